@@ -66,7 +66,12 @@ def difference_stream(
 
 
 def microphone_stream(time_ns: int, places_m: Floats) -> Stream:
-    """Make the stream of where microphones are (n, 3), numbered from 1 on."""
+    """Make the stream that says where microphones are, numbered from 1 on.
+
+    Args:
+        time_ns: the stamp of all.
+        places_m: (n, 3), where they are.
+    """
     return make_stream(
         "/microphones",
         schemas.LANDMARK,

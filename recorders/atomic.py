@@ -30,7 +30,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def settled(place: Path) -> Path:
-    """The place that will be written where a name leads to, once the folders that are missing are made.
+    """Return the place that is written where a name leads to, once missing folders are made.
 
     `MISSING/../FILE` is no other file than FILE, though no system finds it before MISSING is there. What
     is in the place may be a link, and is not followed.
@@ -42,7 +42,7 @@ def settled(place: Path) -> Path:
 
 @contextmanager
 def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
-    """A path to write; what is there when all went well replaces `place`, in one step.
+    """Yield a path to write; what is there when all went well replaces `place`, in one step.
 
     Args:
         place: where the file is to be.
@@ -62,7 +62,7 @@ def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
-    """A folder to fill; when all went well it replaces `place`.
+    """Yield a folder to fill; when all went well it replaces `place`.
 
     `check` is given the folder that is to be replaced, before anything is written and again when it has
     been moved aside; it raises where that folder must stay, and then it does.
@@ -88,7 +88,7 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
 
 @contextmanager
 def scratch_folder(name: str) -> Iterator[Path]:
-    """A private folder among the system's temporary ones, which is removed at the end.
+    """Yield a private folder among the system's temporary ones, which is removed at the end.
 
     Raises BadInput where it cannot be made.
     """
@@ -119,7 +119,7 @@ def is_being_written(file: Path) -> bool:
 
 
 def _make(place: Path) -> tuple[Path, FileLock]:
-    """A new working folder and its lock, held."""
+    """Make a new working folder and its lock, held."""
     while True:
         work = Path(tempfile.mkdtemp(".part", f".{place.name}.", place.parent))
         lock = FileLock(work / _LOCK, timeout=0)
@@ -155,7 +155,7 @@ def _clear_leftovers(place: Path) -> bool:
 
 
 def _is_ours(work: Path) -> bool:
-    """Whether a folder holds what working folders hold and nothing else, and is this user's."""
+    """Tell whether a folder holds what working folders hold and nothing else, and is this user's."""
     try:
         state = work.lstat()
         if not stat.S_ISDIR(state.st_mode) or (hasattr(os, "geteuid") and state.st_uid != os.geteuid()):
@@ -195,7 +195,7 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
 
 @contextmanager
 def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
-    """The folders that a place is in; those that are made here and of which nothing comes go again.
+    """Make the folders that a place is in; those that are made and of which nothing comes go again.
 
     Raises BadInput where they cannot be made.
     """

@@ -21,7 +21,7 @@ class UnknownName(BadInput, KeyError):
 
 
 def choices(name: str, known: Collection[str]) -> str:
-    """The end of a sentence on an unknown name: the one that was probably meant, else all there are."""
+    """End a sentence on an unknown name: by the one that was probably meant, else all there are."""
     from difflib import get_close_matches  # for a mistake alone, not for every start
 
     few = len(known) <= _COMPARED and all(len(each) <= _COMPARED for each in (name, *known))
@@ -31,7 +31,7 @@ def choices(name: str, known: Collection[str]) -> str:
 
 
 def some_of(names: Collection[object]) -> str:
-    """Names in a sentence: the first ones, and how many more there are."""
+    """Write names in a sentence: the first ones, and how many more there are."""
     more = len(names) - _NAMED
     return ", ".join(map(str, islice(names, _NAMED))) + (f" and {more} more" if more > 0 else "")
 
@@ -49,7 +49,7 @@ def check_format(path: object, stated: object, read: int) -> None:
 
 
 def printable(text: str) -> str:
-    """A text for a line of a terminal: control characters and line breaks are shown by their numbers."""
+    """Write a text for a line of a terminal: control characters are shown by their numbers."""
     return "".join(
         each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
     )

@@ -36,7 +36,7 @@ class Parameters(BaseModel):
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        """The JSON schema, with what every parameter means and its unit."""
+        """Return the JSON schema, with what every parameter means and its unit."""
         schema = handler(core_schema)
         table = handler.resolve_ref_schema(schema)
         table["description"] = _prose(cls)
@@ -82,7 +82,7 @@ def build(
 
 @cache
 def _nested_defaults(kind: type[Parameters]) -> Mapping[str, Any]:
-    """Defaults that are tables of their own, so that a setting of one entry keeps the others."""
+    """Return defaults that are tables of their own, so that a setting of one entry keeps the others."""
     defaults = {name: entry.default for name, entry in kind.model_fields.items()}
     return {
         name: value.model_dump() for name, value in defaults.items() if isinstance(value, Parameters)
@@ -90,7 +90,7 @@ def _nested_defaults(kind: type[Parameters]) -> Mapping[str, Any]:
 
 
 def _names_at(kind: type[BaseModel], path: Sequence[str]) -> list[str]:
-    """The names of the parameters in the table at `path`, which may lead through lists and by keys."""
+    """Return the parameters' names in the table at `path`, which may lead through lists and by keys."""
     names = _annotations(kind)
     for part in path:
         table = _table_in(names.get(part))
@@ -103,7 +103,7 @@ def _annotations(kind: type[BaseModel]) -> dict[str, Any]:
 
 
 def _table_in(annotation: Any) -> type[BaseModel] | None:
-    """The type of the tables that an annotation such as list[Matcher] speaks of."""
+    """Return the type of the tables that an annotation such as list[Matcher] speaks of."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next(filter(None, map(_table_in, get_args(annotation))), None)
@@ -170,7 +170,7 @@ def in_few_words(meaning: str) -> str:
 
 
 def _prose(kind: type[BaseModel]) -> str:
-    """What a type and its bases say of their parameters as a whole."""
+    """Return what a type and its bases say of their parameters as a whole."""
     texts = [
         _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
         for each in reversed(kind.__mro__)
@@ -193,7 +193,7 @@ class Described(NamedTuple):
 
 
 def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
-    """All parameters of a type, those of nested tables by full names; `values` stand for defaults.
+    """List all parameters of a type, nested ones by full names; `values` stand for defaults.
 
     In a list of tables names are such as `nodes[].sigma_m`, in tables by name `cases.NAME.sigma_m`.
     """
@@ -243,7 +243,7 @@ def _described(
 def _below(
     schema: Mapping[str, Any], definitions: Mapping[str, Any], name: str
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The schemas of the tables in a value, with how the names in them begin."""
+    """Yield the schemas of the tables in a value, with how the names in them begin."""
     schema = _resolved(schema, definitions)
     if "properties" in schema:
         yield f"{name}.", schema
@@ -259,7 +259,7 @@ def _resolved(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapp
 
 
 def _accepts(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
-    """What a schema of one value accepts: its type and bounds, or its choices."""
+    """Say what a schema of one value accepts: its type and bounds, or its choices."""
     schema = _resolved(schema, definitions)
     if "anyOf" in schema:
         return " or ".join(_accepts(each, definitions) for each in schema["anyOf"])
@@ -285,7 +285,7 @@ _SIGNS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "ma
 
 
 def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
-    """The least and the greatest value of a number by its full name; infinite where there is none.
+    """Return the least and greatest value of a number by its full name; infinite for no bound.
 
     Raises BadInput where a type has no number of this name.
     """
@@ -375,7 +375,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `over`, nested tables merged.
+    """Merge the values of `over` into a copy of `base`, nested tables as well.
 
     >>> merge({"seed": 1, "range": {"rate_hz": 5.0, "sigma_m": 0.1}}, {"range": {"rate_hz": 2.0}})
     {'seed': 1, 'range': {'rate_hz': 2.0, 'sigma_m': 0.1}}

@@ -21,7 +21,7 @@ DEEPEST = 50
 
 
 def parse_json(text: str, *, constants: bool = False) -> Any:
-    """The value that a JSON text states; raises ValueError where there is none, or it is too deep.
+    """Read the value that a JSON text states; raises ValueError where there is none, or one too deep.
 
     Numbers that JSON does not know (NaN, and what is beyond the range of a double) are none, unless
     `constants` takes them as Python writes them.
@@ -56,7 +56,7 @@ _DOTTED_TOO_DEEP = re.compile(rf"(?<![^\s.])(?:[^\s.]++\s*+\.\s*+){{{DEEPEST}}}"
 
 
 def _shallow(parse: Callable[[str], Any], text: str) -> Any:
-    """The parsed value, looked through level by level: dotted keys of TOML need no recursion."""
+    """Return the parsed value unless it is too deep; it goes by levels, as dotted keys never recurse."""
     try:
         value = parse(text)
     except RecursionError:

@@ -19,7 +19,7 @@ SINGULAR = {"studies": "study"}
 
 @cache
 def available(kind: str) -> dict[str, EntryPoint]:
-    """The registered names of a kind ("recorders", say), sorted, with where each comes from."""
+    """Return the registered names of a kind ("recorders", say), sorted, with where each comes from."""
     found = entry_points(group=f"fuselog.{kind}")
     return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
 
@@ -51,7 +51,7 @@ def _object_of(entry: EntryPoint) -> Any:
 
 @contextmanager
 def foreign_code(what: str) -> Iterator[None]:
-    """Around calls of registered code: what it raises becomes one sentence that says whose code it was.
+    """Guard calls of registered code: what it raises becomes one sentence that says whose code it was.
 
     Bad input, a lack of memory or disk, and interrupts go through as they are.
     """

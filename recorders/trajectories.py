@@ -86,7 +86,7 @@ class _Layout(NamedTuple):
 
 
 def _seconds_ns(text: str) -> int:
-    """Exact to the nanosecond, where a double is to a quarter of a microsecond."""
+    """Read a time exactly to the nanosecond, where a double is to a quarter of a microsecond."""
     return round(Decimal(text).scaleb(9))
 
 
@@ -153,7 +153,7 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """The lines that hold something, with their numbers."""
+    """List the lines that hold something, with their numbers."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             lines = [
@@ -175,7 +175,7 @@ def _fields(line: str) -> list[str]:
 
 
 def _recognised(path: object, number: int, line: str) -> Format:
-    """The format that the first pose looks like."""
+    """Find the format that the first pose looks like."""
     fields = _fields(line)
     if "," in line and fields[0].isdigit() and len(fields) >= LAYOUTS["euroc"].least:
         return "euroc"
@@ -216,7 +216,7 @@ def _in_order(name: str, position_m: Floats, rotation: Floats, time_ns: NDArray[
 
 
 def tum_lines(trajectory: Trajectory) -> list[str]:
-    """Lines of a TUM file, with all digits; the identity stands for no rotation."""
+    """Write lines of a TUM file, with all digits; the identity stands for no rotation."""
     assert trajectory.time_ns is not None
     seconds = (f"{Decimal(time).scaleb(-9):f}" for time in trajectory.time_ns.tolist())
     quaternion = Rotation.from_matrix(_rotation(trajectory)).as_quat()
@@ -225,7 +225,7 @@ def tum_lines(trajectory: Trajectory) -> list[str]:
 
 
 def kitti_lines(trajectory: Trajectory) -> list[str]:
-    """Lines of a KITTI file, with all digits; the identity stands for no rotation."""
+    """Write lines of a KITTI file, with all digits; the identity stands for no rotation."""
     matrix = np.concatenate([_rotation(trajectory), trajectory.position_m[:, :, None]], axis=2)
     return [" ".join(map(repr, row)) for row in matrix.reshape(-1, 12).tolist()]
 

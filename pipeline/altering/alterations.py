@@ -31,7 +31,7 @@ def _with(stream: Stream, **columns: NDArray) -> Stream:
 
 
 def shifted(field: str, entry: int | None = None) -> Alteration:
-    """A bias is added to a field, or to one entry of it where that is a vector."""
+    """Add a bias to a field, or to one entry of it where that is a vector."""
     return partial(_shifted, field, entry)
 
 
@@ -45,7 +45,7 @@ def _shifted(field: str, entry: int | None, stream: Stream, by: float | NDArray[
 
 
 def scaled(field: str, entry: int | None = None) -> Alteration:
-    """A field, or one entry of it where that is a vector, is multiplied."""
+    """Multiply a field, or one entry of it where that is a vector."""
     return partial(_scaled, field, entry)
 
 
@@ -59,12 +59,20 @@ def _scaled(field: str, entry: int | None, stream: Stream, factor: float) -> Str
 
 
 def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]:
-    """A vector is multiplied by a matrix, as where a sensor's axes are not at right angles."""
+    """Make the alteration that multiplies a vector by a matrix, as where axes are not at right angles.
+
+    Args:
+        field: a vector of three components.
+        matrix: (3, 3), from the left.
+
+    Returns:
+        A function of a stream, which returns the altered one.
+    """
     return lambda stream: _with(stream, **{field: stream[field] @ matrix.T})
 
 
 def spread(field: str) -> Alteration:
-    """A covariance is multiplied, that of standard deviations e^value times as large."""
+    """Multiply a covariance, as for standard deviations e^value times as large."""
     return partial(_spread, field)
 
 
@@ -73,7 +81,7 @@ def _spread(field: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def turned(field: str) -> Alteration:
-    """A vector, and its covariance, are turned about the vertical by an angle in rad."""
+    """Turn a vector, and its covariance, about the vertical by an angle in rad."""
     return partial(_turned, field)
 
 
@@ -90,12 +98,12 @@ def _turned(field: str, stream: Stream, angle: float) -> Stream:
 
 
 def delayed(stream: Stream, by_s: float) -> Stream:
-    """Stamps are late by so many seconds."""
+    """Make stamps late by so many seconds."""
     return replace(stream, publish_time_ns=stream.publish_time_ns + round(by_s * 1e9))
 
 
 def drifted(first_ns: int) -> Alteration:
-    """The clock of the stamps gains so many seconds a second from the run's begin on."""
+    """Let the clock of the stamps gain so many seconds a second from the run's begin on."""
     return partial(_drifted, first_ns)
 
 
@@ -105,7 +113,7 @@ def _drifted(first_ns: int, stream: Stream, rate: float) -> Stream:
 
 
 def pace(rate: float) -> float:
-    """How fast a clock goes that gains so many seconds a second; of the opposite rate the inverse.
+    """Return how fast a clock goes that gains so many seconds a second; of -rate the inverse.
 
     >>> pace(0.25), pace(-0.25)
     (1.25, 0.8)
@@ -114,12 +122,12 @@ def pace(rate: float) -> float:
 
 
 def multiplied(field: str, entry: int | None = None) -> Alteration:
-    """A field, or one entry of it, is e^value times as large."""
+    """Make a field, or one entry of it, e^value times as large."""
     return lambda stream, logarithm: _scaled(field, entry, stream, float(np.exp(logarithm)))
 
 
 def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
-    """A bias grows by so much a second from the run's begin on."""
+    """Add a bias that grows by so much a second from the run's begin on."""
     return partial(_ramped, first_ns, field, entry)
 
 
@@ -132,7 +140,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """The entries of a vector, and of its covariance, stand in another order, whatever the number."""
+    """Put the entries of a vector, and of its covariance, in another order, whatever the number."""
     return partial(_permuted, field, tuple(order))
 
 
@@ -148,7 +156,15 @@ def _permuted(field: str, order: tuple[int, ...], stream: Stream, _: float) -> S
 
 
 def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream:
-    """Orientations, or those of a Gaussian estimate, are turned about the vertical by angles in rad."""
+    """Turn the orientations of a stream, or those of a Gaussian estimate, about the vertical.
+
+    Args:
+        stream: n messages with a quaternion, or with means that hold one.
+        angle: in rad, anticlockwise from above: one, or (n,), one for each message.
+
+    Returns:
+        The altered stream.
+    """
     half = 0.5 * np.asarray(angle, float)
     about = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
     if "quaternion" in stream.columns:
@@ -160,22 +176,22 @@ def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream
 
 
 def heading_multiplied(stream: Stream, factor: float) -> Stream:
-    """The headings of orientations are multiplied; what else they are turned by stays."""
+    """Multiply the headings of orientations; what else they are turned by stays."""
     return heading_turned(stream, (factor - 1.0) * heading(stream["quaternion"]))
 
 
 def heading_ramped(first_ns: int) -> Alteration:
-    """Orientations turn about the vertical by so many rad/s from the run's begin on."""
+    """Let orientations turn about the vertical by so many rad/s from the run's begin on."""
     return lambda stream, rate: heading_turned(stream, rate * _since_s(stream, first_ns))
 
 
 def heading_from_north(stream: Stream, _: float) -> Stream:
-    """Headings clockwise from north are those anticlockwise from east, and the reverse."""
+    """Change headings clockwise from north into those anticlockwise from east, and the reverse."""
     return heading_turned(stream, 0.5 * np.pi - 2.0 * heading(stream["quaternion"]))
 
 
 def spread_stated(name: str) -> Alteration:
-    """Variances that a channel states are multiplied, standard deviations are e^value times as large."""
+    """Multiply variances that a channel states, for standard deviations e^value times as large."""
     return partial(_spread_stated, name)
 
 
@@ -185,12 +201,12 @@ def _spread_stated(name: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def spread_variances(stated: str, factor: float) -> str:
-    """Variances as a channel states them, multiplied."""
+    """Multiply variances as a channel states them."""
     return ",".join(repr(float(each) * factor) for each in stated.split(","))
 
 
 def renumbered(field: str, first: int, second: int) -> Alteration:
-    """Two numbers are exchanged."""
+    """Exchange two numbers."""
     return partial(_renumbered, field, first, second)
 
 
@@ -210,7 +226,7 @@ def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
 
 
 def thinned(seed: int) -> Alteration:
-    """A share of the stamps is lost, drawn at random, with all their messages."""
+    """Lose a share of the stamps, drawn at random, with all their messages."""
     return partial(_thinned, seed)
 
 
@@ -221,7 +237,7 @@ def _thinned(seed: int, stream: Stream, share: float) -> Stream:
 
 
 def strayed(seed: int, field: str) -> Alteration:
-    """A share of a vector's messages, drawn at random, is off by up to STRAY in every entry."""
+    """Move a share of a vector's messages, drawn at random, by up to STRAY in every entry."""
     return partial(_strayed, seed, field)
 
 

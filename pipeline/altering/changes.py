@@ -105,7 +105,7 @@ class Change:
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The stamps (n,) in ns, moved: as `alterations.drifted` and `delayed` undo clock and delay."""
+        """Move stamps (n,) in ns, as `alterations.drifted` and `delayed` undo clock and delay."""
         since_ns = (stamps_ns - self.first_ns) * alter.pace(-self.gain) - self.delay_ns
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
@@ -183,7 +183,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Settings of topics by their names; what is set of all is set of each that it is about."""
+    """Yield settings of single topics: what is set of all topics is set of each that it is about."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:
@@ -196,7 +196,7 @@ def _of_one_topic(
 
 
 def _with(change: Change, given: _Setting) -> Change:
-    """A change with one more setting of its topic."""
+    """Return the change with one more setting of its topic."""
     what = given.what
     if what in ("delay_s", "delay"):
         delay_ns = 1e9 * given.number("delay_s", "seconds, such as 0.3 or 300 ms")
@@ -222,7 +222,7 @@ def _with(change: Change, given: _Setting) -> Change:
 
 
 def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | None:
-    """What is done to the headings of orientations, or of a Gaussian estimate; None for all else."""
+    """Return what is done to the headings of orientations, or of a Gaussian estimate; else None."""
     has_field = "quaternion" in given.empty.columns
     if given.what == "heading_bias" and (
         has_field or "quaternion" in given.empty.metadata.get("kinds", "")
@@ -244,7 +244,7 @@ def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | 
 
 
 def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
-    """What is done to a field."""
+    """Return what is done to a field."""
     name, _, what = given.what.rpartition("_")
     of_heading = _of_heading(given, first_ns)
     if of_heading is not None:
@@ -276,7 +276,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
 
 
 def _order(given: _Setting, field_: str) -> list[int]:
-    """The order that axes are to have."""
+    """Return the order that axes are to have."""
     text = str(given.value)
     order = [AXES.find(each) for each in text]
     if sorted(order) != list(range(len(order))) or len(order) < 2:
@@ -285,7 +285,7 @@ def _order(given: _Setting, field_: str) -> list[int]:
 
 
 def _matrix(given: _Setting, field_: str) -> Callable[[Stream], Stream]:
-    """The matrix that a vector of three entries is multiplied by."""
+    """Return the matrix that a vector of three entries is multiplied by."""
     example = "nine numbers by rows, such as 1,0,0,0,1,0,0,0,1"
     if given.empty[field_].shape[1:] != (3,):
         raise BadInput(f"--set {given.key}: {field_} is no vector of three entries; leave it out")
@@ -298,7 +298,7 @@ def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:
 
 
 def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
-    """The one field, or entry of one, that a name means; raises BadInput where that is not one."""
+    """Return the one field, or entry of one, that a name means; raise BadInput where there is none."""
     fields: dict[str, tuple[str, int | None]] = {}
     for each in given.empty.schema:
         if each.kind not in ("real", "vector") or each.name not in given.empty.columns:

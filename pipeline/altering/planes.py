@@ -14,7 +14,7 @@ from replay.engine.streams.planes import into_plane_of
 def in_one_plane(
     name: str, topics: Mapping[str, Topic], changes: Mapping[str, Change]
 ) -> dict[str, Change]:
-    """What is done to topics, and then to those that state another plane: they are taken into one.
+    """Add to the changes of topics those that take all of them into one plane.
 
     That is the plane of the truth, so that estimates are in its coordinates, else of the first topic.
 

@@ -63,7 +63,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 def alter_all(
     sources: Iterable[LogSource | MemorySource], settings: Settings
 ) -> list[LogSource | MemorySource]:
-    """Runs with topics altered; what is left out, since it would be before 1970, is counted and logged.
+    """Alter the topics of runs; what is left out, being before 1970, is counted and logged.
 
     Raises BadInput as `alter`.
     """
@@ -81,7 +81,7 @@ def alter_all(
 def _before_1970(
     stored: LogSource | MemorySource, changes: Mapping[str, Change]
 ) -> dict[str, tuple[int, int]]:
-    """How many messages of which topics changes put before 1970, and of how many."""
+    """Count the messages, by topic, that changes put before 1970, and those there are."""
     found = {}
     for topic, change in changes.items():
         if change.is_moving and change.moved(np.array(stored.extent("publish_time")))[0] < 0:
@@ -98,7 +98,7 @@ def alterations_of(source: Source) -> dict[str, Any]:
 
 
 def note_of(source: Source) -> dict[str, str]:
-    """What the metadata of an estimates log says of the alterations; nothing where there are none."""
+    """Return what the metadata of an estimates log says of the alterations; nothing without any."""
     return {name: json.dumps(applied) for name, applied in setting_of(source).items()}
 
 
@@ -109,7 +109,7 @@ def setting_of(source: Source) -> dict[str, dict[str, Any]]:
 
 
 def stated_alterations(estimates: Source) -> dict[str, Any]:
-    """How the run was altered that an estimates log is of; raises BadInput where that is garbled."""
+    """Return how the run of an estimates log was altered; raise BadInput where that is garbled."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get(NOTE, "{}"))
@@ -123,7 +123,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Settings of topics, and all others.
+    """Split settings into those of topics and all others.
 
     >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1})
     ({'/fix.delay_s': 0.3}, {'gate_probability': 1})
@@ -142,7 +142,7 @@ class AlteredRecording(MemorySource):
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """How many messages of which topics would be before 1970, and of how many."""
+        """Count the messages, by topic, that would be before 1970, and those there are."""
         return _before_1970(self.before, self.changes)
 
 
@@ -178,7 +178,7 @@ class AlteredLog(LogSource):
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """How many messages of which topics would be before 1970, and of how many."""
+        """Count the messages, by topic, that would be before 1970, and those there are."""
         return _before_1970(LogSource(self.log), self.changes)
 
     @cached_property
@@ -193,7 +193,7 @@ class AlteredLog(LogSource):
         }
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """A span in ns that holds all stamps by one of the clocks, before they are altered and after."""
+        """Return a span in ns that holds all stamps by a clock, before they are altered and after."""
         ends = np.array(super().extent(clock))
         moved = [ends, *(each.moved(ends) for each in self.changes.values() if clock == "publish_time")]
         return max(0, int(np.min(moved))), int(np.max(moved))
@@ -214,7 +214,7 @@ class AlteredLog(LogSource):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Blocks of the source's span, by the altered stamps."""
+        """Yield blocks of the source's span, by the altered stamps."""
         moving = [
             topic
             for topic in dict.fromkeys(topics)
@@ -239,7 +239,7 @@ class AlteredLog(LogSource):
         return found
 
     def _moved_blocks(self, topic: str, block_messages: int) -> Iterator[dict[str, Stream]]:
-        """Blocks of a topic whose stamps move."""
+        """Yield blocks of a topic whose stamps move."""
         change = self.changes[topic]
         start_ns, end_ns = (
             None if at_ns is None else max(0, change.before(at_ns) + slack_ns)
@@ -258,7 +258,7 @@ class AlteredLog(LogSource):
 
 
 def in_turn(parts: Iterable[Iterator[dict[str, Stream]]], order: Clock) -> Iterator[dict[str, Stream]]:
-    """Blocks of several topics, each in blocks that follow one another in time, as one such sequence.
+    """Join the blocks of several topics, each in order of time, to one such sequence.
 
     Nothing is handed on before every part has come as far.
     """

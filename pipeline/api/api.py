@@ -246,7 +246,7 @@ def _given(**entries: int | None) -> dict[str, int]:
 
 
 def _inputs(stated: Stated, experiment: Experiment) -> list[Path]:
-    """The files that an experiment is read from: its logs, itself, its scenario."""
+    """List the files that an experiment is read from: its logs, itself, its scenario."""
     scenario = "" if experiment.record is None else experiment.record.scenario
     tables = [Path(scenario)] if scenario.endswith(".toml") else []
     return [*experiment.files, *stated.files, *tables]
@@ -258,7 +258,7 @@ def _pool(
     executor: Executor | None,
     experiments: Sequence[Experiment],
 ) -> PoolFactory:
-    """Who works on experiments; a scheduler has its own workers, so that one beside it is none."""
+    """Return who works on experiments; a scheduler has its own workers, and gets none beside."""
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)

@@ -45,7 +45,7 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
 
 
 def _of_topic(name: str) -> Iterator[list[object]]:
-    """Rows of what can be set of a topic: of one thing, or of all where none is named."""
+    """Yield rows of what can be set of a topic: of one thing, or of all where none is named."""
     topic, _, asked = name.rpartition(".")
     ending = asked.rpartition("_")[2]
     whole = [what for what in WHATS if what == asked]
@@ -54,7 +54,7 @@ def _of_topic(name: str) -> Iterator[list[object]]:
 
 
 def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
-    """Rows of one name, of a table with all that is in it; what is alike of several stands once.
+    """List the rows of one name in a table; what is alike of several stands once.
 
     Of several takers the first has a name.
     """
@@ -71,12 +71,12 @@ def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
 
 
 def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
-    """Whose a parameter is; it is of no interest by which model where all models have it alike."""
+    """Return whose a parameter is; the model does not matter where all models have it alike."""
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
 def _recorder(options: Mapping[str, Any]) -> Iterator[Entries]:
-    """That of a scenario, of a log to record again, or of data to import."""
+    """Yield the parameters of a scenario, of a log to record again, or of data to import."""
     name, values = options.get("source"), dict[str, Any]()
     if name is None and options["again"] is not None:
         run = open_log(options["again"]).run
@@ -94,7 +94,7 @@ def _of_recorder(name: str, values: Mapping[str, Any]) -> Entry:
 
 
 def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
-    """Those that a command names."""
+    """Yield the parameters of the estimators that a command names."""
     labels = options.get("names") or options.get("labels") or [options.get("label")]
     if not all(labels):
         raise BadInput(f"--set NAME{ASKED}: name an estimator, such as -e ekf")
@@ -113,7 +113,7 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
 def _by_label(
     estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
 ) -> Iterator[Entries]:
-    """Estimators by label: first what a label begins, then what is set for all."""
+    """Yield estimators by label: first what a label begins, then what is set for all."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
         yield [replace(entry, prefix=f"{label}.") for entry in entries]
@@ -121,7 +121,7 @@ def _by_label(
 
 
 def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = None) -> list[Entry]:
-    """The parameters of an estimator: for each model that it may estimate, or else all."""
+    """Return the parameters of an estimator: for each model that it may estimate, or else all."""
     own = {key: value for key, value in values.items() if key != "kind"}
     kind = values.get("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
@@ -141,7 +141,7 @@ def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = Non
 
 
 def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
-    """An experiment's own, its study's, its scenario's or importer's, and those of its estimators."""
+    """Yield the parameters of an experiment, its study, its scenario or importer, its estimators."""
     named, labels = options["experiment"], options["labels"]
     logs = [Path(each) for each in named if each.endswith(".mcap")]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])

@@ -45,28 +45,28 @@ class Entry:
 
 
 def scenarios() -> list[Entry]:
-    """Recorders, and the scenario files that ship."""
+    """List recorders, and the scenario files that ship."""
     files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
     return _registered("recorders", Recorder, _recorder) + files
 
 
 def estimators() -> list[Entry]:
-    """Estimators with what they need of a log."""
+    """List estimators with what they need of a log."""
     return _registered("estimators", Estimator, _estimator)
 
 
 def models() -> list[Entry]:
-    """Models with what they are made of, and the methods that estimate them."""
+    """List models with what they are made of, and the methods that estimate them."""
     return _registered("models", Model, _model)
 
 
 def metrics() -> list[Entry]:
-    """Metrics that judge estimates."""
+    """List the metrics that judge estimates."""
     return _registered("metrics", Metric, _metric)
 
 
 def experiments() -> list[Entry]:
-    """Shipped experiments."""
+    """List the experiments that ship."""
     files = shipped("experiments").items()
     return [_entry(name, partial(_experiment, name, path)) for name, path in files]
 
@@ -109,13 +109,13 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
 
 
 def _methods_of(model: Model) -> dict[str, str]:
-    """For every method "yes", or what the model lacks for it."""
+    """Say of every method "yes", or what the model lacks for it."""
     lacking = {name: method.lacks(model) for name, method in METHODS.items()}
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
 
 def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
-    """An entry for every registered name."""
+    """Return an entry for every registered name."""
 
     def make(name: str) -> Entry:
         return described(name, load(kind, name, expected))
@@ -124,7 +124,7 @@ def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry
 
 
 def _entry(name: str, make: Callable[[], Entry]) -> Entry:
-    """An entry, or where it cannot be had, why."""
+    """Return an entry, or where it cannot be had, why."""
     try:
         return make()
     except BadInput as error:
@@ -177,7 +177,7 @@ def stated_of(model: Model) -> set[str]:
 
 
 def _listed(components: Mapping[str, str]) -> str:
-    """Components, each with its kind unless that is linear."""
+    """Join components, each with its kind unless that is linear."""
     return ", ".join(
         name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
     )
@@ -236,5 +236,5 @@ def rows_of(entry: Entry) -> list[list[object]]:
 
 
 def _default(value: object, *, is_stated: bool) -> object:
-    """A parameter's default in words, where it is what a log's channels state."""
+    """Say in words what a parameter's default is, where it is what a log's channels state."""
     return "from the log" if value is None and is_stated else value

@@ -128,7 +128,7 @@ def judge_estimates(
 
 
 def _opened(path: Path, *, recover: bool) -> LogSource:
-    """An estimates log; raises BadInput where it is none."""
+    """Open an estimates log; raises BadInput where it is none."""
     try:
         log = open_log(path, recover=recover)
     except NotMcap as error:
@@ -146,7 +146,7 @@ def _compared(
     comparison: Mapping[str, Any],
     gap_limit_s: float,
 ) -> ComparedLogs:
-    """The estimates, compared as trajectories and aligned where that is asked for."""
+    """Compare the estimates as trajectories, aligned where that is asked for."""
     if not comparison:
         return ComparedLogs(estimates, {})
     if "time_offset_s" in comparison:

@@ -206,7 +206,7 @@ def settings_of(
 
 
 def _labelled(named: Named) -> Mapping[str, Kind]:
-    """What stands under which label; a name and an estimator are labels of their own."""
+    """Return what stands under which label; a name and an estimator are labels of their own."""
     if isinstance(named, str):
         return dict([shorthand(named)])
     return {named.label: named} if isinstance(named, Estimator) else allowed(named)

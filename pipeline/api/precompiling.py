@@ -131,7 +131,7 @@ def _usual(models: Iterable[str]) -> list[Pair]:
 
 
 def _working(models: dict[str, Model], methods: Iterable[str]) -> list[Pair]:
-    """The pairs that work together."""
+    """Choose the pairs that work together."""
     kinds = {method: method.partition(":")[0] for method in methods}
     for kind in kinds.values():
         if kind not in METHODS:
@@ -154,7 +154,7 @@ def _check_cache() -> None:
 
 
 def _scenarios() -> list[str]:
-    """All that can be recorded."""
+    """List all that can be recorded."""
     names = [*available("recorders"), *shipped("scenarios")]
     return [
         name
@@ -168,7 +168,7 @@ def _all(executor: Executor, work: Callable[..., Any], asked: Iterable[tuple[Any
 
 
 def _fits(scenario: str, models: Iterable[str]) -> tuple[str, dict[str, Any]]:
-    """Which of the models a scenario's log fits, and with which sensors each."""
+    """Find which of the models a scenario's log fits, and with which sensors each."""
     topics, found = _recorded(scenario).topics, {}
     for name in models:
         model = load("models", name, Model)
@@ -190,7 +190,7 @@ def _replayed(scenario: str, model: str, method: str) -> Precompiled:
 
 
 def _recorded(scenario: str) -> MemorySource:
-    """A short recording."""
+    """Make a short recording."""
     recorder, values, _ = load_scenario(scenario)
     if "duration_s" in load("recorders", recorder, Recorder).parameters.model_fields:
         for duration_s in SHORT_S:

@@ -140,7 +140,7 @@ class Evaluation:
             return ResultFolder(place, write_outcome(part, "evaluate", settings, outcome))
 
     def _hash(self) -> str:
-        """SHA-256 of the poses of both."""
+        """Hash the poses of both with SHA-256."""
         digest = hashlib.sha256()
         for each in (self.estimate, self.truth):
             for array in (each.time_ns, each.position_m, each.rotation):
@@ -213,7 +213,7 @@ class ComparedLogs:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """APE and RPE over all runs, as `estimator.ape_translation_rmse_m[.case]`."""
+        """Return APE and RPE over all runs, as `estimator.ape_translation_rmse_m[.case]`."""
         return {
             metric_key(estimator, quantity, case): value
             for (estimator, case), runs in self.compared.items()
@@ -273,7 +273,7 @@ def compare_logs(
 def trajectory_figures(
     compared: Mapping[str, Compared], suffix: str = ""
 ) -> dict[str, "Chart | Figure"]:
-    """Figures as evo has them, of estimates of one thing by label: paths, errors, errors as colours."""
+    """Draw figures as evo has them, of estimates by label: paths, errors, errors as colours."""
     figures: dict[str, Chart | Figure] = {
         f"trajectory{suffix}": _path_chart(compared),
         f"pose-errors{suffix}": _error_chart(compared),
@@ -284,7 +284,7 @@ def trajectory_figures(
 
 
 def _plane(truth: Trajectory) -> list[int]:
-    """The two axes along which the truth is widest: those of the ground, as a camera has them too."""
+    """Find the two axes along which the truth is widest: those of the ground, also for a camera."""
     return sorted(np.argsort(-np.ptp(truth.position_m, axis=0), kind="stable")[:2].tolist())
 
 
@@ -300,7 +300,7 @@ def _path_chart(compared: Mapping[str, Compared]) -> Chart:
 
 
 def _error_chart(compared: Mapping[str, Compared]) -> Chart:
-    """APE at every pose, RPE at the last pose of every pair; over time, or poses without stamps."""
+    """Draw APE at every pose, RPE at the last pose of every pair; over time, or by their number."""
     timed = all(done.estimate.time_ns is not None for done in compared.values())
     x = Axis(label="time (s)" if timed else "pose")
     panels = []

@@ -27,17 +27,17 @@ NAMES = (
 
 
 def rich(time_s: Floats) -> tuple[Floats, Floats]:
-    """Speed and turn rate that determine everything."""
+    """Return a speed and a turn rate that determine everything."""
     return 8.0 + 3.0 * np.sin(0.4 * time_s), 0.25 * np.sin(0.21 * time_s) + 0.15 * np.sin(0.53 * time_s)
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Straight on at 8 m/s."""
+    """Drive straight on at 8 m/s."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
 def changing_speed(time_s: Floats) -> tuple[Floats, Floats]:
-    """Straight on, now slower and now faster."""
+    """Drive straight on, now slower and now faster."""
     return SPEED_MPS + 4.0 * np.sin(0.4 * time_s), 0.0 * time_s
 
 
@@ -47,7 +47,7 @@ def circle(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def circles(time_s: Floats) -> tuple[Floats, Floats]:
-    """Such circles to the left and to the right, in turn."""
+    """Drive such circles to the left and to the right, in turn."""
     is_left = time_s // CIRCLE_S % 2 == 0
     return np.full_like(time_s, SPEED_MPS), np.where(is_left, 0.4, -0.4)
 
@@ -96,7 +96,19 @@ def drive(
     errors: Floats = TRUTH,
     steps: Steps = STEPS,
 ) -> Measured:
-    """Drive, with errors (7,) as `TRUTH` has them; without noise where there is no seed."""
+    """Simulate a drive of the car, and what its sensors measure.
+
+    Args:
+        seed: of the noise and of the first pose; without one there is no noise, and the car starts at
+            zero.
+        motion: gives speeds in m/s and turn rates in rad/s at times (n,) in s.
+        duration_s: how long it drives.
+        errors: (7,), what is wrong with the sensors, as `TRUTH` has it.
+        steps: how often each sensor measures.
+
+    Returns:
+        What was measured, with its stamps.
+    """
     step_s = steps.odometry_s
     n, m = round(duration_s / step_s), round(duration_s / steps.fix_s) - 1
     fix_s = steps.fix_s * (2.0 + np.arange(m))

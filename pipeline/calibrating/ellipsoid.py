@@ -217,7 +217,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
 
 
 def _readings(source: LogSource | MemorySource, field: str) -> Floats:
-    """The readings (n, 3) of a field; of an accelerometer means where it is still."""
+    """Return the readings (n, 3) of a field; of an accelerometer means where it is still."""
     topic, _, name = field.rpartition(".")
     if not topic:
         raise BadInput(f"--field {field}: expected TOPIC.FIELD, as /imu.magnetic_field_ut")
@@ -233,7 +233,7 @@ def _readings(source: LogSource | MemorySource, field: str) -> Floats:
 
 
 def _still(readings: Floats, times_s: Floats) -> Floats:
-    """The means (m, 3) of readings (n, 3) over half seconds in which they are still."""
+    """Average readings (n, 3) over half seconds in which they are still: (m, 3)."""
     if len(readings) < FEWEST:
         return readings[:0]
     size = max(2, round(_STILL_S / float(np.median(np.diff(times_s)))))

@@ -102,7 +102,7 @@ def fit(readings: Floats) -> Fit:
 
 
 def _distances(values: Floats, readings: Floats) -> Floats:
-    """The distances (n,) of readings from an ellipsoid, to the first order, outward positive."""
+    """Compute the distances (n,) of readings from an ellipsoid, to first order, outward positive."""
     matrix = matrix_of(values)
     vectors = (readings - values[:3]) @ matrix
     lengths = np.linalg.norm(vectors, axis=1)
@@ -112,14 +112,14 @@ def _distances(values: Floats, readings: Floats) -> Floats:
 
 
 def _derivatives(values: Floats, readings: Floats) -> Floats:
-    """The derivatives (n, 9) of the distances by the values."""
+    """Compute the derivatives (n, 9) of the distances by the values."""
     steps = _STEP * np.eye(len(START))
     ways = [_distances(values + step, readings) - _distances(values - step, readings) for step in steps]
     return np.stack(ways, axis=1) / (2.0 * _STEP)
 
 
 def _search(start: Floats, directions: Floats, readings: Floats, sigma: float) -> tuple[float, Floats]:
-    """The least cost from a start (9,) along directions (m, 9), under a wide prior; the values there.
+    """Find the least cost from a start (9,) along directions (m, 9), under a wide prior, and where.
 
     Noise along the surface, which is curved, moves readings outward by its variance.
     """

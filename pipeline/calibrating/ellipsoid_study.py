@@ -69,7 +69,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _held(unit: str, seed: int) -> dict[str, bool]:
-    """Which intervals of a unit hold the truth."""
+    """Tell which intervals of a unit hold the truth."""
     _, truth = UNITS[unit]
     table = calibrated(unit, seed).table
     return dict(zip(NAMES, (table["low"] <= truth) & (truth <= table["high"]), strict=True))
@@ -111,7 +111,7 @@ def turned(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def put_down(rng: np.random.Generator) -> tuple[Floats, float]:
-    """The specific force (n, 3) of a unit that is moved from one position to the next, and the noise."""
+    """Return the specific force (n, 3) of a unit that is moved between positions, and the noise."""
     directions = rng.standard_normal((POSITIONS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     held, moved = round(HELD_S / STEP_S), round(MOVED_S / STEP_S)

@@ -22,7 +22,7 @@ HEADING = "bias_heading_rad"
 
 
 def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
-    """The values of a calibration by their names; of what is held it is said that nothing is known.
+    """Write the values of a calibration by their names, of what is held that nothing is known.
 
     >>> print(kalibr_yaml({"lever_x_m": 1.2, "fix_delay_s": 0.15}, []).removeprefix(HEAD).strip())
     fix:
@@ -56,7 +56,7 @@ def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
 
 
 def _transform(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[str]:
-    """The lines of T_sensor_body."""
+    """Write the lines of T_sensor_body."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     rows = [", ".join(f"{entry + 0.0:.6g}" for entry in row) for row in matrix]

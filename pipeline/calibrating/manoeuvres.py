@@ -51,7 +51,14 @@ class Gain(NamedTuple):
 
 
 def gain(known: Floats, added: Floats) -> Gain:
-    """Return what an information (m, m), in useful units, adds to what is known (m, m).
+    """Compute what the information of a manoeuvre adds to what is known.
+
+    Args:
+        known: (m, m), in useful units.
+        added: (m, m), in useful units; both together are positive definite.
+
+    Returns:
+        The information gained, and the standard deviations (m,) that are left.
 
     >>> found = gain(np.diag([4.0, 1.0]), np.diag([0.0, 3.0]))
     >>> round(found.nats, 3), found.sigmas.tolist()
@@ -108,7 +115,7 @@ def advice(found: Tuning) -> list[str]:
 
 
 def _simulated(found: Tuning, log: Source, motion: Motion) -> Run:
-    """A manoeuvre as a log of the same topics, with the values that were found."""
+    """Simulate a manoeuvre as a log of the same topics, with the values that were found."""
     streams = _of_kinds(log)
     steps = [_step_s(streams.get(topic)) for topic in SIMULATED]
     usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}
@@ -129,7 +136,7 @@ def _simulated(found: Tuning, log: Source, motion: Motion) -> Run:
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
-    """The first topic of a schema that the run has of its own."""
+    """Find the first topic of a schema that the run has of its own."""
     for name, topic in log.topics.items():
         if topic.schema_name == schema.full_name and not name.startswith("/estimates/"):
             return log.read([name])[name]
@@ -137,7 +144,7 @@ def _first_of(log: Source, schema: Schema) -> Stream | None:
 
 
 def _of_kinds(log: Source) -> dict[str, Stream]:
-    """The log's streams that are simulated, by the topic of the simulation."""
+    """Return the log's streams that are simulated, by the topic of the simulation."""
     streams = {topic: _first_of(log, schema) for topic, schema in SIMULATED.items()}
     found = {topic: stream for topic, stream in streams.items() if stream is not None}
     if "/car/odometry" not in found or "/car/fix" not in found:
@@ -148,20 +155,20 @@ def _of_kinds(log: Source) -> dict[str, Stream]:
 
 
 def _step_s(stream: Stream | None) -> float:
-    """The usual time between messages, in s."""
+    """Return the usual time between messages, in s."""
     if stream is None or len(stream) < 2:
         return 1.0
     return float(np.median(np.diff(stream.publish_time_ns))) * 1e-9
 
 
 def _errors(values: Mapping[str, Any]) -> Floats:
-    """The errors of a car (7,), of the readings by the motion; a model's are of the motion by them."""
+    """Return the errors of a car (7,), of readings by the motion, where a model has the reverse."""
     forward, turn, bias, *others = (float(values[name]) for name in NAMES)
     return np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])
 
 
 def _alike(stream: Stream, like: Stream) -> Stream:
-    """A simulated stream under the name, with the metadata and the covariance, of another."""
+    """Give a simulated stream the name, the metadata and the covariance of another."""
     columns = {
         name: np.repeat(like[name][:1], len(stream), axis=0) if "covariance" in name else column
         for name, column in stream.columns.items()

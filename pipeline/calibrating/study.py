@@ -67,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> list[dict[str, Any]]:
-    """A row per parameter of one car."""
+    """Calibrate one car; return a row per parameter."""
     table = calibrate(recorded(drive(seed)), {label: settings}).parameters.set_index("parameter")
     rows: list[dict[str, Any]] = []
     for name, true in zip(NAMES, OURS, strict=True):
@@ -87,7 +87,7 @@ def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> 
 
 
 def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[Any]:
-    """The motion, and of each parameter whether it stays undetermined."""
+    """Return the motion, and of each parameter whether it stays undetermined."""
     found = calibrate(recorded(drive(None, MOTIONS[motion]), WIDE), {label: settings})
     held = set(found.found.held)
     return [motion, *(name in held for name in NAMES)]

@@ -110,7 +110,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
 def _distances(
     golden: Golden, found: Golden, missing: Callable[[str, str, str], Discrepancy]
 ) -> Iterator[Discrepancy]:
-    """How far every part is from the golden's, relative to its size; infinite where one is missing."""
+    """Yield how far every part is from the golden's, by its size; infinite where one is missing."""
     for key, stored, new in _pairs(golden["metrics"], found["metrics"]):
         before, after = _floats(stored), _floats(new)
         if before.shape != after.shape:
@@ -138,7 +138,7 @@ def _pairs(stored: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[
 def _column_distance(
     about: Discrepancy, stored: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Discrepancy:
-    """The largest of a column, relative to its root mean square; angles are as large as one radian."""
+    """Find the largest distance of a column, by its root mean square; of angles by one radian."""
     name, rows, kinds = about.part, stored["rows"], stored["metadata"].get("kinds", "").split(",")
     if name not in stored["columns"] or name not in new["columns"]:
         return about
@@ -176,7 +176,7 @@ def _column_distance(
 
 
 def _component(metadata: Mapping[str, str], place: tuple[int, ...], shape: tuple[int, ...]) -> str:
-    """What an entry of a row is called; of a matrix its row and its column."""
+    """Name an entry of a row; of a matrix by its row and its column."""
     if not place:
         return ""
     names = metadata.get("components", "").split(",")
@@ -189,17 +189,17 @@ def _component(metadata: Mapping[str, str], place: tuple[int, ...], shape: tuple
 
 
 def _floats(values: Any) -> Floats:
-    """An array; a null is NaN."""
+    """Make an array, in which a null is NaN."""
     return np.asarray(values, float)
 
 
 def _difference(before: Floats, after: Floats) -> Floats:
-    """What is missing in both is equal."""
+    """Subtract; what is missing in both is equal."""
     return np.where(np.isnan(before) & np.isnan(after), 0.0, after - before)
 
 
 def _relative(difference: Floats, size: ArrayLike) -> Floats:
-    """Differences relative to their size; NaN where a value is missing in one of the two."""
+    """Divide differences by their size; NaN where a value is missing in one of the two."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative: Floats = np.where(difference == 0.0, 0.0, np.abs(difference) / size)
     return relative
@@ -223,7 +223,7 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
 
 
 def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> int | None:
-    """The stamp of the first row with other bits; None where rows cannot be compared one by one."""
+    """Find the stamp of the first row with other bits; None where rows cannot be compared."""
     stored, new = (
         each["runs"][first.run]["streams"].get(first.topic) for each in (golden, replayed.golden)
     )
@@ -240,7 +240,7 @@ def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> in
 
 
 def _innovation_at(outputs: Outputs, what: tuple[str, str], stamp_ns: int) -> Iterator[str]:
-    """The innovation of an estimator at a stamp, or the last before it, of each innovation stream."""
+    """Yield the innovation at a stamp, or the last before it, of each stream of an estimator."""
     for topic, stream in outputs.items():
         if split_topic(topic) != what or stream.schema.full_name != schemas.INNOVATION.full_name:
             continue

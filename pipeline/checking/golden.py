@@ -122,12 +122,12 @@ def golden_of(
 
 
 def input_hash(source: LogSource | MemorySource) -> str:
-    """SHA-256 of a run: of a log its file, of a recording its columns."""
+    """Hash a run with SHA-256: of a log its file, of a recording its columns."""
     return hash_files([source.log.path]) if isinstance(source, LogSource) else hash_streams([source])
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Whether an output is an estimator's; how much was estimated, and that nothing failed, is not."""
+    """Tell whether an output is an estimate; usage and the note that nothing failed are not."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 
@@ -137,7 +137,7 @@ def _is_kept(topic: str, column: str, patterns: Sequence[str]) -> bool:
 
 
 def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]:
-    """What a golden has of a stream; of failures and the like only how many there were, and when."""
+    """Return what a golden has of a stream; of failures and the like only how many, and when."""
     has_values = stream.schema.full_name not in REASONS
     kept = kept_rows(len(stream), rows)
     values = {
@@ -185,7 +185,7 @@ def _sha256(array: NDArray) -> str:
 
 
 def arithmetic() -> str:
-    """A hash of what elementary functions and linear algebra give here: CPUs differ in the last digit.
+    """Hash what elementary functions and linear algebra give here: CPUs differ in the last digit.
 
     Where it is not a golden's, neither is a recorded input, and nothing can be equal to 1e-12.
     """

@@ -139,7 +139,7 @@ def write(path: Path, golden: Golden) -> None:
 
 
 def read(path: Path) -> Golden:
-    """A golden that is kept; raises BadInput where it is missing, damaged or of another format."""
+    """Read a golden; raises BadInput where it is missing, damaged or of another format."""
     try:
         golden = parse_json(_unpacked(path).decode(), constants=True)
     except FileNotFoundError:
@@ -163,7 +163,7 @@ def read(path: Path) -> Golden:
 
 
 def _unpacked(path: Path) -> bytes:
-    """The text; raises ValueError where it is more than a golden may have, and unpacks no more."""
+    """Unpack the text; raises ValueError where it is more than a golden may have."""
     with path.open("rb") as file:
         packed = file.read(MOST_BYTES)
     unpacking = lzma.LZMADecompressor(memlimit=_UNPACKING_BYTES)

@@ -125,7 +125,7 @@ def companions_if(foxglove: bool) -> Companions | None:
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
-    """Where the estimates of each log go: beside it, to the one file given, or into a folder.
+    """Return where the estimates of each log go: beside it, to the one file given, or to a folder.
 
     Raises BadInput where two would be the same.
     """

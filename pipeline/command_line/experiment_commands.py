@@ -132,7 +132,7 @@ def _stated_experiment(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> tuple[Stated, dict[str, Any]]:
-    """The experiment of a name or a TOML file, or that of logs, and the settings that go over it."""
+    """Return the experiment of a name or TOML file, or of logs, and the settings that go over it."""
     files = [Path(each) for each in named if each.endswith(".mcap")]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
         raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")

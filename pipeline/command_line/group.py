@@ -17,7 +17,7 @@ from pipeline.command_line.help import with_examples
 )
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
-    """All commands; how long one goes is told from here on."""
+    """Hold all commands; from here on it is told how long one takes."""
     from pipeline.output.terminal import once_a_minute
 
     once_a_minute.begin()

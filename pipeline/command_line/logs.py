@@ -310,7 +310,7 @@ def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **
 
 
 def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """What an option gives as NAME=VALUE, each name once."""
+    """Read what an option gives as NAME=VALUE, each name once."""
     pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.rpartition("=")

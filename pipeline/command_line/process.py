@@ -121,7 +121,7 @@ def _stopped_by_signals() -> Iterator[None]:
 
 
 def _sentence(error: Exception, place: str) -> str:
-    """What went wrong, and where: `place` is for errors that do not say so themselves."""
+    """Say what went wrong, and where: `place` is for errors that do not say so themselves."""
     if isinstance(error, OSError):
         place = os.fsdecode(error.filename) if error.filename else place
         return f"{place}: {error.strerror or error}"
@@ -140,7 +140,7 @@ def _fail(sentence: str) -> int:
 
 
 def _drop_output() -> bool:
-    """Whether standard output takes more; where not, the interpreter must not try again at its end."""
+    """Tell whether standard output takes more; if not, drop it, so that nothing tries again."""
     try:
         print(end="", flush=True)
     except OSError:

@@ -130,7 +130,7 @@ def measured(
 
 
 def _hash_of_truth(source: Source, estimates: Source) -> str:
-    """A hash of what estimates are judged by, however it is cut into blocks."""
+    """Hash what estimates are judged by, however it is cut into blocks."""
     named = {topic.metadata.get("truth", "") for topic in estimates.topics.values()}
     digests: list[str] = []
     for topic in sorted(named & source.topics.keys()):
@@ -167,7 +167,7 @@ def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name."""
+    """Flatten nested settings to dotted names."""
     found: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -280,7 +280,7 @@ def of_result(folder: Path, progress: Progress) -> Given:
 
 
 def _run_of_result(result: Result, number: int) -> str:
-    """The key of a result's run; see `key_of`."""
+    """Return the key of a result's run; see `key_of`."""
     settings = result.settings
     if "record" in settings:
         recorder, _, _ = load_scenario(settings["record"]["scenario"])
@@ -302,7 +302,7 @@ def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -
 def _stored(
     rows: pd.DataFrame, times: pd.DataFrame, label: str, name: str, settings: Mapping[str, Any]
 ) -> Candidate:
-    """The candidate of a result's own tables."""
+    """Make the candidate of a result's own tables."""
     own = rows[rows["estimator"] == label].drop(columns=["estimator", "estimates"])
     components = [column for column in map(str, own) if column.startswith("rmse_")]
     sizes = {
@@ -321,7 +321,7 @@ def _stored(
 
 
 def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate) -> Candidate:
-    """What was kept of a result made again, a part of the runs at a time."""
+    """Make again what was kept of a result, a part of the runs at a time."""
     label = kept.label
     if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
         raise BadInput("its settings do not say how to replay it; estimates logs can be compared")
@@ -362,7 +362,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
 
 
 def _row_that_differs(kept: Candidate, again: Candidate) -> str:
-    """A sentence where a replay does not give what a result has."""
+    """Say where a replay does not give what a result has."""
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
     if len(both) < len(kept.rows):

@@ -282,7 +282,7 @@ def _labels(each: str | Mapping[str, Kind]) -> list[str]:
 def _compared(
     first: Candidate, second: Candidate, margin: float, notes: list[str]
 ) -> tuple[list[Paired], pd.DataFrame]:
-    """Every metric that both have, over the runs that both have; and some over time."""
+    """Compare every metric that both have, over the runs that both have; and some over time."""
     keys = ["quantity", "case", "run"]
     both = first.rows.merge(second.rows, on=keys, suffixes=("_first", "_second"))
     of_first, of_second = (set(candidate.rows["quantity"]) for candidate in (first, second))
@@ -319,7 +319,7 @@ def _compared(
 
 
 def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFrame:
-    """The differences of the main RMSE and of NEES by spans of time."""
+    """Compute the differences of the main RMSE and of NEES by spans of time."""
     if first.times.empty or second.times.empty:
         return pd.DataFrame()
     width_s = _span_s([first.times, second.times])
@@ -342,7 +342,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
 
 
 def _span_s(tables: Iterable[pd.DataFrame]) -> float:
-    """How long the spans are: whole multiples of those of all tables, at most `SPANS` of them."""
+    """Choose how long the spans are: whole multiples of those of all tables, at most `SPANS`."""
     ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
     width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
     longest = max(int(each.max()) for each in ends_ms)
@@ -352,7 +352,7 @@ def _span_s(tables: Iterable[pd.DataFrame]) -> float:
 
 
 def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
-    """RMSE of the position or orientation, else of the first component, and NEES, by span."""
+    """Compute by span NEES, and RMSE of position or orientation, else of the first component."""
     columns = [column for column in times if "rmse" in str(column)]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
     parts = []
@@ -369,7 +369,7 @@ def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
 def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
-    """The stretch of spans in a row that has most of a difference, where that is beyond the margin."""
+    """Find the run of spans that has most of a difference, where that is beyond the margin."""
     if over_time.empty or found.verdict in ("no difference", "unclear"):
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]

@@ -106,7 +106,7 @@ def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
 
 
 def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
-    """The run that trajectories are of: that of the other candidates, or the true trajectory alone."""
+    """Return the run that trajectories are of: the other candidates', or the true trajectory alone."""
     if truth is not None:
         trajectory = read_trajectory(truth)
         stream = truth_of(trajectory, "/truth")
@@ -138,7 +138,7 @@ def _truth_topic(source: Source, case: str | None) -> str:
 
 
 def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Candidate]]:
-    """The candidates to compare: the estimators of one thing, or each estimator of several things."""
+    """Yield the candidates to compare: estimators of one thing, or one estimator of several."""
     for each in givens:
         for label in labels:
             if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
@@ -168,14 +168,14 @@ def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterato
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, numbered where two are the same."""
+    """Number the names where two are the same."""
     return [
         f"{name}-{number}" if names.count(name) > 1 else name for number, name in enumerate(names, 1)
     ]
 
 
 def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
-    """A sentence for what two candidates do not share; raises BadInput where that is everything."""
+    """Yield sentences on what two candidates do not share; raises BadInput where nothing is shared."""
     runs = [list(dict.fromkeys(candidate.rows["run"])) for candidate in (first, second)]
     common = [run for run in runs[0] if run in set(runs[1])]
     if not common:

@@ -46,7 +46,7 @@ class Renamed:
         }
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Whole topics, in publish-time order."""
+        """Read whole topics, in publish-time order."""
         return self._renamed(self.estimates.read([self._old(topic) for topic in topics]))
 
     def empty(self, topic: str) -> Stream:
@@ -56,7 +56,7 @@ class Renamed:
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Topics in blocks that follow one another in time."""
+        """Yield topics in blocks that follow one another in time."""
         own = [self._old(topic) for topic in topics]
         return map(self._renamed, self.estimates.blocks(own, order, block_messages))
 

@@ -105,7 +105,7 @@ def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
 
 
 def _literal(text: str) -> str:
-    """A string of C, in lines."""
+    """Write a string of C, in lines."""
     pieces = [text[first : first + 90] for first in range(0, len(text), 90)]
     return "\n".join(f"    {json.dumps(each)}" for each in pieces)
 
@@ -296,7 +296,7 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
-    """What is done with a message of a sensor: its numbers are put in their order, and handed over."""
+    """Write what is done with a message of a sensor: its numbers, in their order, are handed over."""
     m = len(sensor.measured)
     ids = list(dict.fromkeys(each.of for each in sensor.maps))
     first = len(ids)

@@ -111,7 +111,7 @@ def _traced(function: Any, *arguments: Argument) -> Cost:
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
-    """The cost of the loops of the motion (0) or of a sensor: samples, noise, the factor of both."""
+    """Count the loops of the motion (0) or of a sensor: samples, noise, the factor of both."""
     step = made.steps.predict if part == 0 else made.steps.innovate[part - 1]
     sampled, t = made.steps.sampled[part], made.tangent
     costs = [_entering(step, size)]
@@ -126,7 +126,7 @@ def _loops(made: CFilter, part: int, size: int) -> Cost:
 
 
 def _entering(step: Step, size: int) -> Cost:
-    """The cost of noise that enters through a gain."""
+    """Count what noise costs that enters through a gain."""
     gains = sum(name == "u" for name, _ in step.outputs)
     if not gains:
         return NOTHING
@@ -134,7 +134,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """The cost of a function at samples, and of the mean of its values, in all rounds that may be."""
+    """Count a function at samples, and the mean of its values, in all rounds that may be."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -149,7 +149,7 @@ def _sampling(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """The cost of a step for every sample; calls that are always the same stand before the loop."""
+    """Count a step for every sample; calls that are always the same stand before the loop."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     inside = [node for node in needed(outputs, same) if node not in same]
@@ -157,7 +157,7 @@ def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:
-    """The cost of what is made of the values: covariances, or the rows of a factor."""
+    """Count what is made of the values: covariances, or the rows of a factor."""
     count, v = len(sampled.points), sampled.size
     if is_root:
         return Cost(count * v)
@@ -176,13 +176,13 @@ def _orthogonalising(rows: int, columns: int) -> Cost:
 
 
 def _filling_root(size: int) -> Cost:
-    """The cost of a factor of a noise; the search for a pivot divides at each that is larger."""
+    """Count the factor of a noise; the search for a pivot divides at each that is larger."""
     return Cost(size * (1 + 4 * size + size + 2 * size * size), size)
 
 
 @cache
 def _algebra(m: int, t: int, is_robust: bool) -> Cost:
-    """The cost of the update behind an innovation of m components, for t of the tangent space."""
+    """Count the update behind an innovation of m components, for t of the tangent space."""
 
     def update(v: Any, spread: Any, cross: Any, covariance: Any, factor: Any) -> Any:
         innovation, step = Innovation(v, spread, cross), np.empty(t, object)
@@ -197,13 +197,13 @@ def _algebra(m: int, t: int, is_robust: bool) -> Cost:
 
 
 def _factored_algebra(m: int, t: int) -> Cost:
-    """The same of a factor: S, the whitened innovation, the step, and the factor of P."""
+    """Count the same of a factor: S, the whitened innovation, the step, and the factor of P."""
     square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
     return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
 
 
 def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) -> Products:
-    """The cost of products with a Jacobian: with all its entries, and without those that are known."""
+    """Count products with a Jacobian: with all its entries, and without those that are known."""
     if not step.has(jacobian):
         return NOTHING, NOTHING
     known = {

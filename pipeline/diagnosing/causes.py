@@ -64,7 +64,7 @@ class Cause(NamedTuple):
 
     @property
     def numbers(self) -> "list[Estimated]":
-        """The numbers with their intervals, as they are reported: factors, not their logarithms."""
+        """Return the numbers with intervals as they are reported: factors, not their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Estimated(of.part, *(of.reported(each) for each in (self.value, low, high)))]
@@ -95,7 +95,7 @@ class Tried(NamedTuple):
 
     @property
     def row(self) -> tuple[str, str, str, str, float]:
-        """Its kind, topic and part; the number, or numbers, that gain most; and that gain."""
+        """Return its kind, topic and part, the number or numbers that gain most, and that gain."""
         of, at = self.hypothesis, self.at.value
         values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
@@ -120,7 +120,7 @@ def least_gain(count: int, size: int = 1) -> float:
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
-    """At most so many causes, the likeliest first; what each hypothesis gains; and one that is in doubt.
+    """Find at most `most` causes, the likeliest first; what each hypothesis gains; and one in doubt.
 
     Each cause gains most after all before it are undone: most in log-likelihood less what its numbers
     cost. What the hypotheses gain is of the log as it is. In doubt is what gains most after all causes,
@@ -160,7 +160,7 @@ def _likeliest(
     candidates: Sequence[Hypothesis],
     count: int,
 ) -> tuple[list[tuple[Peak, Hypothesis]], list[tuple[Peak, Hypothesis]]]:
-    """The hypothesis that gains most, and those that the log does not tell from it; none by chance.
+    """Find the hypothesis that gains most, not by chance, and those the log does not tell from it.
 
     And those in doubt. How much the parts of a log disagree is the log's: what they disagree about in
     what gains more holds of what gains less as well. Burnham and Anderson, Model Selection and
@@ -209,14 +209,14 @@ class _Supposed(NamedTuple):
 
 
 def _is_gross(at: Peak, of: Hypothesis) -> bool:
-    """Whether it is a noise that is stated far too small."""
+    """Tell whether it is a noise that is stated far too small."""
     return of.kind in NOISES and at.value > GROSS
 
 
 def _companion(
     likelihood: Likelihood, now: Trial, peaks: Sequence[Peak], candidates: Sequence[Hypothesis]
 ) -> _Supposed | None:
-    """One of two gross faults, which gain more together than any noise does; None where no two do.
+    """Find one of two gross faults which gain more together than any noise does; None without.
 
     Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
     none may gain by itself what it is worth.
@@ -241,7 +241,7 @@ def _companion(
 
 
 def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
-    """Whether a topic is late by as much as the likeliest cause has another early.
+    """Tell whether a topic is late by as much as the likeliest cause has another early.
 
     These are one fault but for what is at the ends of the log.
     """
@@ -252,13 +252,13 @@ def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]
 
 
 def _is_early(pair: tuple[Peak, Hypothesis]) -> bool:
-    """Whether it is the less usual name of a fault: one topic is late, or all others are early."""
+    """Tell whether it is the less usual name of a fault: one topic is late, or all others are early."""
     at, of = pair
     return of.kind in ("delay", "clock drift") and isinstance(at.value, float) and at.value < 0.0
 
 
 def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> list[Peak]:
-    """The greatest gain of each; all are searched side by side."""
+    """Find the greatest gain of each; all are searched side by side."""
     greatest = 0.0
 
     def noting(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
@@ -272,13 +272,13 @@ def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> l
 
 
 def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
-    """Whether chance does not explain the gain, and the number is a fault's."""
+    """Tell whether chance does not explain the gain, and the number is a fault's."""
     is_small = isinstance(at.value, float) and abs(at.value) <= of.floor
     return at.gain > least_gain(count, of.size) and at.score(of) > 0.0 and not is_small
 
 
 def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
-    """Whether the number may as well be the last that is searched: its 95 % go on beyond."""
+    """Tell whether the number may as well be the last that is searched: its 95 % go on beyond."""
     if not of.has_end or at.is_special:
         return False
     [last] = gains_of([(of, float(np.copysign(of.limit, at.value)))])
@@ -288,7 +288,7 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
 def _with_rival(
     gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
 ) -> list[tuple[Peak, Hypothesis]]:
-    """Beside the number of a delay or angle another one, where chance explains the difference.
+    """Put beside the number of a delay or angle another one, where chance explains the difference.
 
     The likelier first; it alone, where chance does not.
     """
@@ -304,7 +304,7 @@ def _with_rival(
 
 
 def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:
-    """The causes with the intervals of their numbers."""
+    """Return the causes with the intervals of their numbers."""
     asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others are, or are not
     searches = []
     for at, _ in asking:
@@ -326,7 +326,7 @@ def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list
 
 
 def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
-    """The 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
+    """Compute the 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
     values, steps = np.array(at.value), np.array(of.tried[0])
     units = np.diag(steps)
     pairs = [(row, column) for row in range(of.size) for column in range(row + 1)]
@@ -345,7 +345,7 @@ def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Num
 
 
 def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -> list[Cause]:
-    """The causes with what either half of the log gains: what is wrong with a log is so in both."""
+    """Return the causes with what either half of the log gains: a fault is in both."""
     trials = [base] * (len(causes) + 1)
     for place, cause in enumerate(causes):
         trials = [

@@ -115,13 +115,13 @@ class _Seen(NamedTuple):
 
     @property
     def times(self) -> float:
-        """How many times larger, or smaller, they are."""
+        """Return how many times larger, or smaller, they are."""
         deviation = float(np.sqrt(self.nis))
         return 1.0 / deviation if self.is_small else deviation
 
     @property
     def is_small(self) -> bool:
-        """Whether they are smaller."""
+        """Tell whether they are smaller."""
         return self.nis < self.low
 
 
@@ -153,7 +153,7 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _inconsistent(stream: Stream) -> Iterator[_Seen]:
-    """The components whose mean square is none that a consistent filter has."""
+    """Yield the components whose mean square no consistent filter has."""
     stated = stream.metadata.get("noise", "")
     noise = f"its noise ({stated})" if stated else "its noise"
     for name, column in zip(stream.components, whitened(stream).T, strict=True):
@@ -176,7 +176,7 @@ def _inconsistent(stream: Stream) -> Iterator[_Seen]:
 
 
 def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> dict[str, Chart]:
-    """NIS per component over time, by case."""
+    """Draw NIS per component over time, by case."""
     charts: dict[str, Chart] = {}
     for stream in innovations.values():
         case = split_topic(stream.topic)[1]

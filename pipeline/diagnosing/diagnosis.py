@@ -191,7 +191,7 @@ class Diagnosis:
 
 
 def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outcome:
-    """The outcome with these tables and its summary in place of its own, those without rows left out."""
+    """Return the outcome with these tables and summary instead of its own; empty ones are left out."""
     found = {**tables, "summary": summary_table(outcome.metrics)}
     return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
 
@@ -297,7 +297,7 @@ def _of_recorded(
     settings: Mapping[str, Any],
     gap_limit_s: float,
 ) -> Diagnosis:
-    """What an autopilot's innovations say of its filter, which cannot be replayed.
+    """Diagnose a filter that cannot be replayed, by an autopilot's innovations.
 
     Raises BadInput where there are several filters, settings of one, or no innovations.
     """
@@ -377,7 +377,7 @@ def _followed(
 def _asked(
     source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
-    """The log and the one estimator that are asked for; of estimates the log that they are of."""
+    """Return the log and the one estimator asked for; of estimates the log that they are of."""
     has_estimates = labels_of(source) and not recorded_estimators(source)
     if has_estimates and isinstance(source, LogSource):
         stated = stated_estimators(source.log)

@@ -76,7 +76,7 @@ def without_filter(
     streamed: Collection[str],
     undone: Collection[tuple[Kind, str]] = (),
 ) -> list[Finding]:
-    """All that the topics of an estimator say by themselves, each once: the worst of the log first.
+    """Find what an estimator's topics say by themselves, each once: the worst of the log first.
 
     But for kinds of topics that are `undone`.
     """
@@ -89,7 +89,7 @@ def without_filter(
 
 
 def undone_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
-    """What parameters of the estimator undo already: a topic is late, or a number of it multiplied."""
+    """List what the estimator's parameters undo already: the delay or the factor of a topic."""
     found = list[tuple[Kind, str]]()
     for each in bound:
         if not isinstance(each, Recursive) or each.reading is None or each.parameters is None:
@@ -108,7 +108,7 @@ def undone_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
 
 
 def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str]) -> Iterator[Finding]:
-    """What a log says of its own faults before any filter, of the topics that an estimator reads."""
+    """Yield what a log says of its own faults without a filter, of topics an estimator reads."""
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
     for each in findings_in(source.blocks(topics, "publish_time", BLOCK)):
         if each.topic in streamed:
@@ -152,7 +152,7 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
 def of_innovations(
     innovations: Mapping[str, Stream], gate: float | None, epoch_ns: int, *, has_outliers: bool
 ) -> Iterator[Finding]:
-    """What the gate keeps out, and where a filter diverges; `gate` is its probability, if it is ours."""
+    """Yield what the gate (its probability, if it is ours) keeps out, and where a filter diverges."""
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
         is_in = stream["accepted"] != 0
@@ -185,7 +185,7 @@ def of_innovations(
 
 
 def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterator[Finding]:
-    """From when on NIS is too large for good, where it was not so before."""
+    """Find from when on NIS is too large for good, where it was not so before."""
     nis = stream["normalised_innovation_squared"]
     degrees = np.isfinite(stream["innovation"]).sum(axis=1)
     used = np.flatnonzero((degrees > 0) & np.isfinite(nis))
@@ -217,13 +217,13 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
 
 
 def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
-    """Where flags are set so many times in a row, and more: from and to."""
+    """Find where flags are set so many times in a row, and more: from and to."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 
 
 def of_messages(streams: Iterable[Stream], epoch_ns: int) -> Iterator[Finding]:
-    """Lost, repeated and late messages, values that saturate or are coarse."""
+    """Find lost, repeated and late messages, values that saturate or are coarse."""
     for stream in streams:
         if len(stream) >= FEWEST:
             yield from _of_stamps(stream, epoch_ns)
@@ -282,13 +282,13 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
 
 
 def _are_bursts(gaps: NDArray[np.integer]) -> bool:
-    """Whether gaps come after so many messages each time, as between bursts of a sensor."""
+    """Tell whether gaps come after so many messages each time, as between bursts of a sensor."""
     counts = np.diff(gaps)
     return len(counts) >= FEWEST and bool(np.mean(counts == np.median(counts)) > REGULAR)
 
 
 def _repeated(stream: Stream) -> int:
-    """How many messages equal the one before in stamp and content."""
+    """Count the messages that equal the one before in stamp and content."""
     same = np.diff(stream.publish_time_ns) == 0
     for column in stream.columns.values():
         step = column[1:] == column[:-1]
@@ -333,7 +333,7 @@ def _of_values(stream: Stream) -> Iterator[Finding]:
 
 
 def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Variances that stop at a floor."""
+    """Find variances that stop at a floor."""
     for topic, stream in estimates.items():
         if len(stream) < FEWEST or not stream.components:
             continue

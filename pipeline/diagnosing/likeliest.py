@@ -47,7 +47,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
 
 
 def _logs(folder: Path, result: Result) -> list[Path]:
-    """The logs of the runs that are kept, or that were replayed."""
+    """List the logs of the runs that are kept, or that were replayed."""
     kept = sorted(folder.glob("logs/run-*.mcap"))
     stated = result.settings.get("logs")
     files = stated.get("files", []) if isinstance(stated, Mapping) else []
@@ -64,7 +64,7 @@ def _cause(label: str, sentence: Sentence, mended: str) -> Cause:
 
 
 def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentence, main: str) -> str:
-    """What the same runs give with the mend; nothing where no parameter of the estimator is one."""
+    """Say what the same runs give with the mend; nothing where it is no parameter."""
     if not sentence.setting or sentence.setting.startswith("/"):
         return ""
     mend = merge(own, parse_settings([sentence.setting]))

@@ -130,11 +130,11 @@ class Likelihood:
         return found
 
     def __call__(self, trials: Sequence[Trial]) -> list[float]:
-        """The log-likelihoods; minus infinity where the estimator fails or loses measurements."""
+        """Compute the log-likelihoods; minus infinity where a replay fails or loses measurements."""
         return [float(each) for [each] in self.over_parts(trials, 1)]
 
     def over_parts(self, trials: Sequence[Trial], count: int) -> Floats:
-        """The log-likelihoods (trials, count) of equal shares of the measurements, in their order.
+        """Compute log-likelihoods (trials, count) of equal shares of the measurements, in order.
 
         Minus infinity where the estimator fails or loses measurements.
         """
@@ -155,7 +155,7 @@ class Likelihood:
         return found
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
-        """Trials in portions that memory holds."""
+        """Divide trials into portions that memory holds."""
         messages = sum(map(len, trials[places[0]].source.streams.values())) * part_count(self.starts)
         size = max(1, MOST_MESSAGES // max(messages, 1))
         return (places[first : first + size] for first in range(0, len(places), size))
@@ -167,7 +167,7 @@ class Likelihood:
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound]) -> Scored:
-        """What of a trial a filter can score: within the span of what drives it, after its prior."""
+        """Choose what of a trial can be scored: in the span of what drives it, after its prior."""
         streams = dict(trial.source.streams)
         left, count, stretch = dict[str, float](), dict[str, int](), dict[str, float]()
         begins = [np.iinfo(np.int64).max]
@@ -199,7 +199,7 @@ class Likelihood:
     def _innovations(
         self, trials: Sequence[Trial], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
-        """The innovations of trials of equal settings, of each part by topic; none where it fails."""
+        """Return the innovations of trials of equal settings, by part and topic; none where it fails."""
         count = part_count(self.starts)
         sources = [each.source for each in scored for _ in range(count)]
         begins_ns = [each.begin_ns for each in scored]
@@ -225,7 +225,7 @@ class Likelihood:
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
-        """The log-likelihoods of equal shares of the measurements, each given what is before it."""
+        """Compute log-likelihoods of equal shares of the measurements, each given those before it."""
         until = []
         for share in np.arange(1, count + 1) / count:
             found = [self._of_start(scored, part, share) for part in parts]
@@ -238,7 +238,7 @@ class Likelihood:
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float
     ) -> dict[str, float]:
-        """The log-likelihood of a share of what is seen of each thing; nothing where too much lacks."""
+        """Compute the log-likelihood of a share of what is seen of each; nothing if much lacks."""
         found = {}
         for name, all_ in self.count.items():
             topic = _topic(name)
@@ -269,7 +269,7 @@ class Likelihood:
 
 
 def _is_free(bound: Bound) -> bool:
-    """Whether broad starts are found for an estimator."""
+    """Tell whether broad starts are found for an estimator."""
     initialization = bound.initialization if isinstance(bound, Recursive) else None
     return initialization is not None and initialization.find_broad is not None
 
@@ -279,7 +279,7 @@ def _topic(name: str) -> str:
 
 
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
-    """From where to where a filter can score measurements, and the step of what drives it.
+    """Find from where to where a filter can score measurements, and the step of what drives it.
 
     What is before by a step at most is scored at the begin, and what is after while the last control
     holds, and once more as long: what a small delay moves over an end stays comparable.
@@ -299,7 +299,7 @@ def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) 
 
 
 def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
-    """The mean log-likelihood of messages (n, m) each of which is as far from the last as usual."""
+    """Compute the mean log-likelihood of messages (n, m) as far from the last as is usual."""
     steps = np.diff(numbers, axis=0)
     is_angle = np.array(kinds) == "angle"
     steps[:, is_angle] = np.remainder(steps[:, is_angle] + np.pi, 2.0 * np.pi) - np.pi
@@ -311,7 +311,7 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 
 
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
-    """Of topics that a filter foresees better than it states: no more than it says itself.
+    """Limit topics that a filter foresees better than it states to what it says of them itself.
 
     Of a body at rest the broad model knows more than a cautious filter; without this a delay would gain
     by moving messages to where nothing is scored.
@@ -346,18 +346,18 @@ def _later(stream: Stream, by_ns: int) -> Stream:
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:
-    """The log-likelihood of a part, as its innovations state it."""
+    """Compute the log-likelihood of a part, as its innovations state it."""
     return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
 def _key(trial: Trial) -> str:
-    """What has to be equal of trials that are replayed together."""
+    """Return what has to be equal of trials that are replayed together."""
     stated = {topic: stream.metadata for topic, stream in trial.source.streams.items()}
     return repr((sorted(trial.settings.items()), stated))
 
 
 def _extents(stream: Stream) -> Floats:
-    """How far the innovations (m,) of each component range; an angle may have any value."""
+    """Return how far the innovations (m,) of each component range; an angle may have any value."""
     kinds = stream.metadata["kinds"].split(",")
     known = np.where(np.isfinite(stream["innovation"]), stream["innovation"], np.nan)
     is_there = np.isfinite(known).any(axis=0)

@@ -137,7 +137,7 @@ def on_the_rest(
 def _likelihood(
     source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], end_ns: int
 ) -> float:
-    """The log-likelihood of all innovations from a stamp on."""
+    """Compute the log-likelihood of all innovations from a stamp on."""
     done = replay(source, {label: settings})
     total = 0.0
     for stream in Outputs(done, schemas.INNOVATION).values():

@@ -85,7 +85,7 @@ def peak(of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0
 
 
 def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
-    """The neighbours of the value of the greatest gain, with it between them; None where it has none."""
+    """Return the value of the greatest gain with its neighbours; None where it lacks one."""
     values = sorted(known)
     place = max(range(len(values)), key=lambda place: known[values[place]])
     if place in (0, len(values) - 1):
@@ -94,7 +94,7 @@ def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
 
 
 def _vertex(known: Mapping[float, float], low: float, best: float, high: float) -> float | None:
-    """Where the parabola through three values is greatest; None where a gain is infinite."""
+    """Find where the parabola through three values is greatest; None where a gain is infinite."""
     left, right = known[best] - known[low], known[best] - known[high]
     if not np.isfinite(left + right) or left + right <= 0.0:
         return None
@@ -104,7 +104,7 @@ def _vertex(known: Mapping[float, float], low: float, best: float, high: float) 
 
 
 def _promised(known: Mapping[float, float]) -> float:
-    """By how much a parabola about the greatest gain is above it."""
+    """Compute by how much a parabola about the greatest gain is above it."""
     around = _around(known)
     if around is None:
         return np.inf
@@ -120,7 +120,7 @@ def _promised(known: Mapping[float, float]) -> float:
 
 
 def _next(known: Mapping[float, float], limit: float) -> list[float]:
-    """The next values to look at: about the greatest gain, or beyond where that is the last one."""
+    """Choose what values to look at next: about the greatest gain, or beyond where it is the last."""
     around = _around(known)
     if around is None:
         best = max(known, key=lambda value: known[value])
@@ -140,12 +140,12 @@ def _next(known: Mapping[float, float], limit: float) -> list[float]:
 
 
 def _is_lopsided(low: float, best: float, high: float) -> bool:
-    """Whether a bracket is so uneven that a parabola says little."""
+    """Tell whether a bracket is so uneven that a parabola says little."""
     return max(best - low, high - best) > 8.0 * min(best - low, high - best)
 
 
 def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
-    """The greatest gain of the parabola through zero and both sides of it; infinite if it has none."""
+    """Compute the greatest gain of the parabola through zero and both sides of it, or infinity."""
     if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
         return np.inf
     low, high = sorted(sides)

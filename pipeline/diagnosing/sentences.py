@@ -58,7 +58,7 @@ class Sentence(NamedTuple):
 def ranked(
     causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
 ) -> list[Sentence]:
-    """Sentences in their order: stamps, causes, and what else is seen without any filter.
+    """Order sentences: stamps, causes, and what else is seen without any filter.
 
     What has a setting that undoes it stands before causes that are but its consequence, such as noise.
     What the causes advise is not said twice, nor what has no setting of a topic that they name.
@@ -89,7 +89,7 @@ def ranked(
 
 
 def _is_advised(setting: str, advised: Collection[str]) -> bool:
-    """Whether a setting, or that of the whole vector that it is an entry of, is advised."""
+    """Tell whether a setting, or that of the whole vector that it is an entry of, is advised."""
     stem = setting.partition("=")[0].removesuffix("_scale")
     return any(stem.startswith(each.removesuffix("_scale")) for each in advised)
 
@@ -97,7 +97,7 @@ def _is_advised(setting: str, advised: Collection[str]) -> bool:
 def marks_of(
     sentences: Sequence[Sentence], label: str, outputs: Sequence[str], first_ns: int
 ) -> dict[str, Stream]:
-    """Sentences as messages by topic, for a timeline: at the stamp where each one began.
+    """Write sentences as messages by topic, for a timeline: at the stamp where each one began.
 
     `outputs` are the topics of what was estimated, `first_ns` is the first stamp of the log.
     """
@@ -117,7 +117,7 @@ def marks_of(
 
 
 def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cause] = ()) -> list[str]:
-    """What has to be known of a diagnosis: what is in doubt or not judged, and how much is not said."""
+    """Say what has to be known of a diagnosis: what is in doubt, not judged, or not said."""
     notes = [
         "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
         f"than chance: {each.words}"
@@ -141,7 +141,7 @@ def _sentence(
     before: Sequence[Finding],
     rest: Rest | None,
 ) -> Sentence:
-    """A cause, what to try against it, and whether that is good for the rest of a long log.
+    """Say a cause, what to try against it, and whether that is good for the rest of a long log.
 
     `before` is what was found in the stamps, of which a cause may be a consequence.
     """

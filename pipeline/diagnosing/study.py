@@ -305,7 +305,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _recorded(
     scenario: Scenario, fault: Fault, seed: int, run: int
 ) -> tuple[MemorySource, MemorySource]:
-    """A run without a fault, and the same with it."""
+    """Record a run without a fault, and the same with it."""
     parameters = merge(scenario.parameters, fault.record)
     source = memory_source(*record_run(scenario.recorder, scenario.parameters, seed, run))
     faulty = memory_source(*record_run(scenario.recorder, parameters, seed, run))
@@ -318,7 +318,7 @@ def _recorded(
 
 
 def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: MemorySource) -> float:
-    """What removing the fault gains in log-likelihood; nothing where its measurements are fewer."""
+    """Compute the log-likelihood that removing the fault gains; nothing with fewer measurements."""
     likelihood = Likelihood(scenario.estimator)
     settings = {"kind": scenario.estimator, **OPEN}
     likelihood.begin(Trial(faulty, merge(settings, fault.settings)))
@@ -327,7 +327,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
 
 
 def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
-    """What the diagnosis said, and whether it is right."""
+    """Say what the diagnosis said, and whether it is right."""
     is_right = [
         any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in each.names)
         for each in found.sentences
@@ -349,7 +349,7 @@ def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Over the runs: how many are worth it, and of these how often the fault is named, and covered."""
+    """Count over the runs those that are worth it, and how often the fault is named and covered."""
     counted = rows[rows["worth"] >= WORTH]
     return pd.Series(
         {
@@ -367,7 +367,7 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 
 def _overall(runs: pd.DataFrame) -> dict[str, float]:
-    """Over all scenarios: what a diagnosis has to do."""
+    """Count over all scenarios what a diagnosis has to do."""
     counted = runs[runs["worth"] >= WORTH]
     sized = counted[counted["fault"].isin(SIZED)].dropna(subset=["covers"])
     return {
@@ -380,7 +380,7 @@ def _overall(runs: pd.DataFrame) -> dict[str, float]:
 
 
 def _chart(faults: pd.DataFrame) -> Chart:
-    """How often each fault that can be seen is named first."""
+    """Draw how often each fault that can be seen is named first."""
     names = list(dict.fromkeys(faults["fault"]))
     panel = Panel(
         x=Axis(label="fault: " + ", ".join(f"{place} {name}" for place, name in enumerate(names))),

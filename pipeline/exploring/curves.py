@@ -173,7 +173,15 @@ def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
 
 
 def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
-    """Return the rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
+    """Choose the rows that are drawn: the extremes of each span, so that no outlier is lost.
+
+    Args:
+        values: (n,); what is not finite counts as 0.
+        most: how many rows are chosen at most; of fewer values all are.
+
+    Returns:
+        The rows, ascending.
+    """
     count = len(values)
     if count <= most:
         return np.arange(count)
@@ -187,7 +195,16 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Floats:
-    """The outline (61, 2) of the region of the plane that holds the truth with this probability."""
+    """Outline the region of the plane that holds the truth with a probability.
+
+    Args:
+        center: (2,), the estimate.
+        covariance: (2, 2), of the estimate.
+        probability: with which the ellipse holds the truth.
+
+    Returns:
+        (61, 2), a closed outline in the unit of the center.
+    """
     values, vectors = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 61)
     radius = np.sqrt(-2.0 * np.log1p(-probability))

@@ -17,7 +17,7 @@ SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
 def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
-    """The name of a slider, its value, its ends and where the log's own value is.
+    """Write the name of a slider, its value, its ends and where the log's own value is.
 
     Of a parameter in the state the value is where the estimate begins.
     """
@@ -38,14 +38,14 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
 
 
 def heading_html(log: str) -> str:
-    """What the page is, and of which log."""
+    """Write what the page is, and of which log."""
     return f'<h1 style="font:inherit;margin:0"><b>fuselog</b> explore<br>{escape(log)}</h1>'
 
 
 def head_html(
     labels: Iterable[str], played: Mapping[int | str, Played], case: str, estimated: Mapping[str, Slider]
 ) -> str:
-    """What stands above the plots: verdicts, numbers, what is estimated in the state."""
+    """Write what stands above the plots: verdicts, numbers, what is estimated in the state."""
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
@@ -62,7 +62,7 @@ def head_html(
 
 
 def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
-    """What a filter makes of the parameters in its state, at the end of the log."""
+    """Say what a filter makes of the parameters in its state, at the end of the log."""
     found = []
     for name, slider in estimated.items():
         if name in case.beside and len(case.time_s):
@@ -74,7 +74,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
 
 
 def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
-    """A filter's verdict, in its colour."""
+    """Write a filter's verdict, in its colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
     return (
@@ -85,7 +85,7 @@ def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
 
 
 def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
-    """Its numbers, above those that are pinned."""
+    """Write its numbers, above those that are pinned."""
     cells = []
     before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
     for name, (value, unit) in numbers_of(played.cases[case]).items():

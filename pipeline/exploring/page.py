@@ -111,7 +111,7 @@ class Page:
         self._fill_side()
 
     def _fill_side(self) -> None:
-        """All that is to the left: filters, buttons, sliders."""
+        """Fill all that is to the left: filters, buttons, sliders."""
         session = self.session
         heading = Div(text=heading_html(session.source.name), width=SIDE)
         choices = filter_choices(session.filters, self._known)
@@ -149,7 +149,7 @@ class Page:
         self._side.children = shown
 
     def _label(self, slider: Slider) -> None:
-        """The name of a slider, its value, its ends and the log's own value."""
+        """Write the name of a slider, its value, its ends and the log's own value."""
         value = self.values.get(slider.name, slider.own)
         _, widget, label = self._widgets[slider.name]
         label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
@@ -331,7 +331,7 @@ class Page:
         self._work.ask(work)
 
     def _rest(self) -> None:
-        """Once a slider rests: the likelihood is seen, and plots have the names of what they show."""
+        """Show the likelihood, and name what the plots show, once a slider rests."""
         self.plots["likelihood"].show_if_drawn()
         for plot in self.plots.values():
             plot.name()

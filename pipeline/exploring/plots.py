@@ -125,7 +125,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
-    """Errors of one component, tinted where the filter says that 95 % of them lie."""
+    """Plot errors of one component, tinted where the filter says that 95 % of them lie."""
     plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
     plot.figure.yaxis.ticker = FixedTicker(ticks=[])
     for of in (1, 0):
@@ -138,7 +138,7 @@ def error_plot(over_time: Range1d, cursor: Span) -> Plot:
 
 
 def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
-    """NEES or NIS over time on a logarithmic axis, grey where those of an honest filter lie."""
+    """Plot NEES or NIS on a logarithmic axis over time, grey where those of an honest filter lie."""
     plot = blank(name, title, over_time=over_time, y_range=Range1d(0.1, 100.0), y_axis_type="log")
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT, fill_alpha=1.0)
@@ -150,7 +150,7 @@ def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
 
 
 def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
-    """The plane from above: map, truth, estimates."""
+    """Plot the plane from above: map, truth, estimates."""
     plot = blank("scene", "Scene from above (m)", match_aspect=True)
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     points = map_points(log)
@@ -185,7 +185,7 @@ def lens_plot() -> Plot:
 
 
 def whiteness_plot() -> Plot:
-    """Autocorrelations of the component of the whitened innovations that is least white."""
+    """Plot autocorrelations of the component of the whitened innovations that is least white."""
     plot = blank("whiteness", "Whiteness", y_range=Range1d(-0.25, 0.25))
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT)
@@ -199,7 +199,7 @@ def whiteness_plot() -> Plot:
 
 
 def likelihood_plot() -> Plot:
-    """The log-likelihood of all measurements over the parameter that is dragged."""
+    """Plot the log-likelihood of all measurements over the parameter that is dragged."""
     plot = blank("likelihood", "Likelihood", x_range=Range1d(-0.05, 1.05), y_range=Range1d(0.0, 1.0))
     plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
     plot.figure.xaxis.ticker = FixedTicker(ticks=TICKS)
@@ -229,7 +229,7 @@ def show_played(
 
 
 def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
-    """The error of a component; of what has no truth its estimate or how sure the filter is of it."""
+    """Show the error of a component; without truth its estimate or how sure the filter is of it."""
     errors, name = case.errors, label_of(component)
     if errors is None or component not in errors.components:
         if component not in case.components:  # as of a filter without it in the state
@@ -374,7 +374,7 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
-    """A line for what is pinned and for each filter, the second dashed on top."""
+    """Draw a line for what is pinned and for each filter, the second dashed on top."""
     for of in (PINNED, 0, 1):
         colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
         source = plot.source(of, "line", x, y)
@@ -383,7 +383,7 @@ def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
 
 
 def _foot(plot: Plot) -> None:
-    """A strip of marks at the foot, where the first filter is outside."""
+    """Draw a strip of marks at the foot, where the first filter is outside."""
     plot.figure.extra_y_ranges = {"foot": Range1d(0.0, 1.0)}
     marks = plot.source(0, "outside", "t", "foot")
     plot.figure.scatter("t", "foot", source=marks, marker="dash", angle=np.pi / 2, size=7, color=RED,

@@ -70,7 +70,7 @@ class Explorer:
         self._is_ended.wait()
 
     def _repr_html_(self) -> str:
-        """The page within a notebook's cell."""
+        """Return the page within a notebook's cell."""
         return f'<iframe src="{self.url}" width="100%" height="900" style="border:0"></iframe>'
 
     def _serve(self) -> None:

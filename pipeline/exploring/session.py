@@ -97,7 +97,7 @@ class Session:
         return any(each.name == name for each in self.sliders)
 
     def like_first(self, method: str) -> dict[str, Any]:
-        """The settings of a filter by another method, of the same model where that is one's own."""
+        """Return the settings of a filter by another method, of the same model if it is one's own."""
         like = next(iter(self.filters.values()))
         kind = like.get("kind")
         model = model_of(kind) if isinstance(kind, Estimator) else None
@@ -154,7 +154,7 @@ class Session:
                 yield value, likelihood
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
-        """The best values of some parameters, the others as they are set, and by what they are best.
+        """Find the best values of some parameters, the others as they are set, and by what.
 
         Raises BadInput as `tune` does.
         """
@@ -208,7 +208,7 @@ class Session:
         return tomli_w.dumps(tables)
 
     def command(self, values: Values) -> str:
-        """The command that replays the same; raises BadInput where one is an estimator of one's own."""
+        """Write the command that replays the same; raises BadInput for an estimator of one's own."""
         place = self.source.log.path if isinstance(self.source, LogSource) else self.source.name
         words = ["fuselog replay", shlex.quote(str(place))]
         for label, own in self.filters.items():
@@ -238,7 +238,7 @@ class Session:
 
 
 def _set_to(label: str, value: Any) -> str:
-    """A setting as `--set` takes it: JSON's texts, numbers and lists are TOML's."""
+    """Write a setting as `--set` takes it: JSON's texts, numbers and lists are TOML's."""
     if isinstance(value, Estimator):
         raise BadInput(f"{label}: is an estimator of your own; a command cannot name it")
     return json.dumps(value)

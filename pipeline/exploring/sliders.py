@@ -76,7 +76,7 @@ class Slider(NamedTuple):
         return min(max(value, self.low), self.high)
 
     def values(self, count: int) -> list[float]:
-        """So many values from end to end."""
+        """Return so many values from end to end."""
         return [self.value(place) for place in np.linspace(0.0, 1.0, count).tolist()]
 
     def _straight(self, value: float) -> float:
@@ -101,7 +101,7 @@ def in_words(value: float, unit: str) -> str:
 
 
 def _unit_for(value: float, unit: str) -> tuple[float, str]:
-    """By what to multiply so that a number is of a handy size, and what to write behind it."""
+    """Choose by what to multiply so that a number is handy, and what to write behind it."""
     for most, factor, shorter in SMALLER.get(unit, ()):
         if 0.0 < abs(value) < most or most == math.inf:
             return factor, shorter if shorter.startswith("°") else f" {shorter}"
@@ -150,7 +150,7 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
 
 
 def _groups(label: str, bound: Bound) -> dict[str, str]:
-    """The names of parameters that matter on this log, with what they are of."""
+    """Name the parameters that matter on this log, with what they are of."""
     assert bound.parameters is not None
     names = number_fields(type(bound.parameters))
     if not isinstance(bound, Recursive) or bound.reading is None:
@@ -170,14 +170,14 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
 
 
 def _order(group: str, topics: Sequence[str]) -> int:
-    """Sensors in the order in which they are read, then the motion."""
+    """Order sensors as they are read, then the motion."""
     return topics.index(group) if group in topics else len(topics)
 
 
 def _slider(
     name: str, group: str, meaning: str, unit: str, source: LogSource | MemorySource, bound: Bound
 ) -> Slider | None:
-    """The slider of a parameter; None where it is no number, or has no value on this log."""
+    """Make the slider of a parameter; None where it is no number, or has no value on this log."""
     try:
         least, greatest = bounds_of(type(bound.parameters), name)  # type: ignore[arg-type]
         own, _ = value_at_start(name, source, bound)
@@ -200,7 +200,7 @@ def _slider(
 
 
 def setting_text(values: Mapping[str, float]) -> Iterable[str]:
-    """Values as `--set` takes them.
+    """Write values as `--set` takes them.
 
     >>> list(setting_text({"sigma_range_m": 0.043}))
     ['--set sigma_range_m=0.043']

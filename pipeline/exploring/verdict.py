@@ -48,7 +48,7 @@ def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> 
 
 
 def _ratio(case: Case, about: Set[str]) -> tuple[float, str]:
-    """How many times larger errors or innovations are than stated, and which of them it is of.
+    """Find how many times larger errors or innovations are than stated, and which of them it is.
 
     Of those that alarms are about the one that is farther from one: a filter may be right on what it
     measures and wrong on the rest. NaN where no alarm is about either, or there are no numbers.

@@ -55,12 +55,12 @@ def widget_of(slider: Slider, value: float) -> Any:
 
 
 def tags_of(slider: Slider, value: float) -> list[str]:
-    """What a screen reader says of a slider: its name with what it is of, and its value."""
+    """Return what a screen reader says of a slider: its name with what it is of, and its value."""
     return [f"{slider.title}, {slider.group}", slider.words(value)]
 
 
 def time_range(epoch_ns: int) -> Range1d:
-    """The range of all plots over time, whose name says since when it counts."""
+    """Make the range of all plots over time, whose name says since when it counts."""
     if epoch_ns == SIMULATION_EPOCH_NS or epoch_ns < YEAR_2000_NS:
         return Range1d(0.0, 1.0, name="time since the log began (s)")
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)
@@ -68,7 +68,7 @@ def time_range(epoch_ns: int) -> Range1d:
 
 
 def filter_choices(filters: Iterable[str], known: Iterable[str]) -> list[Any]:
-    """Choices of the first filter and of the second, which may be none: those at hand, and methods."""
+    """Make the choices of both filters, the second of which may be none: those at hand, methods."""
     width = (SIDE - 20) // 2
     names = list(dict.fromkeys([*known, *(each for each in METHODS if each not in NO_FILTERS)]))
     first, second = [*filters, NONE][:2]
@@ -79,7 +79,7 @@ def filter_choices(filters: Iterable[str], known: Iterable[str]) -> list[Any]:
 
 
 def buttons(acts: Mapping[str, Callable[[], None]]) -> list[Any]:
-    """Rows of buttons, by label."""
+    """Make rows of buttons, by label."""
     made = []
     for label, act in acts.items():
         button = Button(label=label, name=label, width=(SIDE - 10 * A_ROW) // A_ROW)

@@ -34,7 +34,7 @@ class ConstraintParameters(Parameters):
 
 
 def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
-    """The topics `standing` and `rolling` beside that of a unit: messages that hold 1 where it is so.
+    """Make the topics `standing` and `rolling` beside that of a unit: messages hold 1 where it is so.
 
     Args:
         inertial: the unit's samples.

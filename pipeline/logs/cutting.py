@@ -14,7 +14,7 @@ from replay.engine.streams.sources import LogSource
 
 
 def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
-    """Maps, priors, and topics all of whose messages have the first stamp of the log."""
+    """List maps, priors, and topics all of whose messages have the first stamp of the log."""
     first_ns, _ = LogSource(log).extent("publish_time")
     early: Counter[str] = Counter()
     for block in stream_blocks(log, topics, None, first_ns + 1):

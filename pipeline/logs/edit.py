@@ -276,7 +276,7 @@ def constrain(
 
 
 def _unit_of(log: Log, unit: str | None) -> str:
-    """The topic of inertial samples that is meant; raises BadInput where it is not clear."""
+    """Find the topic of inertial samples that is meant; raises BadInput where it is not clear."""
     kind = schemas.INERTIAL_SAMPLE.full_name
     units = [name for name, topic in log.topics.items() if topic.schema_name == kind]
     if not units:
@@ -291,7 +291,7 @@ def _unit_of(log: Log, unit: str | None) -> str:
 
 
 def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int]:
-    """What to add to the stamps of each log; raises BadInput where they would leave their range."""
+    """Return what to add to the stamps of each log; raises BadInput where they leave their range."""
     paths = [log.path for log in logs]
     for path, offset_s in offsets_s.items():
         if Path(path) not in paths:
@@ -312,7 +312,7 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
 
 
 def _shifted(stream: Stream, offset_ns: int) -> Stream:
-    """The stream by another clock: its stamps, and what its messages say of times by the log's clock."""
+    """Move a stream to another clock: its stamps, and the times by the log's clock in messages."""
     if not offset_ns:
         return stream
     is_ours = stream.schema.full_name in SCHEMAS
@@ -330,7 +330,7 @@ def _shifted(stream: Stream, offset_ns: int) -> Stream:
 
 
 def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
-    """New names by old ones, of topics and of those that metadata names; those that stay are absent."""
+    """Name topics anew, and those that metadata names, by old names; those that stay are absent."""
     stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
     known = [
         *log.topics,

@@ -96,7 +96,7 @@ def export(
 
 
 def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[str]:
-    """The topics to export; what does not fit is noted, or refused where it was asked for."""
+    """Choose the topics to export; what does not fit is noted, or refused where it was asked for."""
     chosen = []
     for topic in dict.fromkeys(topics or log.topics):
         if topic not in log.topics:
@@ -123,7 +123,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
 
 
 def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
-    """One log of the companions of all topics that have some."""
+    """Write one log of the companions of all topics that have some."""
     from pipeline.logs.foxglove import companions  # which takes long to import
 
     check_files([(place, _new("foxglove"))], {"log": [log.path]})
@@ -141,7 +141,7 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
 
 
 def _export_frames(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
-    """A folder of tracks and truths, frame by frame."""
+    """Write a folder of tracks and truths, frame by frame."""
     files = mot_files(log, topics)
     names = {name: f"{quote(name, safe=' ')}{SUFFIXES['mot']}" for name in files}
     check_folder(place, {"log": [log.path]})
@@ -154,12 +154,12 @@ def _export_frames(log: Log, topics: Sequence[str], place: Path, notes: list[str
 
 
 def _new(to: To) -> Kind:
-    """A file that is not there yet."""
+    """Return the kind of a file that is not there yet."""
     return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 
 def _is_state(log: Log, topic: str) -> bool:
-    """Whether a topic holds estimates, a truth or poses; a prior is none of these."""
+    """Tell whether a topic holds estimates, a truth or poses; a prior is none of these."""
     schema = log.topics[topic].schema_name
     is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
     return is_estimate or schema in (schemas.TRUTH_STATE.full_name, schemas.POSE.full_name)
@@ -191,7 +191,7 @@ def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
 
 @contextmanager
 def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
-    """A text file of poses; what they lack is noted."""
+    """Write a text file of poses; what they lack is noted."""
     header, lines_of = TRAJECTORIES[to]
     dropped: dict[str, int] = {}
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -213,7 +213,7 @@ def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
 
 @contextmanager
 def _table_file(path: Path, to: To) -> Iterator[Write]:
-    """A file of rows, whose columns are those of the first stream that is written."""
+    """Write a file of rows, whose columns are those of the first stream that is written."""
     import pyarrow.csv
     import pyarrow.parquet
 

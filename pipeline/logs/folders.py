@@ -6,7 +6,7 @@ from recorders.errors import BadInput
 
 
 def logs_in(path: Path) -> list[Path]:
-    """The logs of a folder by name, without the estimates beside them; of any other path that path.
+    """List a folder's logs by name, without the estimates beside them; of another path that path.
 
     Raises BadInput where a folder has none.
     """

@@ -41,7 +41,7 @@ Made = Iterator[tuple[str, Message, int]]
 
 
 def companions(stream: Stream) -> Iterator[Companion]:
-    """The companions of a stream, or of a block of it: none of a prior, or where there is no message.
+    """Yield the companions of a stream, or of a block of it: none of a prior or of no messages.
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
     FrameTransforms; ellipses of 95 %, tracks and landmarks SceneUpdate; particles and detections
@@ -63,7 +63,7 @@ def companions(stream: Stream) -> Iterator[Companion]:
 
 
 def _states(stream: Stream) -> Made:
-    """Truths and estimates: their poses, and what they are unsure of."""
+    """Make the poses of truths and estimates, and what these are unsure of."""
     field = "mean" if "mean" in stream.columns else "state"
     rows = np.flatnonzero(np.isfinite(stream[field]).all(axis=1))
     known = stream.take(rows)
@@ -85,7 +85,7 @@ def _states(stream: Stream) -> Made:
 
 
 def _fixes(stream: Stream) -> Made:
-    """Positions, turned by the course where there is one."""
+    """Make positions, turned by the course where there is one."""
     places, quaternions = _padded(stream["position_m"]), None
     if "course_rad" in stream.columns:
         heading_rad = 0.5 * np.pi - np.nan_to_num(stream["course_rad"])
@@ -101,7 +101,7 @@ def _stated_poses(stream: Stream) -> Made:
 def _poses(
     stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], places: Floats, quaternions: Floats | None
 ) -> Made:
-    """Poses, and with an orientation the transforms that they are."""
+    """Make poses, and with an orientation the transforms that they are."""
     for row, pose in enumerate(_in_frame(stream, places, quaternions)):
         yield "pose", pose, int(rows[row])
         if quaternions is not None:
@@ -116,7 +116,7 @@ def _poses(
 
 
 def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
-    """A pose for each row of places (n, 3) and quaternions (n, 4); the identity without them."""
+    """Yield a pose for each row of places (n, 3) and quaternions (n, 4); the identity without them."""
     for row, place in enumerate(places):
         pose = PoseInFrame(frame_id=_frame_of(stream))
         pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
@@ -145,7 +145,7 @@ def _location_fixes(stream: Stream) -> Made:
 
 
 def _landmarks(stream: Stream) -> Made:
-    """Spheres with their numbers, which stay."""
+    """Make spheres with their numbers, which stay."""
     scene = SceneUpdate()
     for row, place in enumerate(_padded(stream["position_m"])):
         number = int(stream["landmark_id"][row])
@@ -155,7 +155,7 @@ def _landmarks(stream: Stream) -> Made:
 
 
 def _tracks(stream: Stream) -> Made:
-    """All tracks of a stamp: a sphere with the number, and the ellipse."""
+    """Make all tracks of a stamp: a sphere with the number, and the ellipse."""
     if not set(PLANE) <= set(stream.components):
         return
     outlines = _outlines(stream)
@@ -185,7 +185,7 @@ def _detections(stream: Stream) -> Made:
 
 
 def _scans(stream: Stream, places: Floats) -> Made:
-    """All places (n, 3) of a stamp."""
+    """Make the scene of all places (n, 3) of a stamp."""
     for rows in _by_stamp(stream):
         poses = PosesInFrame(frame_id=_frame_of(stream))
         poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))
@@ -195,14 +195,14 @@ def _scans(stream: Stream, places: Floats) -> Made:
 
 
 def _by_stamp(stream: Stream) -> Iterator[list[int]]:
-    """The rows of each stamp, sorted by time as they are."""
+    """Yield the rows of each stamp, sorted by time as they are."""
     stamps = stream.publish_time_ns
     for _, rows in groupby(range(len(stream)), lambda row: stamps[row]):
         yield list(rows)
 
 
 def _outlines(stream: Stream) -> Floats:
-    """The ellipses (n, vertices, 2) of the plane that hold the states with 95 %."""
+    """Compute the ellipses (n, vertices, 2) of the plane that hold the states with 95 %."""
     columns = [stream.components.index(name) for name in PLANE]
     return ellipses(stream["mean"][:, columns], covariances_of(stream, PLANE))
 
@@ -232,7 +232,7 @@ def _add_point(entity: Any, place: Floats, label: str, colour: Sequence[int]) ->
 
 
 def _set_pose(pose: Any, place: Floats, quaternion: Floats | None) -> None:
-    """A position, and a quaternion with w first."""
+    """Write a position, and a quaternion with w first."""
     _set_vector(pose.position, place)
     w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
     pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = x, y, z, w
@@ -252,14 +252,14 @@ def _colour(stream: Stream) -> Sequence[int]:
 
 
 def _padded(places: Floats) -> Floats:
-    """Places (n, 1 to 3) in space: what they lack is zero."""
+    """Extend places (n, 1 to 3) to space: what they lack is zero."""
     padded = np.zeros((len(places), 3))
     padded[:, : places.shape[1]] = places[:, :3]
     return padded
 
 
 def _frame_of(stream: Stream) -> str:
-    """The frame that a stream states; what a sensor detects is in that of its case."""
+    """Return the frame that a stream states; what a sensor detects is in that of its case."""
     is_seen = stream.schema.full_name == schemas.DETECTION.full_name
     return stream.metadata.get("frame_id") or (_case_of(stream) if is_seen else WORLD)
 
@@ -269,7 +269,7 @@ def _child_of(stream: Stream) -> str:
 
 
 def _case_of(stream: Stream) -> str:
-    """What a topic is of, as the name of a frame: its name without the last part."""
+    """Name a frame by what a topic is of: its name without the last part."""
     return stream.topic.strip("/").rpartition("/")[0] or stream.topic.strip("/")
 
 

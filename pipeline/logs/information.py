@@ -94,7 +94,7 @@ def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
 
 
 def _findings(log: Log) -> list[Finding]:
-    """What the log says of its own faults; of one that is damaged nothing, and that it is."""
+    """Find what the log says of its own faults; of one that is damaged nothing, and that it is."""
     try:
         return lint_log(log, portions=1)
     except BadInput as error:
@@ -267,7 +267,7 @@ def _say_run(run: RunMetadata) -> None:
 
 
 def _changed(run: RunMetadata) -> dict[str, Any]:
-    """The parameters that are not the recorder's defaults; all where the recorder is not here."""
+    """Return the parameters that are not the recorder's defaults; all where there is no recorder."""
     try:
         described = describe(load("recorders", run.scenario, Recorder).parameters)
     except BadInput:
@@ -278,7 +278,7 @@ def _changed(run: RunMetadata) -> dict[str, Any]:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
-    """Nested values by their full names."""
+    """Return nested values by their full names."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, Mapping) and value:

@@ -75,7 +75,7 @@ def _is_point(topic: Topic) -> bool:
 
 
 def _frames(epoch_ns: int, last_ns: int) -> Integers:
-    """The stamps of all frames until the last stamp."""
+    """Return the stamps of all frames until the last stamp."""
     return np.arange(epoch_ns, last_ns + 1, PERIOD_NS)
 
 

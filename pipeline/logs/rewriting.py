@@ -33,7 +33,7 @@ class Changed(NamedTuple):
 def stream_blocks(
     log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
 ) -> Blocks:
-    """Blocks of a span, each with its streams in the order of `topics`, which settles ties."""
+    """Yield blocks of a span, each with its streams in the order of `topics`, which settles ties."""
     for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
         yield [block[topic] for topic in topics if topic in block]
 
@@ -56,7 +56,7 @@ def write_changed(
 
 
 def ranked(log: Log) -> list[str]:
-    """The topics in the order in which the log declares them: so its writer ordered equal stamps."""
+    """Order the topics as the log declares them: so its writer ordered equal stamps."""
     return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
 
 
@@ -128,7 +128,7 @@ def readable_log(
 
 
 def run_of(log: Log, target: Path) -> RunMetadata:
-    """The log's run, with the place of the log that estimates are of as it is seen from the target."""
+    """Return the log's run, with the place of the log that estimates are of, seen from the target."""
     run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
     if "log" not in run.notes:
         return run

@@ -46,7 +46,7 @@ def alarms_of(
 
 
 def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
-    """A gate that keeps out too much, and NIS that is beyond its interval."""
+    """Find a gate that keeps out too much, and NIS that is beyond its interval."""
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
         estimator, case = split_topic(topic)
@@ -76,7 +76,7 @@ def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -
 
 
 def _of_errors(judge: Judge) -> Iterator[Alarm]:
-    """NEES beyond its interval; of positions whose error stays, that."""
+    """Find NEES beyond its interval; of positions whose error stays, that."""
     metrics, intervals, constants = judge.metrics, judge.intervals(CONSISTENT), judge.constants
     for topic in judge.judged:
         what = estimator, case = split_topic(topic)
@@ -101,7 +101,7 @@ def _of_errors(judge: Judge) -> Iterator[Alarm]:
 
 
 def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
-    """An error that stays."""
+    """Describe an error that stays."""
     offset = ", ".join(f"{each:.3g}" for each in constant.offset_m)
     name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
     words = f"{name}: {_percent(constant.share)} of the squared error is constant, "
@@ -117,7 +117,7 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
 
 
 def _of_costs(judge: Judge) -> Iterator[Alarm]:
-    """The search of a trajectory that ended at more than its residuals leave."""
+    """Find searches of a trajectory that ended at more than their residuals leave."""
     metrics = judge.metrics
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
@@ -138,7 +138,7 @@ def _of_costs(judge: Judge) -> Iterator[Alarm]:
 
 
 def _of_digits(judge: Judge) -> Iterator[Alarm]:
-    """Covariances, of estimates or of innovations, of which rounding has left next to nothing."""
+    """Find covariances, of estimates or innovations, of which rounding left next to nothing."""
     for topic, found in judge.conditioning.items():
         if not found.lost:
             continue
@@ -162,7 +162,7 @@ def _of_digits(judge: Judge) -> Iterator[Alarm]:
 
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
-    """Measurements that came to nothing for a reason; what a tracker leaves over has none."""
+    """Find measurements that came to nothing for a reason; what a tracker leaves over has none."""
     measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
         is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
@@ -174,7 +174,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
-    """Estimators with different gates, where one kept something out: they are not judged alike."""
+    """Find estimators with different gates, where one kept something out: they are judged unlike."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

@@ -172,7 +172,17 @@ def curve(
 def path(
     label: str, points: NDArray[np.float64], style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """Points (n, 2) over the plane."""
+    """Return a series of points in the plane.
+
+    Args:
+        label: its name in the legend.
+        points: (n, 2), x and y.
+        style: how it is drawn.
+        reference: whether it is what others are compared with.
+
+    Returns:
+        The series, for `Panel.series`.
+    """
     return curve(label, points[:, 0], points[:, 1], style, reference=reference)
 
 
@@ -193,13 +203,32 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
 
 
 def level(label: str, x: ArrayLike, y: float) -> Series:
-    """Return a value that others are seen against, from end to end."""
+    """Return a value that others are compared with, from end to end.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names; only the first and the last count.
+        y: the value.
+
+    Returns:
+        The series, for `Panel.series`.
+    """
     ends = np.asarray(x)[[0, -1]]
     return curve(label, ends, [y, y], reference=True)
 
 
 def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
-    """Draw one range that others are seen against, from end to end."""
+    """Return one range that others are compared with, from end to end.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names; only the first and the last count.
+        low: its lower end.
+        high: its upper end.
+
+    Returns:
+        The band, for `Panel.bands`.
+    """
     ends = np.asarray(x)[[0, -1]]
     return band(label, ends, [low, low], [high, high], reference=True)
 
@@ -224,7 +253,7 @@ def _places(values: ArrayLike) -> Places:
 
 
 def _numbers(values: ArrayLike) -> Numbers:
-    """Numbers as JSON has them, to seven digits, which no screen resolves; NaN and infinity are null."""
+    """Write numbers as JSON has them, to seven digits, as no screen shows more; NaN becomes null."""
     array = np.asarray(values, dtype=float)
     return [float(f"{value:.7g}") if np.isfinite(value) else None for value in array.tolist()]
 
@@ -256,7 +285,7 @@ def draw(chart: Chart) -> "Figure":
 
 
 def _height_in(panel: Panel) -> float:
-    """How high a panel is: of a plane with limits as high as these ask for."""
+    """Choose how high a panel is: of a plane with limits as high as these ask for."""
     if panel.plane and panel.x.limits and panel.y.limits:
         wide, high = panel.x.limits[1] - panel.x.limits[0], panel.y.limits[1] - panel.y.limits[0]
         return min(4.5, 7.0 * high / wide + 0.9)
@@ -297,12 +326,12 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
 
 
 def _known(values: Places) -> list[Any]:
-    """Values as matplotlib has them: NaN where there is none."""
+    """Return values as matplotlib has them: NaN where there is none."""
     return [math.nan if value is None else value for value in values]
 
 
 def show_names_as_they_are(figure: "Figure") -> None:
-    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
+    """Keep a dollar sign in titles, labels and ticks from beginning a formula: names hold some."""
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]

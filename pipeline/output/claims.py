@@ -76,7 +76,7 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 
 
 def known(claim: Claim) -> Claim:
-    """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
+    """Return the claim, neither confirmed nor refuted where a number of ours is missing."""
     has_none = claim.verdict in ("not reproducible", NO_VERDICT)
     if has_none or not re.search(r"\bnan\b", claim.ours):
         return claim
@@ -131,7 +131,7 @@ class StatedClaim(Parameters):
 
     @property
     def recordings(self) -> set[str]:
-        """The recordings that it is of; `*` for those that a result will tell, "" for the first."""
+        """Return the recordings that it is of: `*` for those a result will tell, "" for the first."""
         return {_named(self, meant).recording for meant in _combinations(self.each)}
 
     @property
@@ -151,7 +151,7 @@ class StatedClaim(Parameters):
 
 
 def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
-    """What reading an expression gives; BadInput that names the claim where it cannot be read."""
+    """Read an expression; raises BadInput that names the claim where it cannot be read."""
     try:
         return read(*arguments)
     except BadInput as error:
@@ -186,7 +186,7 @@ def decide(
     names: Mapping[str, float],
     recordings: Mapping[str, bool] | None = None,
 ) -> list[Claim]:
-    """The claims with their verdicts by a result's metrics, their 95 % intervals, and numbers by name.
+    """Give claims verdicts by a result's metrics, 95 % intervals, and numbers by name.
 
     `recordings` tells of each recording whether the result is of it: there is no verdict on claims of
     others. Raises BadInput where an expression of a claim cannot be evaluated.
@@ -203,7 +203,7 @@ def decide(
 
 
 def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
-    """The claim, without its verdict where it is of another recording; "" is the first one."""
+    """Return the claim, without its verdict where it is of another recording; "" is the first."""
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
@@ -213,7 +213,7 @@ def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim)
 def _combinations(
     each: Mapping[str, str | list[Any]], metrics: Mapping[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """What the names of `each` stand for, one combination after another.
+    """Yield what the names of `each` stand for, one combination after another.
 
     Without metrics, which are not known before a run, their `*` stands for itself.
     """
@@ -229,13 +229,13 @@ def _combinations(
 
 
 def _found(pattern: str, metrics: Mapping[str, Any]) -> list[str]:
-    """What the `*` of a metric such as `nees[ekf, *]` stands for, each once."""
+    """List what the `*` of a metric such as `nees[ekf, *]` stands for, each once."""
     quantity, _, of = pattern.removesuffix("]").partition("[")
     return list(dict.fromkeys(keys_of(quantity, of, metrics).values()))
 
 
 def _named(claim: StatedClaim, names: Mapping[str, Any]) -> StatedClaim:
-    """The claim with what names stand for in their places."""
+    """Put into the claim what names stand for."""
 
     def put(text: str) -> str:
         return Template(text).safe_substitute(names)
@@ -252,7 +252,7 @@ _TEXTS = (
 
 
 def _decided(claim: StatedClaim, values: Values) -> Claim | None:
-    """The claim with its verdict; None where it is left out."""
+    """Give the claim its verdict; None where it is left out."""
     try:
         return _reading(claim.sentence, _verdict, claim, values)
     except NoMetric as error:
@@ -265,7 +265,7 @@ def _decided(claim: StatedClaim, values: Values) -> Claim | None:
 
 
 def _as_far_as_known(text: str, values: Values) -> str:
-    """The text with its numbers, or as it stands where one of them is missing."""
+    """Put numbers into the text, or leave it as it stands where one of them is missing."""
     try:
         return formatted(text, values)
     except (BadInput, NoMetric):

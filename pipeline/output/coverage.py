@@ -81,7 +81,7 @@ def _untaken(offer: str) -> str:
 
 
 def _messages(source: Source, topic: str, order: Clock) -> int:
-    """How many messages of a topic lie in the source's span."""
+    """Count the messages of a topic that lie in the source's span."""
     if source.start_ns is None and getattr(source, "end_ns", None) is None:
         return source.topics[topic].messages
     return sum(len(block[topic]) for block in source.blocks([topic], order, BLOCK_MESSAGES))
@@ -93,7 +93,7 @@ def recounted(
     stated: Mapping[str, Any],
     doubts: Mapping[str, Doubt],
 ) -> list[Row]:
-    """The same table from estimates logs and the logs that they are of, as their replay counted it.
+    """Count the same table from estimates logs and the logs that they are of, as the replay did.
 
     `stated` are the estimators' settings by label, `doubts` those about truths. What cannot be bound
     here says so in its row.
@@ -121,14 +121,14 @@ def recounted(
 
 
 def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock]:
-    """The span of a log that estimates are of, and the clock that they go by."""
+    """Return the span of a log that estimates are of, and the clock that they go by."""
     notes = estimates.run.notes if estimates.run else {}
     start_ns, end_ns, order = _noted(notes.get(REPLAYED, ""))
     return replace(source, start_ns=start_ns, end_ns=end_ns), order
 
 
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
-    """The note REPLAYED of a source's estimates; none where it was replayed whole, by publish time."""
+    """Return the note REPLAYED of a source's estimates; none where it is whole, by publish time."""
     ends = source.start_ns, getattr(source, "end_ns", None)
     text = json.dumps([*ends, order])
     return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
@@ -148,7 +148,7 @@ def _noted(note: str) -> tuple[int | None, int | None, Clock]:
 def _recounted(
     estimates: LogSource, source: LogSource, order: Clock, bound: Sequence[Bound]
 ) -> dict[str, Usage]:
-    """One run's counts by bound estimator: its messages, and what was said up to their last."""
+    """Count one run by bound estimator: its messages, and what was said up to their last."""
     usages = {each.name: Usage(each.name) for each in bound}
     maps = {
         topic: gather([source.read([topic])[topic]])
@@ -196,7 +196,7 @@ def _recounted(
 
 
 def _places(bound: Iterable[Bound]) -> dict[str, str]:
-    """The names of bound estimators by what their topics begin with."""
+    """Return the names of bound estimators by what their topics begin with."""
     return {f"/estimates/{each.name}": each.name for each in bound}
 
 
@@ -217,7 +217,7 @@ def rows_of(
 
 
 def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
-    """Lines on topics that are not taken, over runs and further ones."""
+    """Add lines on topics that are not taken, over runs and further ones."""
     counts = {(row.estimator, row.topic): row for row in rows}
     for row in more:
         before = counts.get((row.estimator, row.topic))

@@ -75,7 +75,7 @@ def truth(expression: str, values: Values) -> Truth:
 
 
 def formatted(template: str, values: Values) -> str:
-    """A sentence with the values of the expressions in it: `{EXPRESSION:FORMAT}`, lists with commas.
+    """Write a sentence with its expressions' values: `{EXPRESSION:FORMAT}`, lists with commas.
 
     A number that has an interval stands before it; `{EXPRESSION!n:FORMAT}` says the names of numbers
     too. Raises as `evaluate` does.

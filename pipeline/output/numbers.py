@@ -72,7 +72,7 @@ def combined(operation: Callable[[float, float], float]) -> Callable[[Number, Nu
 
 
 def _of_known(compare: Callable[[Number, Number], Truth]) -> Callable[[Number, Number], Truth]:
-    """A comparison that is missing where one of its numbers is."""
+    """Make a comparison that is missing where one of its numbers is."""
 
     def found(one: Number, other: Number) -> Truth:
         if not (isinstance(one, Number) and isinstance(other, Number)):
@@ -83,7 +83,7 @@ def _of_known(compare: Callable[[Number, Number], Truth]) -> Callable[[Number, N
 
 
 def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Number, Number], Truth]:
-    """Whether a number is on one side of another, with all of both intervals."""
+    """Make the test whether a number is on one side of another, with all of both intervals."""
 
     def compare(one: Number, other: Number) -> Truth:
         if one.low == one.high and other.low == other.high:
@@ -99,7 +99,7 @@ def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Number, Number]
 
 
 def _within(one: Number, other: Number) -> Truth:
-    """Whether a number, with all of its interval, lies within another's interval."""
+    """Tell whether a number, with all of its interval, lies within another's interval."""
     if other.low <= one.low and one.high <= other.high:
         return True
     return False if one.high < other.low or one.low > other.high else None
@@ -137,7 +137,7 @@ def _flat(values: Sequence[Any]) -> list[Any]:
 
 
 def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Number]:
-    """A function of some numbers or lists of them, such as the least one, end by end."""
+    """Make a function of numbers or lists of them, such as the least one, end by end."""
 
     def found(*arguments: Value) -> Number:
         numbers = _flat(arguments)
@@ -150,7 +150,7 @@ def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Numbe
 
 
 def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
-    """A function that rises, of a number or the entries of a list."""
+    """Make a function that rises, of a number or the entries of a list."""
 
     def of(number: float) -> float:
         try:
@@ -184,38 +184,38 @@ def _median(numbers: Sequence[float]) -> float:
 
 
 def _deviation(numbers: Sequence[float]) -> float:
-    """The standard deviation of a sample."""
+    """Compute the standard deviation of a sample."""
     mean = _mean(numbers)
     squares = sum((each - mean) ** 2 for each in numbers)
     return math.sqrt(squares / (len(numbers) - 1)) if len(numbers) > 1 else math.nan
 
 
 def _plus_minus(number: Number, spread: Number) -> Number:
-    """A number that is no surer than a spread."""
+    """Return a number that is no surer than a spread."""
     return Number(number.value, number.value - spread.value, number.value + spread.value, number.name)
 
 
 def _chi_square(share: Number, size: Number) -> Number:
-    """Below which a share of chi-square numbers of so many degrees lies; NaN without any degree."""
+    """Find below what a share of chi-square numbers of so many degrees lies; NaN without any degree."""
     from replay.distributions import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
 
 
 def _count(values: list[Any]) -> Number:
-    """How many comparisons are true; where one is missing, how many are is not known."""
+    """Count the comparisons that are true; with one missing, how many are is not known."""
     flat = _flat(values)
     count = float(sum(each is True for each in flat))
     return Number(count, math.nan, math.nan) if "missing" in flat else exactly(count)
 
 
 def _falls(values: list[Number]) -> Truth:
-    """Whether each entry is below the one before it."""
+    """Tell whether each entry is below the one before it."""
     return all_hold([COMPARISONS[ast.Lt](later, one) for one, later in pairwise(values)])
 
 
 def _consistent(size: Number, count: Number) -> Number:
-    """The interval of a mean NEES of so many components, over so many independent estimates.
+    """Return the interval of a mean NEES of so many components, over independent estimates.
 
     NaN where one of these is missing.
     """

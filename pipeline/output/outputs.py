@@ -87,7 +87,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def _is_of_result(path: Path) -> bool:
-    """Whether a result folder lists a file as its own."""
+    """Tell whether a result folder lists a file as its own."""
     place = Path(os.path.realpath(path))
     for folder in place.parents:
         if (folder / RESULT_FILE).is_file():
@@ -97,7 +97,7 @@ def _is_of_result(path: Path) -> bool:
 
 
 def _identity(path: Path) -> Hashable:
-    """Equal for two names of one file, also where that does not exist yet."""
+    """Return what is equal for two names of one file, also where that does not exist yet."""
     try:
         state = path.stat()
     except OSError:
@@ -106,7 +106,7 @@ def _identity(path: Path) -> Hashable:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """What run a log is of, if fuselog wrote it: as the run gave it, or changed since."""
+    """Return the run of a log that fuselog wrote: as the run gave it, or changed since."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None
@@ -114,7 +114,7 @@ def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
 
 
 def _is_log(path: Path) -> bool:
-    """Whether fuselog wrote a log, which is whole."""
+    """Tell whether fuselog wrote a log, which is whole."""
     from mcap.reader import make_reader
 
     from recorders.log.container.writing import LIBRARY

@@ -116,7 +116,7 @@ class Result(Parameters):
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
-    """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`.
+    """Split a metric key `estimator.quantity_unit[.case]` into estimator, quantity and case.
 
     A key without a dot is a quantity of what has no estimator: a trajectory from a file.
     """
@@ -187,7 +187,7 @@ def metric_tables(
 
 
 def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
-    """The mean of the runs' NEES with its 95 % interval, by estimator and case.
+    """Return the mean of the runs' NEES with its 95 % interval, by estimator and case.
 
     Runs are independent, so that the interval is Student's; fewer than `FEWEST_RUNS` have none. A study
     may have a table of runs without NEES.
@@ -212,7 +212,7 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
-    """A folder to fill, beside its place; it replaces an earlier result there when all went well.
+    """Return a folder to fill, beside its place; it replaces an earlier result when all went well.
 
     Raises BadInput where something else than a result of ours is in the place, where another process
     is filling it, or where it cannot be written.
@@ -251,7 +251,7 @@ def require_ours(found: Path, place: Path) -> None:
 
 
 def _sealed(result: Result) -> Result:
-    """The result with the SHA-256 of its own text among its files."""
+    """Put the SHA-256 of the result's own text among its files."""
     files = {name: digest for name, digest in result.files.items() if name != RESULT_FILE}
     bare = result.model_copy(update={"files": files})
     digest = hashlib.sha256(_text(bare).encode()).hexdigest()
@@ -359,7 +359,7 @@ def read_result(folder: Path) -> Result:
 
 
 def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:
-    """Metrics as JSON has them: NaN and infinity become null."""
+    """Write metrics as JSON has them: NaN and infinity become null."""
     return {
         key: [_number(entry) for entry in value] if isinstance(value, list) else _number(value)
         for key, value in metrics.items()

@@ -22,7 +22,7 @@ def summarise(
     coverage: Sequence[Row] = (),
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Outcome:
-    """Metrics, alarms, tables and figures of a judged replay, and what became of the log's topics in it.
+    """Sum up a judged replay: metrics, alarms, tables, figures, and what became of the log's topics.
 
     Args:
         judge: of all runs.
@@ -73,7 +73,7 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
 
 
 def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
-    """RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent.
+    """Draw RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent.
 
     A panel shows one estimator, a row of them has one pair of axes: curves never lie on one another.
     """
@@ -125,7 +125,7 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
 
 
 def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis:
-    """One axis for all tables: from below the least to above the greatest, none of them zero."""
+    """Make one axis for all tables: from below the least to above the greatest, none of them zero."""
     values = pd.concat([table[name] for table in tables for name in columns if name in table])
     positive = values[(values > 0) & (values < float("inf"))]
     if positive.empty:
@@ -135,7 +135,7 @@ def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis
 
 
 def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
-    """An estimator's name, and at how many of the steps it is outside."""
+    """Write an estimator's name, and at how many of the steps it is outside."""
     known = steps[[quantity, low, low.replace("_low", "_high")]].dropna()
     if known.empty:
         return label
@@ -154,7 +154,7 @@ def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
 def _outside(
     steps: pd.DataFrame, quantity: str, low: "pd.Series[float]", high: "pd.Series[float]", axis: Axis
 ) -> list[Series]:
-    """A strip along the foot where a curve is outside."""
+    """Draw a strip along the foot where a curve is outside."""
     is_out = (steps[quantity] < low) | (steps[quantity] > high)
     if not is_out.any() or axis.limits is None:
         return []
@@ -170,7 +170,7 @@ def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> 
 
 
 def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
-    """The mean probability of each mode over time, all runs together, a panel for each estimator."""
+    """Draw the mean probability of each mode over time, over all runs, a panel per estimator."""
     x, y = Axis(label="time (s)"), Axis(label="mean probability", limits=(0.0, 1.0))
     panels = {name: Panel(x=x, y=y, title=name) for name in modes["estimator"].unique()}
     for (name, mode, smoothed), rows in modes.groupby(["estimator", "mode", "smoothed"], sort=False):

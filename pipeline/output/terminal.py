@@ -40,7 +40,7 @@ TOLD_EVERY_S = 60.0
 
 
 def _console(*, stderr: bool) -> Console:
-    """Plain text, wide where no terminal breaks it."""
+    """Make a console for plain text, wide where no terminal breaks it."""
     console = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 1000
@@ -108,12 +108,12 @@ def status() -> Iterator[Callable[[str], None]]:
 
 
 def say(text: str) -> None:
-    """A line on standard output; the terminal breaks it, not we, so that paths stay whole."""
+    """Print a line; the terminal breaks it, not we, so that paths stay whole."""
     out.print(printable(text), soft_wrap=True)
 
 
 def warn(text: str) -> None:
-    """A line on standard error."""
+    """Print a line on standard error."""
     err.print(printable(f"fuselog: {text}"), soft_wrap=True)
 
 
@@ -131,7 +131,7 @@ def _finite(value: Any) -> Any:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> None:
-    """A table; columns of numbers are set right, long texts are broken into lines."""
+    """Print a table; columns of numbers are set right, long texts are broken into lines."""
     body = [list(row) for row in rows]
     table = Table(
         title=printable(title) or None,
@@ -149,7 +149,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
 
 
 def format_value(value: object) -> str:
-    """Four significant digits for floats, nothing for None, the range of many numbers, or text."""
+    """Write four significant digits of floats, nothing for None, the range of many numbers, or text."""
     if isinstance(value, list):
         known = [each for each in value if each is not None]
         if any(isinstance(each, dict) for each in known):
@@ -173,7 +173,7 @@ def print_metrics(
     runs: "pd.DataFrame | None" = None,
     details: str = "--json",
 ) -> None:
-    """Metrics as tables: one per case, a row per quantity, a column per estimator.
+    """Print metrics as tables: one per case, a row per quantity, a column per estimator.
 
     A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
     of runs there is also the mean NEES over them, see `metric_tables`. Of many cases there is one table
@@ -196,7 +196,7 @@ def print_metrics(
 
 
 def _print_cases(tables: Sequence[MetricTable]) -> None:
-    """The medians over cases, with the least and the greatest: a row per quantity that has numbers."""
+    """Print the medians over cases, the least and the greatest: a row per quantity with numbers."""
     found: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for quantity, values in table.quantities.items():
@@ -229,7 +229,7 @@ def _with_bounds(measured: Measured) -> object:
 
 
 def print_pose_errors(metrics: Mapping[str, float]) -> None:
-    """APE and RPE: a row each, a column per statistic; then how many poses and pairs they are of."""
+    """Print APE and RPE: a row each, a column per statistic; then how many poses and pairs."""
     rows: dict[str, dict[str, float]] = {}
     counts = []
     for key, value in metrics.items():
@@ -247,7 +247,7 @@ def print_pose_errors(metrics: Mapping[str, float]) -> None:
 def print_parameters(
     parameters: Mapping[str, Mapping[str, object]], stated: Mapping[str, Mapping[str, str]] | None = None
 ) -> None:
-    """The parameters of estimators by label: a row each, a column per estimator.
+    """Print the parameters of estimators by label: a row each, a column per estimator.
 
     Those that a log's channels state come last, with the topic of the channel.
     """
@@ -259,13 +259,13 @@ def print_parameters(
 
 
 def print_worst(alarms: Sequence[Alarm]) -> None:
-    """The worst of what makes the numbers below doubtful."""
+    """Print the worst of what makes the numbers below doubtful."""
     for alarm in alarms[:1]:
         say(f"doubtful: {alarm.words}")
 
 
 def print_others(alarms: Sequence[Alarm]) -> None:
-    """A few of the others."""
+    """Print a few of the others."""
     for alarm in alarms[1:MOST_ALARMS]:
         say(f"also doubtful: {alarm.words}")
     if len(alarms) > MOST_ALARMS:
@@ -273,7 +273,7 @@ def print_others(alarms: Sequence[Alarm]) -> None:
 
 
 def print_claims(claims: Sequence[Claim]) -> None:
-    """Claims, each with what the paper says and what we found; before them those that go undecided."""
+    """Print the claims, each with what the paper says and what we found, after those undecided."""
     elsewhere = sum(claim.verdict == NO_VERDICT for claim in claims)
     if elsewhere:
         say(

@@ -173,7 +173,7 @@ class Scale(NamedTuple):
 
 
 def scale(unit: str, *values: float | None) -> Scale:
-    """A unit for values that stand together: that in which the least has a digit before the point.
+    """Choose a unit for values that stand together: in it the least has a digit before the point.
 
     >>> scale("m", 0.0162, 0.414).with_unit(0.414), scale("rad", 0.00544).with_unit(0.00544)
     ('41.4 cm', '0.312°')
@@ -222,22 +222,22 @@ def stated(value: float) -> str:
 
 
 def _exponent(value: float, digits: int) -> int:
-    """The power of ten of a number that is rounded to so many digits."""
+    """Return the power of ten of a number that is rounded to so many digits."""
     return math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
 
 
 def _bare(text: str) -> str:
-    """Without zeros at the end that say nothing of a whole number."""
+    """Remove zeros at the end that say nothing of a whole number."""
     return re.sub(r"\.0+$", "", text)
 
 
 def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
-    """Two ends in one unit, without the unit."""
+    """Write two ends in one unit, without the unit."""
     return " to ".join(alike([low, high], own, digits))
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Numbers that stand together, with the decimals of the largest; of very unlike sizes each its own.
+    """Write numbers that stand together with the decimals of the largest; very unlike ones apart.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])
@@ -265,5 +265,5 @@ def count(number_of: int, one: str, many: str = "") -> str:
 
 
 def listed(words: list[str]) -> str:
-    """Words one after the other, `and` before the last."""
+    """Write words one after the other, `and` before the last."""
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -85,7 +85,7 @@ class Cell:
         return Runner(self.experiment, setting).judge(slice(self.first, self.end))
 
     def packed(self, folder: Path) -> bytes:
-        """The same as bytes, which any process can take; BadInput where a metric stands against that."""
+        """Return the same as bytes for any process; raises BadInput where a metric prevents that."""
         shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
         if self.draws or self.logs or self.errors:
             folder.mkdir()
@@ -122,7 +122,7 @@ class Sent(NamedTuple):
             return left, {path.relative_to(folder).as_posix(): path.read_bytes() for path in written}
 
     def _unpacked(self, root: Path) -> Cell:
-        """The cell with its logs, and its result's place, in a folder as if that were the root."""
+        """Return the cell with its logs, and its result's place, in a folder as if it were the root."""
         if not self.logs:
             return self.cell
 
@@ -183,7 +183,7 @@ def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[P
 
 
 def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]:
-    """What each part of the cells leaves, merged in their order."""
+    """Merge what each part of the cells leaves, in their order."""
     assert setting.checkpoints is not None
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
@@ -290,7 +290,7 @@ def work_off(
 def _beginner(
     pool: WorkerPool, cells: Sequence[Cell], checkpoints: Checkpoints
 ) -> Callable[[Cell], Future[Any]]:
-    """What hands a cell to the pool; logs that its workers do not see go with it."""
+    """Return what hands a cell to the pool; logs that its workers do not see go with it."""
     sees, submit = pool.sees, pool.executor.submit
     if sees is None:
         return lambda cell: submit(cell.packed, checkpoints.place_of(cell.key))

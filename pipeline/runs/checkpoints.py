@@ -152,7 +152,7 @@ class Checkpoints:
             self.folder.rmdir()
 
     def _left(self, key: str) -> "_Left | None":
-        """What this very cell left, if its files are those that it wrote."""
+        """Return what this very cell left, if its files are those that it wrote."""
         content = read_own(self.folder / f"{key}{_SUFFIX}")
         if content is None or not content.startswith(key.encode()):
             return None
@@ -174,7 +174,7 @@ class _Left(NamedTuple):
 
 @contextmanager
 def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
-    """The kept cells of the campaign whose result goes to a place; they go when all went well."""
+    """Keep the cells of the campaign whose result goes to a place; they go when all went well."""
     place = settled(place)
     folder = place.with_name(f"{place.name}.unfinished")
     checkpoints = Checkpoints(folder, FileLock(folder / _LOCK, timeout=0))
@@ -188,7 +188,7 @@ def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a member of the folder is what this module puts there."""
+    """Tell whether a member of the folder is what this module puts there."""
     if path.is_symlink():
         return False
     is_cell = _KEY.fullmatch(path.stem) is not None
@@ -198,7 +198,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _copy(path: Path, place: Path) -> None:
-    """The file in another place of the disk, without its bytes where the disk can do that."""
+    """Copy a file to another place of the disk, without its bytes where the disk can do that."""
     try:
         os.link(path, place)
     except OSError:

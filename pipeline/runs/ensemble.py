@@ -139,7 +139,7 @@ class Pass:
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
-        """Itself; raises BadInput where there is an estimator that could follow no run."""
+        """Return itself; raises BadInput where there is an estimator that could follow no run."""
         for refusal in self.refused.values():
             raise refusal
         return self
@@ -250,7 +250,7 @@ def replay_parts(
 
 @contextmanager
 def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
-    """Items handed over are worked on in order, one at a time, while the caller goes on.
+    """Work on items in order, one at a time, while the caller, who hands them over, goes on.
 
     What the work raises is raised when the next item is handed over, or at the end.
     """
@@ -276,7 +276,7 @@ def bind_from(
 
 
 def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
-    """The parameters of estimators by label, as JSON has them; those that are None are not used."""
+    """Return the parameters of estimators by label, as JSON has them; those that are None are unused."""
     return {
         each.name.partition("/")[0]: each.parameters.model_dump(mode="json", exclude_none=True)
         for each in bound

@@ -24,7 +24,7 @@ ERRORS = Path("tables", "errors")
 
 
 def log_of_estimates(estimates: Log) -> Path:
-    """The log that an estimates log was replayed from; raises BadInput where it is not to be found.
+    """Find the log that an estimates log was replayed from; raises BadInput where it is not found.
 
     A recording that has estimates beside its sensors is itself what they are of.
     """
@@ -58,7 +58,7 @@ def source_of_estimates(
 
 
 def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
-    """Parameters by label, in the order of the replay; none where the log does not say."""
+    """Return parameters by label, in the order of the replay; none where the log does not say."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get("estimators", "{}"))
@@ -74,7 +74,7 @@ def labels_of(estimates: Log | Source) -> list[str]:
 
 
 def recorded_estimators(log: Log | Source) -> list[str]:
-    """The estimators of which a recording has estimates beside its sensors, such as an autopilot's own.
+    """List the estimators whose estimates a recording has beside its sensors, as an autopilot's.
 
     An estimates log, which is of another log, has none of these.
     """
@@ -84,7 +84,7 @@ def recorded_estimators(log: Log | Source) -> list[str]:
 
 
 def hash_streams(sources: Iterable[MemorySource]) -> str:
-    """SHA-256 over every column of every run: equal where the input data are equal."""
+    """Hash every column of every run with SHA-256: equal where the input data are equal."""
     digest = hashlib.sha256()
     for source in sources:
         add_to_hash(digest, source)
@@ -99,7 +99,7 @@ def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
 
 
 def hash_files(paths: Sequence[Path]) -> str:
-    """SHA-256 over the bytes of files."""
+    """Hash the bytes of files with SHA-256."""
     digest = hashlib.sha256()
     for path in paths:
         with path.open("rb") as file:

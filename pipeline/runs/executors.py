@@ -105,7 +105,7 @@ def inline_pool() -> Iterator[WorkerPool]:
 
 @contextmanager
 def threads() -> Iterator[WorkerPool]:
-    """Threads of the calling process, one for each core: for work whose kernels run side by side."""
+    """Yield threads of this process, one for each core: for work whose kernels run side by side."""
     count = os.cpu_count() or 1
     with ThreadPoolExecutor(count) as pool:
         yield WorkerPool(pool, count)
@@ -131,7 +131,7 @@ def processes(count: int) -> PoolFactory:
 
 
 def _begin_worker() -> None:
-    """One core for each worker; an interrupt is the parent's to deal with, and its end theirs too."""
+    """Give each worker one core; an interrupt is the parent's to deal with, and its end theirs too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_cores(1)
     threadpool_limits(1)
@@ -183,7 +183,7 @@ def dask(scheduler: str) -> PoolFactory:
 
 
 def _local_cluster(scheduler: str) -> Any:
-    """Workers on this machine alone, of one thread each."""
+    """Start workers on this machine alone, of one thread each."""
     from distributed import LocalCluster
 
     count = scheduler.removeprefix("local:")
@@ -217,13 +217,13 @@ def _check_code(scheduler: str, client: Any) -> None:
 
 
 def _all_see(client: Any, files: Sequence[Path]) -> bool:
-    """Whether all workers see files as this process does."""
+    """Tell whether all workers see files as this process does."""
     own = states_of(files)
     return not files or all(found == own for found in client.run(states_of, files).values())
 
 
 def states_of(files: Sequence[Path]) -> list[tuple[int, int] | None]:
-    """Size and time of the last change of files; None of one that is not seen."""
+    """Return size and time of the last change of files; None of one that is not seen."""
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
@@ -237,7 +237,7 @@ def states_of(files: Sequence[Path]) -> list[tuple[int, int] | None]:
 
 @cache
 def version_of_code() -> str:
-    """A hash of all that cells go through: our code, that of plug-ins, the versions of libraries."""
+    """Hash all that cells go through: our code, that of plug-ins, the versions of libraries."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         with resources.as_file(resources.files(package)) as folder:

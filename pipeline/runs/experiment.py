@@ -117,7 +117,7 @@ class Experiment(Parameters):
 
 
 def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
-    """An estimator's parameters with those of the one that it is like."""
+    """Return an estimator's parameters with those of the one that it is like."""
     values = stated[label]
     if "like" not in values:
         return values
@@ -200,7 +200,7 @@ class Stated(NamedTuple):
 
     @property
     def _values(self) -> dict[str, Any]:
-        """Its entries; the programs that it names may be run."""
+        """Return its entries; the programs that it names may be run."""
         estimators = self.values.get("estimators")
         if not isinstance(estimators, Mapping):
             return dict(self.values)
@@ -257,7 +257,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
-    """The files that patterns stand for, each once; raises BadInput where one stands for none."""
+    """Find the files that patterns stand for, each once; raises BadInput where one stands for none."""
     files: dict[str, None] = {}
     for pattern in patterns:
         place = Path(os.path.normpath(folder / pattern))
@@ -273,14 +273,14 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
 
 
 def _given(experiment: Experiment, data: Path | None) -> list[Path]:
-    """The files that an experiment imports, or among which those are, or the logs that it replays."""
+    """List the files that an experiment imports, those of its folder of data, or the logs it replays."""
     if data is None or experiment.logs is not None:
         return experiment.files
     return sorted(path for path in data.rglob("*") if path.is_file()) if data.is_dir() else [data]
 
 
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings where they belong; raises BadInput where one belongs nowhere."""
+    """Put settings where they belong; raises BadInput where one belongs nowhere."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
     part, names = _parameters_of_source(experiment)
     own = parameters_by_label(experiment.estimators) if settings else {}
@@ -309,7 +309,7 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
 
 
 def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
-    """Which part of an experiment says where its data come from, and the parameters that this has."""
+    """Return which part of an experiment says where its data come from, and its parameters."""
     if experiment.import_:
         part, recorder = "import", experiment.import_.source
     elif experiment.record:

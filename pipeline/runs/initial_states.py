@@ -198,7 +198,7 @@ def _true_state(
 
 
 def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[str, float]) -> Floats:
-    """The covariance (t, t) of a prior with some of its components' standard deviations replaced."""
+    """Replace some components' standard deviations in the covariance (t, t) of a prior."""
     names = [name for name, _ in tangent_components(list(components), list(components.values()))]
     covariance = prior["covariance"][0].reshape(len(names), len(names)).copy()
     given = named_now(sigmas, list(components), list(components.values()))
@@ -238,7 +238,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
 
 
 def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
-    """The estimate to begin a prior from: of the same thing, with all its components."""
+    """Find the estimate to begin a prior from: of the same thing, with all its components."""
     case = prior.topic.rpartition("/")[0].removeprefix("/")
     found = [
         name
@@ -259,7 +259,7 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
 
 
 def _components(prior: Stream, name: str) -> dict[str, Any]:
-    """Names and kinds of a prior's components; raises BadInput where it names none."""
+    """Return names and kinds of a prior's components; raises BadInput where it names none."""
     found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
     if not found:
         raise BadInput(

@@ -61,7 +61,7 @@ class Recording(Parameters):
     sha256: str = ""
 
     def digest_of(self, files: Sequence[Path]) -> str:
-        """SHA-256 over those of this recording's files, decompressed and sorted; "" without any file."""
+        """Compute SHA-256 of those of the files that are this recording's, decompressed; "" for none."""
         digests = sorted(_digest(path) for path in files if path.match(self.files))
         return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 
@@ -100,7 +100,7 @@ def shipped(kind: str) -> dict[str, Path]:
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
-    """A scenario by its registered name, its shipped file or a TOML file: recorder, parameters, label.
+    """Find a scenario by registered name, shipped file or TOML file: recorder, parameters, label.
 
     A scenario file has `recorder` and a table `parameters`.
     """

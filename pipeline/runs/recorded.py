@@ -93,7 +93,7 @@ def require_memory(what: str, need_bytes: float, time_s: float | None = None) ->
 
 
 def _size(source: MemorySource) -> int:
-    """Bytes of all columns of a run."""
+    """Count the bytes of all columns of a run."""
     return sum(
         column.nbytes
         for stream in source.streams.values()
@@ -134,6 +134,6 @@ def replay_in_memory(
 
 
 def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
-    """Errors, innovations and set errors of a replay's outputs."""
+    """Compute errors, innovations and set errors of a replay's outputs."""
     judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
     return Replayed(sources, outputs, judged.errors, judged.innovations, judged.sets)

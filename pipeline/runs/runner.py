@@ -182,18 +182,18 @@ class Runner:
         return done
 
     def _as_seen_from(self, path: Path, log: Path) -> Path:
-        """Where a log seems to be from a file of the folder, so that it is there when that has moved."""
+        """Return where a log seems to be from a file of the folder, so that it is found when moved."""
         there = self.setting.place / path.relative_to(self.setting.folder)
         return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
 
     def _places(self, folder: str, run: int) -> tuple[Path, Path]:
-        """Where a run's log and its estimates go."""
+        """Return where a run's log and its estimates go."""
         name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
         return place / "logs" / name, place / "estimates" / name
 
 
 def _in_memory(source: LogSource) -> MemorySource:
-    """A log's streams, but for estimates and what is no columns."""
+    """Read a log's streams, but for estimates and what is no columns."""
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
     return MemorySource(source.read(topics), run, source.name)

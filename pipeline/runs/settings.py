@@ -18,7 +18,7 @@ OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
 def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label, from the tables of a TOML file; none without a file.
+    """Read parameters by estimator label from the tables of a TOML file; none without a file.
 
     Args:
         path: the file.
@@ -48,7 +48,7 @@ def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
 def settings_of_estimators(
     labels: Sequence[str], texts: Sequence[str], file: Path | None, **options: Any
 ) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label: those of a settings file, KEY=VALUE over them, then options.
+    """Return parameters by estimator label: those of a settings file, then KEY=VALUE, then options.
 
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter; so do
     options that are not None. Raises BadInput where none has.
@@ -73,7 +73,7 @@ def named_by(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label with others over them, see `settings_of_estimators`.
+    """Return parameters by estimator label with others over them, see `settings_of_estimators`.
 
     Raises BadInput where no estimator has such a parameter.
     """
@@ -110,7 +110,7 @@ def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
+    """Read standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
     sigmas: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")

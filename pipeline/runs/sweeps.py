@@ -71,7 +71,7 @@ class Over(NamedTuple):
 
 
 def parse_over(text: str) -> Over:
-    """`KEY=LOW:HIGH:N`, evenly, `KEY=LOW:HIGH:logN` in the logarithm, or a list `KEY=VALUE,VALUE,...`.
+    """Read `KEY=LOW:HIGH:N` (even), `KEY=LOW:HIGH:logN` (in the logarithm) or `KEY=VALUE,VALUE,...`.
 
     Raises BadInput for anything else.
 
@@ -88,7 +88,7 @@ def parse_over(text: str) -> Over:
 
 
 def over_of(key: str, values: Sequence[Any]) -> Over:
-    """A list of values; drawn in the logarithm where they are even in that. BadInput for one twice."""
+    """Make a list of values, in the logarithm if they are even in it; raises BadInput for one twice."""
     if len({*map(str, values)}) < len(values) or not values:
         raise BadInput(f"sweep over {key}: give at least one value, and each once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]
@@ -122,7 +122,7 @@ def _value(text: str, key: str, stated: str) -> Any:
 def points_of(
     over: Sequence[Over], samples: int | None = None, sampling: Sampling = "sobol", seed: int = 0
 ) -> list[dict[str, Any]]:
-    """The points: of the grid, the last parameter changing fastest, or so many samples of the ranges.
+    """Return the points: of the grid, the last parameter changing fastest, or samples of the ranges.
 
     Of a list, a sample takes one. Raises BadInput where there is nothing to sweep, or too much.
     """
@@ -152,7 +152,7 @@ def points_of(
 
 
 def _at(over: Over, share: float) -> Any:
-    """The value at a share, from 0 to 1, of a range or a list."""
+    """Return the value at a share, from 0 to 1, of a range or a list."""
     if over.ends is None:
         return over.taken[min(int(share * len(over.taken)), len(over.taken) - 1)]
     low, high = over.ends
@@ -160,7 +160,7 @@ def _at(over: Over, share: float) -> Any:
 
 
 def nested(point: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by keys such as `ekf.sigma_range_m` as tables in tables.
+    """Nest values by keys such as `ekf.sigma_range_m` as tables in tables.
 
     >>> nested({"ekf.sigma_range_m": 0.1, "robots": 2})
     {'ekf': {'sigma_range_m': 0.1}, 'robots': 2}
@@ -260,7 +260,7 @@ def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
 
 
 def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
-    """What a parameter of an estimator or of the scenario means, in a few words; empty if unknown."""
+    """Say in a few words what a parameter of an estimator or scenario means; empty if unknown."""
     for label, words in done.meanings.items():
         name = key.removeprefix(f"{label}.")
         if name in experiment.estimators.get(label, {}):
@@ -322,7 +322,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
 
 
 def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
-    """The quantity over two parameters, a map for each estimator; a cross where an error is least."""
+    """Draw the quantity over two parameters, a map per estimator; a cross where an error is least."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 

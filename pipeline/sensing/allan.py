@@ -36,7 +36,7 @@ def multiples_of(count: int) -> Integers:
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Every how many differences are looked at: neighbours of long windows are nearly the same."""
+    """Return every how many differences are looked at: neighbours of long windows are alike."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 
@@ -82,7 +82,16 @@ def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -
 
 
 def interval(deviations: Floats, degrees: Floats, confidence: float = 0.95) -> tuple[Floats, Floats]:
-    """Return where the true deviations (n,) lie with a confidence, by chi-square."""
+    """Compute, by chi-square, between what the true deviations lie.
+
+    Args:
+        deviations: (n,), Allan deviations in any unit.
+        degrees: (n,), of freedom, of each variance.
+        confidence: with which the intervals hold the truth.
+
+    Returns:
+        The lower and the upper ends, (n,) each, in the unit of the deviations.
+    """
     tail = (1 - confidence) / 2
     low = deviations * np.sqrt(degrees / chi2.ppf(1 - tail, degrees))
     return low, deviations * np.sqrt(degrees / chi2.ppf(tail, degrees))

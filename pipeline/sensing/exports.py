@@ -40,7 +40,7 @@ class Densities(NamedTuple):
 
 
 def settings(found: Densities) -> str:
-    """Fuselog's settings of the model inertial: N and K, continuous."""
+    """Write fuselog's settings of the model inertial: N and K, continuous."""
     names = {
         _FORCE: ("force_noise_density", "force_bias_density"),
         _RATE: ("gyro_noise_density", "gyro_bias_density"),
@@ -55,7 +55,7 @@ def settings(found: Densities) -> str:
 
 
 def kalibr(found: Densities) -> str:
-    """Kalibr's imu.yaml: N and K, continuous; it divides by the root of the step itself."""
+    """Write Kalibr's imu.yaml: N and K, continuous; it divides by the root of the step itself."""
     if found.unit is None:
         return ""
     force, rate = found.unit
@@ -72,7 +72,7 @@ def kalibr(found: Densities) -> str:
 
 
 def px4(found: Densities) -> str:
-    """PX4's EKF2 parameters: discrete, N and K over the root of the filter's step."""
+    """Write PX4's EKF2 parameters: discrete, N and K over the root of the filter's step."""
     if found.unit is None:
         return ""
     force, rate = (density.white / _PX4_STEP_S**0.5 for density in found.unit)
@@ -88,7 +88,7 @@ def px4(found: Densities) -> str:
 
 
 def gtsam(found: Densities) -> str:
-    """GTSAM's preintegration parameters: N^2 and K^2, continuous."""
+    """Write GTSAM's preintegration parameters: N^2 and K^2, continuous."""
     if found.unit is None:
         return ""
     force, rate = found.unit
@@ -107,7 +107,7 @@ def gtsam(found: Densities) -> str:
 
 
 def robot_localization(found: Densities) -> str:
-    """What robot_localization's process noise is, and which part of it an inertial unit states."""
+    """Say what robot_localization's process noise is, and which part an inertial unit states."""
     if found.unit is None:
         return ""
     force, rate = found.unit

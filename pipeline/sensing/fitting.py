@@ -125,7 +125,7 @@ def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
 
 
 def _limits(name: str, step_s: float, span_s: float) -> tuple[float, float]:
-    """Where the logarithm of a number is searched for, relative to white noise of 1."""
+    """Return where the logarithm of a number is searched for, relative to white noise of 1."""
     if name == "markov_time_s":
         return math.log(_SHORTEST * step_s), math.log(max(span_s / 2, 2 * _SHORTEST * step_s))
     if name == "walk":  # from what no recording of that length shows to what one sample shows
@@ -148,12 +148,20 @@ def _objective(samples: Samples, free: Sequence[str]) -> Objective:
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
-    """Return the terms whose free numbers have these logarithms."""
+    """Return the terms whose free numbers have these logarithms.
+
+    Args:
+        free: the names of the p numbers, as fields of `Terms`.
+        point: (p,), their natural logarithms.
+
+    Returns:
+        The terms; all other numbers are as `Terms` has them by default.
+    """
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 
 def _polished(objective: Objective, free: tuple[str, ...], point: Floats, size: int) -> Fit:
-    """Newton's steps, as long as they gain; none where a number is not determined."""
+    """Take Newton's steps, as long as they gain; none where a number is not determined."""
     best = objective(point)
     reach = np.full(len(point), 0.01)
     curvature = np.zeros((len(point), len(point)))
@@ -176,7 +184,7 @@ def _polished(objective: Objective, free: tuple[str, ...], point: Floats, size: 
 def _derivatives(
     objective: Objective, point: Floats, here: float, reach: Floats
 ) -> tuple[Floats, Floats]:
-    """The gradient and minus the second derivatives, by central differences over steps `reach`."""
+    """Compute the gradient and minus the second derivatives by central differences."""
     moves = np.diag(reach)
     ahead, behind = (np.array([objective(point + sign * move) for move in moves]) for sign in (1, -1))
     curvature = np.diag(-(ahead - 2 * here + behind) / reach**2)
@@ -203,7 +211,7 @@ def profile_interval(samples: Samples, found: Fit, name: str) -> tuple[float, fl
     reach = 0.05 * found.sigmas[others]
 
     def root(distance: float) -> float:
-        """The signed root of twice what the log-likelihood loses, less that at the interval's end."""
+        """Compute the signed root of twice the log-likelihood's loss, less that at an interval's end."""
         at = point.copy()
         at[place] += sign * distance * sigma
         at[others] += follows * sign * distance * sigma

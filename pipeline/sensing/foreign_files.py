@@ -73,7 +73,7 @@ def _number(text: str) -> float:
 
 
 def _deviation_at_1_s(path: Path) -> float | None:
-    """The mean Allan deviation at 1 s of the gyro's axes, in rad/s, of the curves beside a file."""
+    """Average the Allan deviation at 1 s of the gyro's axes, in rad/s, of a file's curves."""
     name = path.name.partition("_imu_param")[0]
     times = path.with_name(f"data_{name}_gyr_t.txt")
     curves = [path.with_name(f"data_{name}_gyr_{axis}.txt") for axis in "xyz"]

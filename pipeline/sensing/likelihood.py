@@ -48,7 +48,7 @@ class Likelihood(NamedTuple):
 
 
 def likelihood(samples: Samples, terms: Terms) -> Likelihood:
-    """The exact Gaussian log-likelihood of samples, with the regressors' coefficients that suit best."""
+    """Compute the exact Gaussian log-likelihood of samples, with the coefficients that suit best."""
     columns = samples.values.shape[1]
     moments = np.zeros((columns, columns))
     log_determinant = _filtered(samples, terms, moments, np.empty((0, columns)))

@@ -79,7 +79,7 @@ def _one(sources: Sequence[Any]) -> Sequence[Any]:
 
 
 def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
-    """The topics and, where they are named, their fields."""
+    """Choose the topics and, where they are named, their fields."""
     chosen: dict[str, list[str]] = {}
     for text in wanted:
         topic, _, name = (text, "", "") if text in source.topics else text.rpartition(".")
@@ -102,7 +102,7 @@ def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _numbers(stream: Stream) -> list[str]:
-    """The fields that are real numbers and no covariances."""
+    """List the fields that are real numbers and no covariances."""
     return [
         name
         for name, column in stream.columns.items()
@@ -111,7 +111,7 @@ def _numbers(stream: Stream) -> list[str]:
 
 
 def _read(source: Any, topic: str, fields: Sequence[str]) -> Stream:
-    """A topic with these fields alone; of a log that fills memory no column is there twice but one."""
+    """Read these fields of a topic; only one column at a time is in memory twice."""
     empty = source.empty(topic)
     parts = [block[topic] for block in source.blocks([topic], "publish_time", _BLOCK) if topic in block]
     kept: dict[str, list[NDArray[Any]]] = {name: [part[name] for part in parts] for name in fields}
@@ -225,7 +225,7 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
 
 
 def _least(found: ColumnNoise, unit: str) -> str:
-    """The least of the curve, which data sheets call bias instability, in both conventions."""
+    """Say the least of the curve, which data sheets call bias instability, in both conventions."""
     least = int(np.nanargmin(np.where(found.degrees > _FEWEST_DEGREES, found.curve.deviations, np.inf)))
     value = float(found.curve.deviations[least])
     return (

@@ -92,14 +92,29 @@ def grid_of(stream: Stream) -> Grid:
 
 
 def on_grid(values: Floats, grid: Grid) -> Floats:
-    """Samples (n,) at their places on the grid; NaN where one was lost."""
+    """Put samples at their places on the grid.
+
+    Args:
+        values: (n,), of all messages, in the order of the stream.
+        grid: of the stream.
+
+    Returns:
+        (grid.size,), NaN where a sample was lost.
+    """
     found = np.full(grid.size, np.nan)
     found[grid.places] = values[grid.rows]
     return found
 
 
 def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
-    """Raise BadInput where samples on a grid are constant, or those of a unit that moves."""
+    """Raise BadInput where samples are too few or constant, or those of a unit that moves.
+
+    Args:
+        name: what messages call the samples.
+        field: its name; its ending says the unit.
+        values: (n,), on a grid, NaN where a sample was lost.
+        step_s: the grid's step.
+    """
     there = values[np.isfinite(values)]
     if len(there) < FEWEST:
         raise BadInput(f"{name}: has {len(there)} numbers; noise takes {FEWEST} at least")
@@ -121,7 +136,15 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
 
 
 def block_means(values: Floats, block: int) -> Floats:
-    """Means (m,) of blocks of samples on a grid; NaN where less than half of one is there."""
+    """Average blocks of samples on a grid.
+
+    Args:
+        values: (n,), NaN where a sample was lost.
+        block: how many places a block has.
+
+    Returns:
+        (n // block,), NaN where less than half of a block is there.
+    """
     if block == 1:
         return values
     blocks = values[: len(values) // block * block].reshape(-1, block)
@@ -132,7 +155,16 @@ def block_means(values: Floats, block: int) -> Floats:
 
 
 def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) -> Samples:
-    """Samples on a grid, NaN where one was lost, as the likelihood takes them."""
+    """Return samples on a grid as the likelihood takes them.
+
+    Args:
+        values: (n,), NaN where a sample was lost.
+        step_s: the grid's step.
+        regressors: (n, k), what the samples may depend on; by default nothing.
+
+    Returns:
+        Those that were not lost, less the first.
+    """
     rows = np.flatnonzero(np.isfinite(values))
     columns = values[rows, None] if regressors is None else np.column_stack([values, regressors])[rows]
     # the first value is taken off, that digits are kept
@@ -140,7 +172,15 @@ def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) 
 
 
 def find_drift(values: Floats, step_s: float) -> Drift | None:
-    """Return the drift of a sensor that warms up, where a line and an exponential explain enough."""
+    """Find the drift of a sensor that warms up: a line, or a line and an exponential.
+
+    Args:
+        values: (n,), on a grid, NaN where a sample was lost.
+        step_s: the grid's step.
+
+    Returns:
+        The drift; None where it explains too little.
+    """
     block = -(-len(values) // _DRIFT_SAMPLES)
     means, step_s = block_means(values, block), step_s * block
     times_s = (np.arange(len(means)) + 0.5 * (1 - 1 / block)) * step_s
@@ -168,10 +208,17 @@ def fewest_block(count: int) -> int:
 
 
 def white_block(values: Floats, step_s: float) -> int:
-    """Return over how many samples to average, so that noise is white beside what drifts.
+    """Find over how many samples to average, so that noise is white beside what drifts.
 
     A sensor that filters its output correlates neighbours, and a likelihood at its full rate gives too
     little noise. The residuals of white noise and a walk tell.
+
+    Args:
+        values: (n,), on a grid, NaN where a sample was lost.
+        step_s: the grid's step.
+
+    Returns:
+        The size of a block, for `block_means`.
     """
     block = fewest_block(len(values))
     while len(values) // (2 * block) >= FEWEST:
@@ -185,7 +232,15 @@ def white_block(values: Floats, step_s: float) -> int:
 
 
 def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
-    """Return the frequency in Hz and the amplitude of a line in the spectrum, where there is one."""
+    """Find a line in the spectrum, as of something that vibrates.
+
+    Args:
+        values: (n,), on a grid, NaN where a sample was lost; the first `MOST` count.
+        step_s: the grid's step.
+
+    Returns:
+        Its frequency in Hz and its amplitude in the unit of the samples; None where there is no line.
+    """
     part = values[:MOST]
     part = np.where(np.isfinite(part), part - np.nanmean(part), 0.0)
     window = np.hanning(len(part))

@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _looked_at(seed: int) -> dict[str, Any]:
-    """Of one unit what is found, and which intervals hold the truth."""
+    """Find one unit's noise, and which intervals hold the truth."""
     values = unit(seed, SIZE, TERMS, STEP_S)
     [column] = noise(at_rest(values, STEP_S), TURN).columns
     low, high = interval(column.curve.deviations, column.degrees)
@@ -83,7 +83,7 @@ def _looked_at(seed: int) -> dict[str, Any]:
 
 
 def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
-    """Samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
+    """Draw samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
 
     A seed draws the same numbers for all terms, whichever there are.
     """
@@ -100,7 +100,15 @@ def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
 
 
 def at_rest(values: Floats, step_s: float) -> MemorySource:
-    """Values (n,) as the turn rate of a log, in `TURN`."""
+    """Make a log whose turn rate `TURN` has these values.
+
+    Args:
+        values: (n,), in rad/s.
+        step_s: the time between two of them.
+
+    Returns:
+        The log, which begins at time 0.
+    """
     stream = make_stream(
         TURN.partition(".")[0],
         schemas.ODOMETRY,

@@ -49,14 +49,14 @@ class Terms(NamedTuple):
     def _second_differences(
         self, multiple: Floats | int, step_s: float, lags: Floats | float = 0.0
     ) -> Floats:
-        """The autocovariance of second differences as differences of what is summed twice."""
+        """Compute the autocovariance of second differences as differences of what is summed twice."""
         far = 2 * np.asarray(multiple)
         ends = (lags + far, lags - far), (lags + far / 2, lags - far / 2)
         outer, inner = (sum(self._summed_twice(np.abs(end), step_s) for end in pair) for pair in ends)
         return np.atleast_1d(-outer + 4 * inner - 6 * self._summed_twice(np.abs(lags), step_s))
 
     def _summed_twice(self, lag: Floats | float, step_s: float) -> Floats:
-        """What has the autocovariance of the samples, times step_s^2, as second differences."""
+        """Return what has as second differences the samples' autocovariance times step_s^2."""
         lag = np.asarray(lag, dtype=float)
         white = self.white**2 / step_s * lag / 2
         walk = -(self.walk**2) * step_s * (lag * lag * lag - lag) / 12

@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """The topics of one scan belong together: they get one sign, and are dropped together."""
+    """Name the group of a topic: those of one scan get one sign, and are dropped together."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -60,7 +60,7 @@ def _groups(source: MemorySource, inputs: Inputs) -> dict[str, list[str]]:
 
 
 def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]:
-    """For each topic another share, from -1 to 1, so that no two of equal stamps stay together."""
+    """Return another share, -1 to 1, for each topic, so that no two of equal stamps stay together."""
     groups = _groups(source, inputs)
     shares = np.linspace(1.0, -1.0, len(groups))
     drawn = np.random.default_rng(seed).permutation(shares).tolist()
@@ -69,7 +69,7 @@ def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]
 
 
 def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """No stamp passes that of the run's first message: what came before the start would be lost."""
+    """Move stamps, none past the run's first message: what came before the start would be lost."""
     starts_ns = [source.streams[topic].publish_time_ns for topic in inputs.priors]
     first_ns = min((int(each[0]) for each in starts_ns if len(each)), default=SHIFT_NS)
     moved = {}
@@ -84,7 +84,7 @@ def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> Mem
 
 
 def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySource:
-    """Topics of equal stamps are taken the other way round, those of one scan together."""
+    """Take topics of equal stamps the other way round, those of one scan together."""
     last = max(int(each.position.max()) for each in source.streams.values() if len(each))
     turned = {}
     for topics in _groups(source, inputs).values():
@@ -103,7 +103,7 @@ def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySou
 
 
 def _inputs(change: Callable[[NDArray[np.float64], np.random.Generator], NDArray]) -> Changed:
-    """A change of every floating number that is sensed."""
+    """Change every floating number that is sensed."""
 
     def changed(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
         rng, streams = np.random.default_rng(seed), {}
@@ -132,7 +132,7 @@ def _by_an_ulp(column: NDArray[np.float64], rng: np.random.Generator) -> NDArray
 
 
 def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """By START_SIGMAS of the prior's sigma along all its axes, so that A is that at the start."""
+    """Move the start by START_SIGMAS of the prior's sigma along all its axes; A is that then."""
     rng, streams = np.random.default_rng(seed), {}
     for topic in inputs.priors:
         stream = source.streams[topic]
@@ -148,7 +148,7 @@ def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> Memo
 
 
 def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray[np.float64]:
-    """States moved in their tangent space, by (rows, tangent components)."""
+    """Move states in their tangent space, by (rows, tangent components)."""
     mean, place = stream["mean"].copy(), 0
     for kind, columns in manifold_blocks(kinds):
         if kind == "quaternion":
@@ -165,7 +165,7 @@ def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray
 
 
 def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> MemorySource:
-    """One draw for every stamp of a group, so that a scan goes with its detections."""
+    """Drop messages by one draw for every stamp of a group, so that a scan goes with detections."""
     streams = {}
     for number, topics in enumerate(_groups(source, inputs).values()):
         of_group = [source.streams[topic].publish_time_ns for topic in topics]
@@ -179,7 +179,7 @@ def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> Memor
 
 
 def _again(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySource:
-    """Every message that drives the motion comes twice."""
+    """Give every message that drives the motion twice."""
     streams = {}
     for topic in inputs.controls:
         stream = source.streams[topic]
@@ -201,7 +201,7 @@ CHANGES: Mapping[str, Change] = {
 
 
 def inputs_of(source: MemorySource, topics: Collection[str], controls: Collection[str]) -> Inputs:
-    """What of the topics that an estimator reads may be changed: not the truth, nor what has no time."""
+    """Choose what may be changed of an estimator's topics: not the truth, nor what has no time."""
     streams = {topic: source.streams[topic] for topic in topics if topic in source.streams}
     names = {topic: stream.schema.full_name for topic, stream in streams.items() if len(stream)}
     priors = [t for t, name in names.items() if name == schemas.GAUSSIAN_ESTIMATE.full_name]
@@ -210,7 +210,7 @@ def inputs_of(source: MemorySource, topics: Collection[str], controls: Collectio
 
 
 def parameters_changed(parameters: Any, size: float, rng: np.random.Generator) -> Any:
-    """Parameters with every number but whole ones, 0 and the chance of a gate changed."""
+    """Change every number of parameters but whole ones, 0 and the chance of a gate."""
     if isinstance(parameters, Mapping):
         changed = {name: parameters_changed(each, size, rng) for name, each in parameters.items()}
         return {
@@ -226,7 +226,7 @@ def parameters_changed(parameters: Any, size: float, rng: np.random.Generator) -
 
 
 def _probability(before: Any, changed: Any) -> Any:
-    """What is left to 1 changes as the number does, where that is less."""
+    """Change a probability, where less is left to 1, by what is left."""
     if not isinstance(before, float) or before <= 0.5 or before > 1.0:
         return changed
     return 1.0 - (1.0 - before) * (changed / before)

@@ -61,7 +61,7 @@ class Replayed:
     how: How
 
     def estimates(self, run: int) -> dict[str, Stream]:
-        """The Gaussian estimates of a run, by topic, in the order of their stamps."""
+        """Return the Gaussian estimates of a run, by topic, in the order of their stamps."""
         wanted = schemas.GAUSSIAN_ESTIMATE.full_name
         found = {
             topic: rows.of_run(run)
@@ -74,7 +74,7 @@ class Replayed:
         }
 
     def failure(self, run: int) -> str:
-        """When and why a run ends before its time; empty where it does not."""
+        """Say when and why a run ends before its time; empty where it does not."""
         for rows in self.outputs.values():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 own = rows.of_run(run)
@@ -97,7 +97,7 @@ class Replayed:
         return found
 
     def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """The metrics of one run by case and quantity, those that are known."""
+        """Return the metrics of one run by case and quantity, those that are known."""
         return self._metrics.get(run, {})
 
 
@@ -155,7 +155,7 @@ def compared(
 
 
 def _reach(found: Sequence[Parting], main: str) -> float:
-    """By how much an RMSE can change: no more than the estimates of common stamps are apart.
+    """Return by how much an RMSE can change: no more than estimates of common stamps are apart.
 
     What a copy has not an estimate of, as at a stamp where the message is lost, is in one RMSE alone.
     """
@@ -168,14 +168,14 @@ def _reach(found: Sequence[Parting], main: str) -> float:
 
 
 def _main(quantities: Sequence[str]) -> str:
-    """The metric that a verdict goes by: RMSE of the position or orientation, else the first one."""
+    """Choose a verdict's metric: RMSE of position or orientation, else the first one."""
     errors = [each for each in quantities if "rmse" in each]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in errors]
     return next(iter([*main, *errors]), "")
 
 
 def _parameters(done: Replayed, label: str) -> dict[str, Any]:
-    """All parameters of an estimator: those that it has, and those that one channel states."""
+    """Return all parameters of an estimator: those that it has, and those that one channel states."""
     stated = {}
     for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
         number, _, topics = words.partition(" (")

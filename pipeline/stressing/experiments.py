@@ -120,7 +120,7 @@ def claims_under_stress(
 
 
 def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[str, StressSums]]:
-    """What each part leaves, in their order; a few are handed out at a time."""
+    """Yield what each part leaves, in their order; a few are handed out at a time."""
     working = deque[Future[Any]]()
     for part in parts:
         working.append(pool.executor.submit(part.stressed))
@@ -131,7 +131,7 @@ def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[st
 
 
 def _merged(parts: Sequence[_Part], pool: WorkerPool, progress: Progress) -> Mapping[str, StressSums]:
-    """What stress did, part by part, in their order."""
+    """Merge what stress did, part by part, in their order."""
     whole: dict[str, StressSums] = {}
     try:
         for found in progress(_worked_off(parts, pool), "stressing: parts of the runs", len(parts)):

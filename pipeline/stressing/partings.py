@@ -45,7 +45,7 @@ class Parting(NamedTuple):
 
     @property
     def has_sigmas(self) -> bool:
-        """Whether any covariance is known, without which A is zero."""
+        """Tell whether any covariance is known, without which A is zero."""
         return bool(np.isfinite(self.spread))
 
     @property
@@ -115,7 +115,7 @@ def _largest_finite(spread: Floats) -> float:
 
 
 def _explained(covariance: Floats, other: Floats) -> Floats:
-    """How large A may be by chance, at each of (n,) stamps, where one estimate has less data.
+    """Compute how large A may be by chance at n stamps (n,), where one estimate has less data.
 
     The difference of a consistent estimate with covariance P, and of another with less data and P', has
     the covariance P' - P. So n A^2 is at most the largest eigenvalue of (P' - P) P^-1 times chi-square
@@ -208,5 +208,5 @@ def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermi
 
 
 def _last_narrowed(variances: Floats) -> int:
-    """The row that is the last one narrower than all before it since the variance was that small."""
+    """Find the last row narrower than all before it since the variance was that small."""
     return int(np.flatnonzero(variances <= variances.min())[-1])

@@ -113,7 +113,7 @@ def _in_memory(source: LogSource | MemorySource) -> MemorySource:
 def _stressed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> list[Stressed]:
-    """Runs that hold the same topics, stressed; replays of all copies, of parameters, of the halves."""
+    """Stress runs that hold the same topics: replay all copies, parameters, the halves."""
     bound = bind(label, sources, settings)
     controls = [
         topic
@@ -168,7 +168,7 @@ def _stressed(
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
 
     def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
-        """These changes of these runs, so much smaller."""
+        """Try these changes of these runs, so much smaller."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
             again = replayed(copies(own, size), label, settings, how)
@@ -204,7 +204,7 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Which changes are quartered: those whose half does less, but not half as much, worst first.
+    """Choose which changes are quartered: whose half does less, but not half as much, worst first.
 
     What bends is in proportion where it is small enough. No run is replayed more than twelve times.
     """
@@ -223,7 +223,7 @@ def _bent(
 
 
 def _topics(bound: Sequence[Bound]) -> list[str]:
-    """What is read: of an estimator in time its streams and priors, of a batch all that it takes."""
+    """List what is read: of an estimator in time its streams and priors, of a batch all it takes."""
     found = [
         topic
         for each in bound
@@ -241,7 +241,7 @@ def _lacking(name: str, inputs: Inputs) -> str:
 
 
 def _doubtful(tried: Iterable[Tried]) -> list[str]:
-    """Which changes are halved: of those that do something the three that do most."""
+    """Choose which changes are halved: of those that do something the three that do most."""
     own = [
         each
         for each in tried

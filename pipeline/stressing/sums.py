@@ -65,7 +65,7 @@ class StressSums:
 
     @property
     def _largest(self) -> dict[str, float]:
-        """How far a change moves the mean of a metric at most: of each case, and over all of them."""
+        """Return how far a change moves a metric's mean at most: of each case, and over all of them."""
         largest: dict[str, float] = {}
         for of in self.moved.values():
             sums: dict[str, tuple[float, int]] = {}

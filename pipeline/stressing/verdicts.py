@@ -56,14 +56,14 @@ class Tried(NamedTuple):
 
     @property
     def size(self) -> float:
-        """The largest A; of an estimate without covariances the largest distance, in m or degrees."""
+        """Return the largest A; without covariances the largest distance, in m or degrees."""
         if self.parting is None or self.parting.has_sigmas:
             return self.largest
         return float(np.nanmax([self.parting.metres, self.parting.degrees], initial=0.0))
 
     @property
     def far(self) -> str:
-        """How far the estimate moves, in words."""
+        """Say how far the estimate moves, in words."""
         if self.parting is None:
             return f"the metric moves: {self.beyond}" if self.beyond else "the metric stays"
         sizes = [(self.parting.metres, "m"), (self.parting.degrees, "deg")]
@@ -107,7 +107,7 @@ class Stressed:
 
     @property
     def failed(self) -> str:
-        """When and why the unchanged replay ends before it has an estimate; empty where it has one."""
+        """Say when and why the unchanged replay ends before it has an estimate; else empty."""
         said = [each.failed for each in self.tried.values() if each.why]
         return next(filter(None, said), "")
 
@@ -117,7 +117,7 @@ class Stressed:
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
-        """Whether a change without a half moves the estimate no farther than it may.
+        """Tell whether a change without a half moves the estimate no farther than it may.
 
         It is less than a sigma, or, as a lost message moves it by chance, what the covariances say.
         """
@@ -128,7 +128,7 @@ class Stressed:
         return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
-        """How many times more a change does than half of it, in A; NaN where none was halved.
+        """Return how many times more a change does than half of it, in A; NaN where none was halved.
 
         Where half of the change was halved again, it is that which is compared.
         """
@@ -163,12 +163,12 @@ class Stressed:
 
     @property
     def is_per_prediction(self) -> bool:
-        """Whether a microsecond changes a covariance: one more prediction brings noise of its own."""
+        """Tell whether a microsecond changes a covariance: one more prediction adds noise."""
         return self.is_recursive and self._jumps
 
     @property
     def _jumps(self) -> bool:
-        """Whether a microsecond changes a sigma, and half of one as much."""
+        """Tell whether a microsecond changes a sigma, and half of one as much."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -176,7 +176,7 @@ class Stressed:
 
     @property
     def is_redrawn(self) -> bool:
-        """Whether an ulp of the inputs, too, changes a covariance: it is not the stamps that do."""
+        """Tell whether an ulp of the inputs changes a covariance too: it is not the stamps that do."""
         ulp = self.tried["ulp"].parting
         return ulp is not None and ulp.spread > PER_PREDICTION
 
@@ -214,7 +214,7 @@ class Stressed:
         return found
 
     def _message_at(self, stamp_ns: int) -> str:
-        """The topic whose message is the last one until then."""
+        """Return the topic whose message is the last one until then."""
         last = {
             topic: int(stamps_ns[np.searchsorted(stamps_ns, stamp_ns, side="right") - 1])
             for topic, stamps_ns in self.sensors.items()
@@ -240,7 +240,7 @@ class Stressed:
         return f"{begin}; {self._shrinking(name)}"
 
     def _shrinking(self, name: str) -> str:
-        """What half of a change does, in words, and a quarter where that was tried."""
+        """Say what half of a change does, in words, and a quarter where that was tried."""
         share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
         half = f"half the change does {share:.2g} of it"
         if name in self.quarters:

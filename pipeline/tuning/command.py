@@ -123,14 +123,14 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
 
 
 def _in_words(logs: Sequence[Path]) -> str:
-    """How many logs, the first and the last."""
+    """Say how many logs, the first and the last."""
     if len(logs) > 1:
         return f"{len(logs)} logs, {logs[0]} to {logs[-1]}"
     return f"1 log, {logs[0]}" if logs else "none"
 
 
 def _bound(text: str) -> tuple[str, tuple[float, float]]:
-    """A parameter and its bounds, from NAME=LOW:HIGH."""
+    """Read a parameter and its bounds, from NAME=LOW:HIGH."""
     name, _, ends = text.rpartition("=")
     low, _, high = ends.partition(":")
     try:

@@ -42,7 +42,7 @@ class Confidence(NamedTuple):
 
     @property
     def correlation(self) -> Floats:
-        """(m, m); NaN where a variance is infinite."""
+        """Return the correlations (m, m); NaN where a variance is infinite."""
         with np.errstate(invalid="ignore"):
             return self.covariance / np.outer(self.errors, self.errors)
 
@@ -76,7 +76,15 @@ class SearchOutcome(NamedTuple):
 
 
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
-    """Compute what a curvature (m, m) tells of the parameters at these places."""
+    """Compute what a curvature tells of the parameters.
+
+    Args:
+        places: (m,), the places of these parameters among all k.
+        curvature: (m, m), the second derivatives of the cost, by coordinates.
+
+    Returns:
+        The covariance, with infinite variances of what the cost does not rise along.
+    """
     values, vectors = np.linalg.eigh(curvature)
     rises = values > 0.0
     covariance = (vectors / np.where(rises, values, np.inf)) @ vectors.T
@@ -107,7 +115,7 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 
 
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
-    """The directions (m,), of length one, along which the cost hardly rises, and its curvature there.
+    """Yield the unit directions (m,) along which the cost hardly rises, and its curvature there.
 
     By the eigenvalues of the curvature in useful units: two standard errors that are useful, a factor of
     2.7, or `UNIT` standard errors that a parameter without a useful one has alone.
@@ -126,18 +134,18 @@ def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Fl
 
 
 def _involved(direction: Floats) -> list[int]:
-    """The places of a direction (m,) that count, the first most."""
+    """Return the places of a direction (m,) that count, the first most."""
     order = np.argsort(-np.abs(direction)).tolist()
     return [place for place in order if abs(direction[place]) > INVOLVED]
 
 
 def _factor(value: float) -> float:
-    """Within what factor a positive parameter is known that alone has this curvature."""
+    """Compute within what factor a positive parameter is known that alone has this curvature."""
     return float(np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0)))
 
 
 def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
-    """What it means that the cost has only this curvature along a direction (m,) of length one."""
+    """Say what it means that the cost has only this curvature along a unit direction (m,)."""
     names = [each.name for each in free]
     first, *others = _involved(direction)
     if not others and free[first].useful:
@@ -178,7 +186,17 @@ class Profile(NamedTuple):
 def profiles(
     cost: Cost, coordinates: Coordinates, point: Floats, confidence: Confidence
 ) -> list[Profile]:
-    """The profiles of all parameters that have a standard error, about the point (k,) of least cost."""
+    """Compute the profiles of all parameters that have a standard error.
+
+    Args:
+        cost: minus the log-likelihood, by values (n, k).
+        coordinates: what was searched over.
+        point: (k,), the coordinates of the least cost.
+        confidence: by the curvature there.
+
+    Returns:
+        A profile for each such parameter, over `PROFILE_POINTS` values.
+    """
     found = []
     for index, place in enumerate(confidence.places):
         error, free = confidence.errors[index], coordinates.free[place]

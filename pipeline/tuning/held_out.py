@@ -63,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
-    """A log without the topics of some vehicles; raises BadInput where it has none of one of them."""
+    """Leave some vehicles' topics out of a log; raises BadInput where it has none of one of them."""
     found = {topic.split("/")[1] for topic in source.streams}
     for vehicle in vehicles:
         if vehicle not in found:

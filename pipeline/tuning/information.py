@@ -40,9 +40,18 @@ class Undetermined(NamedTuple):
 
 
 def information(objective: Objective, values: Floats, useful: Floats, places: Sequence[int]) -> Floats:
-    """Return the information (m, m) on the parameters at m of k places, in their useful units (k,).
+    """Compute the information that all logs hold on some of the parameters.
 
-    At values (k,), over all logs. Measurements that one side of a difference lacks tell nothing.
+    Measurements that one side of a difference lacks tell nothing.
+
+    Args:
+        objective: replays the logs.
+        values: (k,), where the derivatives are taken.
+        useful: (k,), each parameter's useful unit.
+        places: which m of the k parameters.
+
+    Returns:
+        (m, m), in useful units.
     """
     found = np.zeros((len(places), len(places)))
     values = values + 2.0 * STEP * useful  # beside a delay of zero, at which stamps are equal
@@ -103,7 +112,7 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """The difference of innovations, message by message, by the covariances of those between (n m,).
+    """Compute a difference of innovations by message, by the covariances of those between (n m,).
 
     A delay changes the order among topics, never within one.
     """
@@ -120,7 +129,7 @@ def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | No
 
 
 def _sparse(directions: Floats) -> Floats:
-    """The same span (d, m) by directions of as few parameters each as elimination leaves."""
+    """Span the same (d, m) by directions of as few parameters each as elimination leaves."""
     rows = directions.copy()
     for number in range(len(rows)):
         rest = np.abs(rows[number:])

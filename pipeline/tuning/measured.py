@@ -12,7 +12,7 @@ BEYOND_NS = 1_000_000_000  # that what drives goes on, so that the last measurem
 def until_last_measured(
     source: LogSource | MemorySource, bound: Sequence[Bound]
 ) -> LogSource | MemorySource:
-    """A log up to a second after its last measurement: what drives the motion may go on for longer.
+    """Cut a log a second after its last measurement: what drives the motion may go on for longer.
 
     There are no estimates that anything could be compared with then, and that is no failure.
     """

@@ -48,10 +48,9 @@ class Run(NamedTuple):
     Attributes:
         ensemble: it alone.
         name: what it is called.
-        begun: by the name of what is estimated how it begins, where the log does not say so. Where it
-            began depended on the values, the likelihoods of different measurements would be compared.
-        starts: from where likelihoods are compared, in place of `begun`, and the log once for each part
-            of these.
+        begun: how what is estimated begins, by its name, where the log does not say so; see `begin`.
+        starts: from where likelihoods are compared, in place of `begun`.
+        parts: the log once for each part of `starts`.
     """
 
     ensemble: Ensemble[MemorySource]
@@ -95,7 +94,7 @@ def _likelihood(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> 
 
 
 def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
-    """The squares of whitened innovations by measured component, and how many there are."""
+    """Sum the squares of whitened innovations by measured component; count them."""
     found: Sums = {}
     for topic, stream in innovations_in(outputs):
         for name, column in zip(stream.components, whitened(stream).T, strict=True):
@@ -105,7 +104,7 @@ def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  
 
 
 def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
-    """NEES by case, and how many components they are of."""
+    """Sum NEES by case; count how many components they are of."""
     found: Sums = {}
     for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         known = errors.nees[np.isfinite(errors.nees)]
@@ -114,7 +113,7 @@ def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
 
 
 def _rmse(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
-    """Squared errors of the position, else of what is judged first, and how many there are."""
+    """Sum squared errors of the position, else of what is judged first; count them."""
     found: Sums = {}
     for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         squared = errors.error[:, errors.main.columns] ** 2
@@ -127,7 +126,7 @@ def _cost_of_likelihood(sums: Sums) -> float:
 
 
 def _cost_of_ratios(sums: Sums) -> float:
-    """How far mean squares are from one, each by its own standard deviation, 1/2 sum n/2 log(s/n)^2."""
+    """Compute how far mean squares are from one, by their deviations, 1/2 sum n/2 log(s/n)^2."""
     squares = np.array(list(sums.values()))
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(squares[:, 0] / squares[:, 1])
@@ -135,7 +134,7 @@ def _cost_of_ratios(sums: Sums) -> float:
 
 
 def _cost_of_squares(sums: Sums) -> float:
-    """The logarithms of the RMSEs, of which there is one but for logs that have other truths."""
+    """Sum the logarithms of the RMSEs, of which logs with other truths have more than one."""
     squares = np.array(list(sums.values()))
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(0.5 * np.sum(np.log(squares[:, 0] / squares[:, 1])))
@@ -204,7 +203,7 @@ class Objective:
     _counts: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
-        """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements.
+        """Compute what points (n, k) cost (n,); infinity where a run fails or uses fewer measurements.
 
         Raises BadInput where a worker dies.
         """
@@ -221,7 +220,7 @@ class Objective:
         return costs
 
     def _shared(self, points: Floats) -> list[list[Sums | None]]:
-        """Of every run what it tells at each point, by all who work, each for some of the points."""
+        """Return what every run tells at each point; all workers share the points."""
         with threads() if self.pool is None else nullcontext(self.pool) as pool:
             parts = np.array_split(points, min(pool.workers, len(points)))
             alone = self._without_runs()
@@ -241,14 +240,14 @@ class Objective:
                 ) from error
 
     def _without_runs(self) -> "Objective":
-        """What workers need besides a run."""
+        """Return what workers need besides a run."""
         return replace(self, runs=(), on_best=silent, pool=None)
 
     def begin(self, start: Floats) -> None:
         """Note what every log tells at the start (k,), and where filters begin there: so it stays.
 
-        Raises BadInput where a run fails there, the log lacks what is minimised, or the estimator
-        cannot go to other processes that are to work.
+        Else likelihoods of different measurements would be compared. Raises BadInput where a run fails,
+        a log lacks what is minimised, or the estimator cannot go to other processes.
         """
         if self.pool is not None:
             try:
@@ -320,7 +319,7 @@ class Objective:
         return self._total(parts, run, count)
 
     def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
-        """The outputs that are compared: from each part of broad starts, where the log has none."""
+        """Return the outputs that are compared: of each part of broad starts, where the log has none."""
         if not run.starts:
             return [self.outputs(values, run)]
         bound = [begun_at(each, run.starts) for each in self._bound(values, run)]
@@ -331,7 +330,7 @@ class Objective:
         ]
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
-        """What all parts tell; None where all of them fail or gave another number of messages."""
+        """Sum what all parts tell; None where all fail or gave another number of messages."""
         is_used = [not _failures(outputs) and self._count(outputs) == count for outputs in parts]
         if not any(is_used):
             return None
@@ -342,7 +341,7 @@ class Objective:
         return found[0] if len(parts) == 1 else dict(mean_likelihood(found))
 
     def _count(self, outputs: Mapping[str, Ragged]) -> int:
-        """How many messages are compared: innovations alone, where these are; a delay adds estimates."""
+        """Count the messages compared: innovations alone, if there are; a delay adds estimates."""
         if CRITERIA[self.by].is_smooth:
             return sum(len(stream) for _, stream in innovations_in(outputs))
         return sum(len(rows) for rows in outputs.values())
@@ -360,7 +359,7 @@ class Objective:
 
 
 def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
-    """When a log's filters begin, by what is estimated and by topic."""
+    """Return when a log's filters begin, by what is estimated and by topic."""
     return {
         (name, topic): rows.stream.publish_time_ns.tolist()
         for name, opened in run.begun.items()
@@ -380,7 +379,13 @@ def _as_noted(opened: Initialized, *_: Any) -> Initialized:
 
 
 def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:
-    """Settings with these values (k,) of parameters by their full names."""
+    """Return settings in which parameters have other values.
+
+    Args:
+        settings: they stay as they are.
+        names: the parameters, by their full names.
+        values: (k,), what these become.
+    """
     pairs = zip(names, values.tolist(), strict=True)
     return reduce(merge, (nested(name, value) for name, value in pairs), dict(settings))
 

@@ -266,7 +266,7 @@ class Tuning:
                 )
 
     def _notes_of_truth(self) -> Iterator[str]:
-        """What innovations do not see: errors that the state follows."""
+        """Say what innovations do not see: errors that the state follows."""
         for replayed in self.replays:
             metrics = replayed.judge.metrics
             for key, (_, high) in replayed.judge.bounds.items():
@@ -286,7 +286,7 @@ class Tuning:
                 )
 
     def _notes_of_others(self) -> Iterator[str]:
-        """Whether logs that were not searched by are explained better too."""
+        """Say whether logs that were not searched by are explained better too."""
         if self.held_out_costs is not None:
             before, after = self.held_out_costs
             what, sign = "cost", 1.0
@@ -302,7 +302,7 @@ class Tuning:
 
     @property
     def _scale(self) -> str:
-        """What the log-likelihood of the logs held out is, beside that of the tables."""
+        """Say what the log-likelihood of the logs held out is, beside that of the tables."""
         count = len(self.held_out_logs)
         total = "of 1 log" if count == 1 else f"the sum over {count} logs"
         is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")
@@ -364,7 +364,7 @@ class Tuning:
 
     @property
     def _meanings(self) -> Mapping[str, str]:
-        """What the estimator's parameters are, in a few words."""
+        """Say what the estimator's parameters are, in a few words."""
         return next(iter(self.replay.done.meanings.values()), {})
 
     @property
@@ -390,7 +390,7 @@ class Tuning:
 
 
 def _is_toml(value: Any) -> bool:
-    """Whether a setting can be written: an estimator of a program's own cannot, nor can None."""
+    """Tell whether a setting can be written: an estimator of a program's own cannot, nor can None."""
     return isinstance(value, bool | int | float | str | list | dict)
 
 

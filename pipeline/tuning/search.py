@@ -128,7 +128,7 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], each: Free) -> tuple[float, Floats]:
-    """UNIT standard errors of one parameter alone, by the curvature about the start; the last costs."""
+    """Find UNIT standard errors of one parameter alone, by the curvature about the start, and costs."""
     step = 1e-3 * max(abs(each.start), 1.0)
     for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
         costs = near([-step, 0.0, step])
@@ -163,11 +163,20 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
 def least(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
-    """Find where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
+    """Find where the cost is least.
 
-    In coordinates. A descent from far off can end in another minimum than the least, such as one in
-    which two modes have changed their parts. So it begins, and ends, where no change of a single
-    parameter by one of `FACTORS` costs less.
+    A descent from far off can end in another minimum than the least, such as one in which two modes have
+    changed their parts. So it begins, and ends, where no change of a single parameter by one of
+    `FACTORS` costs less.
+
+    Args:
+        cost: what values (n, k) cost.
+        coordinates: what is searched over.
+        start: (k,), in coordinates.
+        is_smooth: whether the cost has a gradient, so that the search may follow it.
+
+    Returns:
+        Where the cost is least (k,), in coordinates, and whether the search came to its end.
     """
     point = _scanned(cost, coordinates, start)
     while True:
@@ -178,7 +187,7 @@ def least(
 
 
 def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """A point (k,) from which no change of one positive parameter costs less: the start, or another."""
+    """Find a point (k,) from which no change of one positive parameter costs less."""
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
@@ -201,7 +210,7 @@ def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
 def _minimum(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
-    """The minimum (k,) that the cost falls to from a start (k,), and whether the search came to its end.
+    """Find the minimum (k,) that the cost falls to from a start (k,), and whether the search converged.
 
     In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """
@@ -249,9 +258,16 @@ def _minimum(
 
 
 def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
-    """Return the second derivatives (m, m) of the cost at a point (k,), by m of its coordinates.
+    """Compute the second derivatives of the cost at a point.
 
-    They are not finite where the cost beside the point is not.
+    Args:
+        cost: what values (n, k) cost.
+        coordinates: what is searched over.
+        point: (k,), in coordinates.
+        places: by which m of the k coordinates.
+
+    Returns:
+        (m, m), by coordinates; not finite where the cost beside the point is not.
     """
     m, h = len(places), CURVATURE_STEP
     along = h * np.eye(len(point))[list(places)]

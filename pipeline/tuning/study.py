@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _rows(
     source: MemorySource, label: str, settings: Mapping[str, Any], true: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """A row per parameter of one log: true and tuned value, interval, standard error, doubt."""
+    """Return a row per parameter of one log: true and tuned value, interval, standard error, doubt."""
     found = tune(source, {label: settings}, list(true))
     tables, errors = found.parameters.to_dict("records"), found.standard_errors
     return [
@@ -85,7 +85,7 @@ def _rows(
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Over the runs: coverage, the spread of log(value / true), its standard error, doubts."""
+    """Sum up runs: coverage, the spread of log(value / true), its standard error, doubts."""
     ratios = np.log(rows["value"] / rows["true"])
     return pd.Series(
         {
@@ -98,7 +98,7 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 
 def _chart(summary: pd.DataFrame) -> Chart:
-    """Coverage, and the spread of the values beside their standard errors, over the logs' length."""
+    """Draw coverage, and the values' spread beside their standard errors, over the logs' length."""
     x = Axis(label="length of the log (s)", log=True)
     covered = Panel(x=x, y=Axis(label="95 % intervals that hold the truth", limits=(0.0, 1.05)))
     spread = Panel(x=x, y=Axis(label="spread of log(value / true)", log=True))

@@ -166,20 +166,20 @@ def tune(
 def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
 ) -> AbstractContextManager[WorkerPool | None]:
-    """Who evaluates; None stands for threads of this process."""
+    """Return who evaluates; None stands for threads of this process."""
     if workers is None and scheduler is None and executor is None:
         return nullcontext()
     return pool_for(workers, scheduler, 1, executor)()
 
 
 def _criterion(run: Run, bound: Sequence[Bound]) -> By:
-    """By what an estimator is tuned: its likelihood, or its errors where it gives no innovations."""
+    """Choose by what an estimator is tuned: its likelihood, or errors where it has no innovations."""
     outputs = collect(replay(run.ensemble, bound))
     return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
 
 
 def _gate(bound: Sequence[Bound]) -> float:
-    """The probability that a measurement is let in by the gate, if there is one."""
+    """Return the probability that a measurement is let in by the gate, if there is one."""
     return float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
 
 
@@ -200,7 +200,7 @@ def _searched(
     source: Source,
     bound: Sequence[Bound],
 ) -> list[Free]:
-    """What is searched for, by the parameters that an estimator was bound with.
+    """List what is searched for, by the parameters that an estimator was bound with.
 
     Raises BadInput where a name is none, stands twice, or its start or bounds cannot be.
     """
@@ -247,7 +247,7 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
 
 
 def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
-    """The value that an estimator has on a log of a number, by its full name, and whether it is assumed.
+    """Return a number's value on a log for an estimator, by its full name, and whether it is assumed.
 
     Raises BadInput where neither the settings nor the log's channels state it.
     """
@@ -264,7 +264,7 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
 
 
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
-    """The values of least cost with which filters begin where they began in the search.
+    """Find the values of least cost with which filters begin where they began in the search.
 
     Without a prior in the log, where a filter begins depends on the values: on how far it trusts its
     path between the first fixes, say. That is held during a search, else likelihoods of different
@@ -290,7 +290,7 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
 def _held(
     objective: Objective, free: Sequence[Free], values: Floats
 ) -> tuple[list[Free], dict[str, Any]]:
-    """What of a calibration the motion does not determine, at values (k,), is kept at its start.
+    """Keep at its start what of a calibration the motion does not determine, at values (k,).
 
     Far from the best values innovations are large, so that it is looked at there once more. What was
     held before stays so.
@@ -315,7 +315,7 @@ def _held(
 def _search(
     objective: Objective, free: Sequence[Free], grid: int, point: Floats | None = None
 ) -> SearchOutcome:
-    """The values of least cost, and how well they are told; from a point (k,), in coordinates, if given.
+    """Find the values of least cost, and how well they are told; from a point (k,), if given.
 
     A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
     change with one of them.
@@ -352,7 +352,7 @@ def _search(
 def _confidence_at(
     objective: Objective, coordinates: Coordinates, point: Floats
 ) -> tuple[Confidence | None, bool]:
-    """How well a search by likelihood tells what lies at no bound, and whether runs fail beside it."""
+    """Compute how well a search tells what lies at no bound, and whether runs fail beside it."""
     inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
     if objective.by != "likelihood" or not inner:
         return None, False
@@ -364,7 +364,7 @@ def _confidence_at(
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
 ) -> dict[str, Any]:
-    """What all other logs give, and what the logs of a fold cost with that."""
+    """Return what all other logs give, and what the logs of a fold cost with that."""
     found = _settled(rest, free, grid)
     start = np.array([each.start for each in free])
     costs = left_out(np.array([start, found.optimum]))

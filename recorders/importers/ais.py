@@ -114,7 +114,7 @@ def read(path: Path, parameters: AisParameters) -> Recording:
 
 
 def _reports(path: Path) -> Reports:
-    """All rows of a file, checked."""
+    """Read all rows of a file, checked."""
     table = _table(path)
     numbers = table[list(NUMBERS)].apply(pd.to_numeric, errors="coerce")
     for name in NUMBERS:
@@ -139,7 +139,7 @@ def _reports(path: Path) -> Reports:
 
 
 def _table(path: Path) -> pd.DataFrame:
-    """The rows of a file as text."""
+    """Read the rows of a file as text."""
     if path.is_dir():
         raise BadInput(f"{path}: is a folder; give one AIS table, a .csv or .csv.xz file")
     try:
@@ -169,7 +169,7 @@ def _refuse(path: Path, table: pd.DataFrame, name: str, bad: pd.Series, wanted: 
 
 
 def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Reports:
-    """Those whose position is known; counts also what else is not."""
+    """Keep those whose position is known; count also what else is not."""
     unknown = (reports.latitude_deg > 90.0) | (reports.longitude_deg > 180.0)
     if unknown.all():
         raise BadInput(
@@ -186,7 +186,7 @@ def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Repo
 
 
 def _without_repetitions(reports: Reports, notes: dict[str, str]) -> Reports:
-    """Every row once."""
+    """Keep every row once."""
     repeated = pd.DataFrame(reports._asdict()).duplicated().to_numpy()
     if repeated.any():
         notes["repeated rows"] = f"{repeated.sum()} dropped"
@@ -194,7 +194,7 @@ def _without_repetitions(reports: Reports, notes: dict[str, str]) -> Reports:
 
 
 def _middle(reports: Reports) -> tuple[float, float]:
-    """The median of the positions; on the circle of longitudes it is the one about their mean."""
+    """Compute the median of the positions; on the circle of longitudes it is about their mean."""
     longitude = np.radians(reports.longitude_deg)
     mean = np.degrees(np.arctan2(np.sin(longitude).mean(), np.cos(longitude).mean()))
     about = (reports.longitude_deg - mean + 180.0) % 360.0 - 180.0

@@ -167,7 +167,7 @@ def read(folder: Path, parameters: AutoferryParameters) -> Recording:
 
 
 def _file(folder: Path, kind: str) -> Path:
-    """The one file of a kind in a scenario's folder."""
+    """Find the one file of a kind in a scenario's folder."""
     found = sorted(folder.glob(f"*_{kind}.json")) if folder.is_dir() else []
     if len(found) != 1:
         raise BadInput(
@@ -208,7 +208,7 @@ def _scans(path: Path) -> Scans:
 
 
 def _places(measurement: Any, where: str) -> Floats:
-    """Places (n, 2) east and north: none is [], one is [N, E], more are [[N ...], [E ...]]."""
+    """Read places (n, 2) east and north: none is [], one is [N, E], more are [[N ...], [E ...]]."""
     if measurement == []:
         return np.empty((0, 2))
     rows = measurement if isinstance(measurement, list) else [measurement]
@@ -225,14 +225,14 @@ def _places(measurement: Any, where: str) -> Floats:
 
 
 def _bearings(measurement: Any, where: str) -> Floats:
-    """Bearings (n, 1) anticlockwise from east; one is a bare number, clockwise from north."""
+    """Read bearings (n, 1) anticlockwise from east; one is a bare number, clockwise from north."""
     values = measurement if isinstance(measurement, list) else [measurement]
     clockwise = _numbers(values, where, "measurement", len(values))
     return np.pi - (clockwise[:, None] + np.pi / 2.0) % (2.0 * np.pi)
 
 
 def _truths(path: Path) -> dict[int, tuple[Integers, Floats]]:
-    """By target the distinct stamps (n,), ascending, and the places (n, 2) then."""
+    """Read by target the distinct stamps (n,), ascending, and the places (n, 2) then."""
     found: dict[int, dict[int, tuple[float, ...]]] = {}
     for number, entry in enumerate(_entries(path)):
         where = f"{path}: entry {number}"
@@ -259,7 +259,7 @@ def _of(entry: Any, key: str, where: str) -> Any:
 
 
 def _stamp_ns(entry: Any, where: str) -> int:
-    """The time of an entry; whole seconds apart, since a double of 1e9 s has no nanoseconds to lose."""
+    """Read the time of an entry; whole seconds apart, as a double of 1e9 s has no nanoseconds."""
     [time_s] = _numbers([_of(entry, "time", where)], where, "time", 1)
     if not 0.0 <= time_s < 9e9:
         raise BadInput(f"{where}: time is {time_s:g}; expected seconds since 1970")
@@ -276,7 +276,7 @@ def _numbers(values: Any, where: str, name: str, count: int) -> Floats:
 def _sensor_streams(
     prefix: str, rows: Integers, scans: Scans, stated: dict[str, str]
 ) -> Iterator[Stream]:
-    """The scans of one sensor, and what it saw."""
+    """Yield the scans of one sensor, and what it saw."""
     counts = np.array([len(scans.seen[row]) for row in rows])
     owner, seen = np.repeat(rows, counts), np.concatenate([scans.seen[row] for row in rows])
     scan_id = np.repeat(np.arange(len(rows)), counts)

@@ -93,7 +93,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
 
 
 def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
-    """The datasets of one file, all of one length, and the sampling rate."""
+    """Read the datasets of one file, all of one length, and the sampling rate."""
     with extra("papers", f"{file}, a file of HDF5"):
         import h5py  # which takes long to import
 

@@ -131,7 +131,7 @@ class StreamMapping(Parameters):
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:
-    """The message that a mapping gives; raises BadInput where fuselog lacks it or one of its fields."""
+    """Return the message that a mapping gives; raises BadInput where it or a field is unknown."""
     known = {schema.name: schema for schema in schemas.SCHEMAS.values()}
     if mapping.becomes not in known:
         raise BadInput(
@@ -215,7 +215,7 @@ class _Maker(NamedTuple):
         return made
 
     def _values(self, name: str, given: OneOrMore[Source]) -> NDArray:
-        """A field's values (n, width), in fuselog's unit."""
+        """Compute a field's values (n, width), in fuselog's unit."""
         values = self._numbers(_listed(given))
         mapping, width = self.mapping, values.shape[1]
         stated = len(mapping.components.split(","))
@@ -237,7 +237,7 @@ class _Maker(NamedTuple):
         return values
 
     def _covariance(self, name: str, stretch: Floats) -> Floats:
-        """A covariance (n, width * width) of standard deviations."""
+        """Compute a covariance (n, width * width) of standard deviations."""
         mapping = self.mapping
         deviations = self._numbers(mapping.deviations[name])
         width = deviations.shape[1]
@@ -258,7 +258,7 @@ class _Maker(NamedTuple):
         return covariance.reshape(self.size, -1)
 
     def _numbers(self, sources: Sequence[Source]) -> NDArray:
-        """The numbers (n, width) of sources."""
+        """Read the numbers (n, width) of sources."""
         parts = []
         for source in sources:
             if isinstance(source, str):
@@ -271,7 +271,7 @@ class _Maker(NamedTuple):
         return np.concatenate(parts, axis=1)
 
     def _conversions(self, name: str, width: int) -> Floats:
-        """By what each entry of a field is multiplied."""
+        """Return by what each entry of a field is multiplied."""
         if name not in self.mapping.units:
             return np.ones(width)
         names = self.mapping.components.split(",")
@@ -284,7 +284,7 @@ class _Maker(NamedTuple):
             raise BadInput(f"{self.where}: {error}") from None
 
     def _spread(self, given: OneOrMore, width: int, what: str) -> NDArray:
-        """One for each entry of a vector."""
+        """Repeat what is one for each entry of a vector."""
         values = _listed(given)
         if len(values) not in (1, width):
             raise BadInput(f"{self.where}: {what}: found {len(values)} values; give one, or {width}")
@@ -327,19 +327,24 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
 
 
 def _quaternion_of(mapping: StreamMapping) -> list[int]:
-    """Where a vector has the parts of a quaternion, if it has one."""
+    """Find where a vector has the parts of a quaternion, if it has one."""
     return [index for index, kind in enumerate(mapping.kinds.split(",")) if kind == "quaternion"]
 
 
 def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
-    """Orientations (n, 4) of the body where `quaternion` has the sensor's, each as long as it was."""
+    """Turn orientations (n, 4) of the sensor to those of the body, each as long as it was."""
     return compose(quaternion, turn.inv().as_quat(scalar_first=True))
 
 
 def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Return which messages (n,) lack a number that they must have, or have none at all.
+    """Find the messages that lack a number that they must have, or have none at all.
 
-    `columns` may be without some fields.
+    Args:
+        schema: of the messages.
+        columns: by field, (n,) or (n, width) each; some fields may be missing.
+
+    Returns:
+        (n,), whether a message is such.
     """
     size = len(next(iter(columns.values())))
     lacks, finite = np.zeros(size, bool), []
@@ -357,9 +362,17 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
 
 
 def checked(where: str, field: str, column: NDArray) -> NDArray:
-    """A column's values; raises BadInput, which begins with `where`, for such as nothing can mean.
+    """Return a column's values; where one may be missing, infinite ones become NaN.
 
-    Where a value may be missing, infinite ones become NaN.
+    Args:
+        where: what a message begins with.
+        field: the schema's.
+        column: (n,) or (n, width), in the field's unit.
+
+    Returns:
+        The same shape; quaternions are scaled to unit length.
+
+    Raises BadInput for values that nothing can mean.
     """
     limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
     if limit is not None and len(column) and np.abs(column).max() > limit:

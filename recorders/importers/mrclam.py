@@ -139,7 +139,7 @@ def _robot_streams(
 
 
 def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """The numbers of one file, (rows, columns); some columns hold whole numbers of 32 bits."""
+    """Read the numbers of one file, (rows, columns); some columns hold whole numbers of 32 bits."""
     try:
         table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
     except FileNotFoundError:
@@ -171,7 +171,7 @@ def _refuse(bad: NDArray[np.bool_], path: Path, table: pd.DataFrame, what: str) 
 def _timed(
     path: Path, columns: int, identifiers: tuple[int, ...] = ()
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
+    """Read stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
 
     Stamps are printed to the millisecond, and are not exact as doubles: rounding makes them so again.
     """

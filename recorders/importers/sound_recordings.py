@@ -126,7 +126,7 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
 
 
 def _array(folder: Path, path: Path, table: pd.DataFrame, first_id: int, notes: dict[str, str]) -> Array:
-    """What an array's files hold, and where they are; microphones count from `first_id` on."""
+    """Read what an array's files hold, and where they are; microphones count from `first_id` on."""
     places = _places(path, table)
     files = _recordings(folder, places, notes)
     if not files:
@@ -153,7 +153,7 @@ def _table(path: Path) -> pd.DataFrame:
 
 
 def _places(path: Path, table: pd.DataFrame) -> dict[str, Floats]:
-    """The places (3,) of microphones by file; z is 0 where the table has none."""
+    """Read the places (3,) of microphones by file; z is 0 where the table has none."""
     axes = [axis for axis in AXES if axis in table.columns]
     found: dict[str, Floats] = {}
     for name, row in zip(table.iloc[:, 0], table[axes].to_numpy(), strict=True):
@@ -176,7 +176,7 @@ def _number(value: Any) -> float:
 
 
 def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -> dict[str, Recorded]:
-    """What the files of an array hold, by name; what is not there or silent is left out, and told."""
+    """Read an array's files, by name; what is not there or silent is left out, and told."""
     found: dict[str, Recorded] = {}
     for name in at:
         path = folder / name
@@ -200,7 +200,7 @@ def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -
 
 
 def _read(path: Path) -> Recorded:
-    """A WAV file of one channel; BadInput where it is none, or not whole."""
+    """Read a WAV file of one channel; raises BadInput where it is none, or not whole."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", wavfile.WavFileWarning)
         warnings.filterwarnings("ignore", r"Chunk \(non-data\)", wavfile.WavFileWarning)
@@ -219,7 +219,7 @@ def _read(path: Path) -> Recorded:
 
 
 def _begin_ns(path: Path) -> int | None:
-    """When a recording began, as its comment says; None where it does not."""
+    """Read when a recording began, as its comment says; None where it does not."""
     stated = re.search(rb'"recording_start_time": "([^"]+)"', path.read_bytes())
     if stated is None:
         return None
@@ -237,13 +237,13 @@ def _begin_ns(path: Path) -> int | None:
 
 
 def _span_ns(recorded: Recorded, epoch_ns: int) -> tuple[int, int]:
-    """When a recording begins and ends; at the epoch where it does not say."""
+    """Return when a recording begins and ends; at the epoch where it does not say."""
     begin_ns = epoch_ns if recorded.begin_ns is None else recorded.begin_ns
     return begin_ns, begin_ns + round(len(recorded.samples) / recorded.rate_hz * 1e9)
 
 
 def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) -> Iterator[Sound]:
-    """The sounds of an array: those of the tables of detections, or its recordings as far as all go."""
+    """Yield the sounds of an array: those of the tables of detections, or of its recordings."""
     spans = {name: _span_ns(each, epoch_ns) for name, each in array.files.items()}
     has_one = False
     for path, table in tables.items():
@@ -270,7 +270,7 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
 
 
 def _topic(name: str) -> str:
-    """A name that a topic may have as one of its parts."""
+    """Make a name that a topic may have as one of its parts."""
     return re.sub(r"[^\w-]+", "_", name)
 
 
@@ -281,7 +281,7 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """The differences of one sound, and the truth where it is known; none where too few heard it.
+    """Yield the differences of one sound, and the truth where known; nothing where too few heard it.
 
     It is looked for a little longer than it lasts on both sides, as long as sound travels between the
     microphones. A file that does not cover the sound itself, or is silent there, is left out.

@@ -57,7 +57,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Columns on a grid that is wider than their noise."""
+    """Find columns on a grid that is wider than their noise."""
     for field, name, column in _entries(stream):
         known = column[:LOOKED_AT][np.isfinite(column[:LOOKED_AT])]
         step = resolution(known)
@@ -80,7 +80,7 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Inertial columns that stand at the end of a usual range."""
+    """Find inertial columns that stand at the end of a usual range."""
     for field, name, column in _entries(stream):
         ranges = RANGES.get(field)
         if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
@@ -124,7 +124,7 @@ def resolution(values: Floats) -> float:
 
 
 def _entries(stream: Stream) -> Iterator[tuple[str, str, Floats]]:
-    """The field, name and values (n,) of every measured component; of what is regular alone."""
+    """Yield field, name and values (n,) of every measured component; of what is regular alone."""
     if stream.schema.full_name not in REGULARS:
         return
     for entry in stream.schema:
@@ -139,7 +139,7 @@ def _entries(stream: Stream) -> Iterator[tuple[str, str, Floats]]:
 
 
 def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which runs of equal values are of a grid, within whose next steps is what is before and after."""
+    """Tell which runs of equal values are a grid's, whose neighbours are within its next steps."""
     steps = np.abs(np.diff(column[edges]))
     farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
     levels = np.unique(column[np.isfinite(column)])

@@ -15,7 +15,7 @@ _PARTIAL = {schemas.POSE.full_name, schemas.TWIST.full_name}
 
 
 def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Covariances that are -1, zero, negative, not symmetric, indefinite, or one number throughout."""
+    """Find covariances that are -1, zero, negative, not symmetric, indefinite, or one number."""
     for entry in stream.schema:
         column = stream.columns[entry.name]
         if not entry.name.startswith("covariance") or column.ndim != 2 or not column.shape[1]:
@@ -53,7 +53,7 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def _faults(
     values: NDArray[np.float64], *, is_partial: bool, is_stated: bool
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Each fault with the rows (n,) that have it, the plainest first.
+    """Yield each fault with the rows (n,) that have it, the plainest first.
 
     `is_partial` says that zero may stand for a component that there is none, `is_stated` that one
     message is for all of the log.

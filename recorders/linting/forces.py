@@ -21,7 +21,7 @@ UPRIGHT = {
 
 
 def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Units whose z axis is not up at rest; beside orientations, which may say so, nothing is."""
+    """Find units whose z axis is not up at rest; not beside orientations, which may say so."""
     if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
         return
     if any(_turns(each) for each in streams.values()):
@@ -60,5 +60,5 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _turns(stream: Stream) -> bool:
-    """Whether a topic says how a body is turned in space."""
+    """Tell whether a topic says how a body is turned in space."""
     return "quaternion" in stream.columns or "quaternion" in stream.metadata.get("kinds", "")

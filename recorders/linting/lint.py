@@ -73,7 +73,7 @@ def _asked(
 
 
 def _portions(blocks: Iterable[Mapping[str, Stream]]) -> Iterator[dict[str, Stream]]:
-    """Blocks joined until they have `MOST` messages, without estimates and topics that are empty."""
+    """Join blocks until they have `MOST` messages, without estimates and topics that are empty."""
     parts: dict[str, list[Stream]] = {}
     count = 0
     for block in blocks:

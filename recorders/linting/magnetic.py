@@ -21,7 +21,7 @@ SCATTER = 0.1  # about the ellipse, of the radius
 
 
 def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Fields that are the Earth's in another unit, or in none."""
+    """Find fields that are the Earth's in another unit, or in none."""
     field = _field(stream)
     if field is None:
         return
@@ -49,7 +49,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Fields whose circle in a full turn is off the origin (hard iron), or an ellipse (soft iron)."""
+    """Find fields whose circle in a full turn is off the origin (hard iron) or an ellipse (soft)."""
     field = _field(stream)
     circle = None if field is None else ellipse(field)
     if circle is None:
@@ -90,7 +90,7 @@ class Ellipse(NamedTuple):
 
 
 def ellipse(field: Floats) -> Ellipse | None:
-    """The ellipse of a full turn about one axis, by least squares; None where no turn is whole."""
+    """Fit the ellipse of a full turn about one axis, by least squares; None where no turn is whole."""
     mean = field.mean(axis=0)
     spreads, axes = np.linalg.eigh(np.cov((field - mean).T))
     if spreads[1] <= 0.0 or spreads[0] > FLAT * spreads[1]:
@@ -119,7 +119,7 @@ def ellipse(field: Floats) -> Ellipse | None:
 
 
 def _field(stream: Stream) -> Floats | None:
-    """The fields (n, 3) that are known, where they are enough."""
+    """Return the fields (n, 3) that are known, where they are enough."""
     known = {schemas.INERTIAL_SAMPLE.full_name, schemas.MAGNETIC_FIELD.full_name}
     if stream.schema.full_name not in known or stream[FIELD].shape[1] != 3:
         return None

@@ -21,7 +21,7 @@ FEWEST = 20
 
 
 def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Latitudes and longitudes beyond their range, in integers, or at 0, 0."""
+    """Find latitudes and longitudes beyond their range, in integers, or at 0, 0."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     latitude, longitude = stream["latitude_deg"], stream["longitude_deg"]
@@ -63,7 +63,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Latitudes that are longitudes, by how far the wheels come."""
+    """Find latitudes that are longitudes, by how far the wheels come."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     if np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]])) > 90.0:
@@ -91,7 +91,7 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
 
 
 def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Heights above the sea beside ones above the ellipsoid, and a z that points down."""
+    """Find heights above the sea beside ones above the ellipsoid, and a z that points down."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     if not np.isfinite(stream["altitude_m"]).all():
@@ -138,12 +138,12 @@ _PLACED = {schemas.POSITION_FIX.full_name, schemas.POSE.full_name}
 
 
 def _at(stream: Stream, times_ns: np.ndarray) -> np.ndarray:
-    """Altitudes at other stamps."""
+    """Interpolate altitudes at other stamps."""
     return np.interp(times_ns, np.sort(stream.publish_time_ns), stream["altitude_m"])
 
 
 def _wheels(streams: Mapping[str, Stream], stream: Stream) -> Slope | None:
-    """How far fixes move for each metre of the wheels of the same body."""
+    """Compute how far fixes move for each metre of the wheels of the same body."""
     for body in bodies({**streams, stream.topic: stream}):
         if body.speeds and body.fixes and body.fixes[0].topic == stream.topic:
             return Motion(body).speed(body.speeds[0])

@@ -37,7 +37,7 @@ _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schema
 
 
 def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Stamps whose decade is another unit's: beyond 2100, or at a rate that no such sensor has."""
+    """Find stamps whose decade is another unit's: beyond 2100, or at a rate that no sensor has."""
     last_ns = int(stream.publish_time_ns.max())
     if last_ns > YEAR_2100_NS:
         year = 1970 + last_ns / 1e9 / 31_556_952
@@ -70,7 +70,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Stamps that go back from message to message, and equal ones of what is measured once at a time."""
+    """Find stamps that go back between messages, and equal ones of what is measured once at a time."""
     rows = np.argsort(stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
     back = np.diff(stamps_ns) < 0
@@ -109,7 +109,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Steps that scatter, of what should be regular and loses nothing."""
+    """Find steps that scatter, of what should be regular and loses nothing."""
     if len(stream) < FEWEST or stream.schema.full_name not in _CLOCKED:
         return
     steps_s = 1e-9 * _steps_ns(stream)
@@ -127,7 +127,7 @@ def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Stamps that are leap seconds or a time zone off the recorder's clock."""
+    """Find stamps that are leap seconds or a time zone off the recorder's clock."""
     ahead_s = _ahead_s(stream)
     name = _named_offset(ahead_s, int(stream.log_time_ns[0]) / 1e9)
     if not name or stream.schema.full_name == schemas.TRUTH_STATE.full_name:
@@ -153,7 +153,7 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """A clock that is a little fast or slow, as most are; more than 1e-3 is told by plausibility."""
+    """Find a clock a little fast or slow, as most are; more than 1e-3 is told by plausibility."""
     if len(stream) < FEWEST or np.array_equal(stream.publish_time_ns, stream.log_time_ns):
         return
     measured_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
@@ -180,7 +180,7 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:
-    """Which thing (n,) every message is of, where another topic says so row by row; else zeros."""
+    """Return which thing (n,) every message is of, where another topic says so by row; else zeros."""
     for each in streams.values():
         is_named = each.schema.full_name == schemas.IDENTITY.full_name
         if is_named and np.array_equal(each.publish_time_ns, stream.publish_time_ns):
@@ -206,7 +206,7 @@ def _ahead_s(stream: Stream) -> float:
 
 
 def _named_offset(offset_s: float, unix_s: float) -> str:
-    """What differs by so many seconds at a time; empty where nothing does."""
+    """Name what differs by so many seconds at a time; empty where nothing does."""
     gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
     for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
         if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:

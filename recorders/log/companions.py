@@ -55,7 +55,7 @@ def descriptor_set(message: Message) -> bytes:
 
 
 def chunks_of_companions(companions: Sequence[Numbered], chunk_bytes: int) -> Iterator[Chunk]:
-    """Chunks of about `chunk_bytes`, in the order of log time; ties keep the order given."""
+    """Yield chunks of about `chunk_bytes`, in the order of log time; ties keep the order given."""
     rows: list[tuple[Numbered, bytes]] = []
     size = 0
     for row in sorted(companions, key=lambda each: each.companion.log_time_ns):

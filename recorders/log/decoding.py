@@ -49,7 +49,7 @@ class Decoder:
         self._layout: Layout | None = None
 
     def _description(self, log: Log) -> records.Schema:
-        """What the file says of the messages; all channels of the topic must say the same."""
+        """Return what the file says of the messages; all channels of the topic must say the same."""
         described = []
         for identifier in self._topic.channel_ids:
             channel = log.container.channels[identifier]
@@ -69,7 +69,7 @@ class Decoder:
         return schema
 
     def _check_fields(self) -> None:
-        """A message of one of our names must have our fields (but the latest), whatever else it has."""
+        """Require that a message of one of our names has our fields (but the latest)."""
         kinds = {entry.name: entry.kind for entry in self.schema}
         expected = SCHEMAS.get(self.schema.full_name, self.schema)
         wrong = [
@@ -113,7 +113,7 @@ class Decoder:
         )
 
     def _at_once(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> _Decoded | None:
-        """Clocks and columns by the fixed layout; None where a message is laid out in another way."""
+        """Read clocks and columns by the fixed layout; None where a message is laid out otherwise."""
         if not self._is_fixed:
             return None
         if self._layout is None:
@@ -124,7 +124,7 @@ class Decoder:
         return None if found is None else (*_clocks(found), columns_of(self.schema, found))
 
     def _one_by_one(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> _Decoded:
-        """Clocks and columns by the protobuf library, whatever the order and presence of the fields."""
+        """Read clocks and columns by the protobuf library, whatever the fields' order and presence."""
         messages = self._messages(data, offsets)
         columns = {entry.name: self._column(entry, messages) for entry in self.schema}
         return *_clocks(_heads(data, offsets)), columns
@@ -172,7 +172,7 @@ def _heads(data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.vo
 
 
 def _clocks(records: NDArray[np.void]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Log times and publish times, copied out of message records or their heads."""
+    """Copy log times and publish times out of message records or their heads."""
     return (
         np.ascontiguousarray(records["mcap log_time"]),
         np.ascontiguousarray(records["mcap publish_time"]),

@@ -56,14 +56,22 @@ class Layout:
         return records
 
     def parse(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.void] | None:
-        """The message records (n,) at `offsets` of a chunk; None where one is laid out differently."""
+        """Read the message records (n,) at `offsets` of a chunk; None where one is laid out unlike."""
         if not agree(data, offsets, self.pattern):
             return None
         return windows(data, self.dtype.itemsize)[offsets].view(self.dtype)
 
 
 def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
-    """Return the schema's columns, copied out of records; an empty vector has shape (n, 0)."""
+    """Copy the schema's columns out of records.
+
+    Args:
+        schema: of the records.
+        records: (n,), as of `Layout.parse`.
+
+    Returns:
+        By field, (n,) or (n, width); an empty vector has shape (n, 0).
+    """
     return {
         field.name: np.ascontiguousarray(records[field.name])
         if field.name in (records.dtype.names or ())
@@ -73,7 +81,15 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """Every run of `size` bytes of `data` as one opaque item, without a copy: gathers and scatters."""
+    """View every run of some bytes as one opaque item, without a copy, to gather and scatter them.
+
+    Args:
+        data: (n,), the bytes.
+        size: how many make an item.
+
+    Returns:
+        (n - size + 1,), the items that begin at each byte.
+    """
     return np.ndarray((len(data) - size + 1,), _opaque(size), data.data, strides=(1,))
 
 
@@ -109,7 +125,7 @@ def _layout(schema: Schema, widths: tuple[int, ...]) -> Layout:
 
 
 def _prefix(number: int, field: Field, width: int) -> bytes:
-    """The tag, and for a vector the length in bytes, that stand before a field's value."""
+    """Write the tag, and for a vector the length in bytes, that stand before a field's value."""
     tag = _varint(number << 3 | _WIRE_TYPES[field.kind])
     return tag + _varint(width * field.dtype.itemsize) if field.kind == "vector" else tag
 

@@ -53,7 +53,12 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
-    """Return the pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
+    """Return the pattern of the bytes that all records of a layout share.
+
+    Args:
+        record: (size,), the bytes of one.
+        is_fixed: (size,), 0xFF where they are the same in all.
+    """
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
     mask = words_of(is_fixed)[places]
@@ -67,7 +72,13 @@ def scan(data: NDArray[np.uint8]) -> Scan:
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
-    """Tell whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
+    """Tell whether records lie inside a chunk and have the pattern's bytes.
+
+    Args:
+        data: the chunk.
+        offsets: (n,), where the records begin, ascending; at least one.
+        pattern: theirs.
+    """
     if offsets[-1] + pattern.size > len(data):
         return False
     agreed = loop_for(_agree, len(offsets) * pattern.size)
@@ -81,7 +92,7 @@ def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
 
 
 def loop_for(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
-    """The loop to go through so many bytes with."""
+    """Return the loop to go through so many bytes with."""
     _left["plain"] -= size
     if _left["plain"] >= 0 and "numba" not in sys.modules:
         return np.errstate(over="ignore")(loop)

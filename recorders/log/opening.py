@@ -95,7 +95,7 @@ class Log:
         return f"{self.path}: {stated}" if stated else None
 
     def _lost_messages(self) -> str:
-        """How many are left out of the messages that a whole summary states; empty where none are."""
+        """Say how many messages are left out of those that a summary states; empty where none are."""
         stated = {
             topic.name: sum(self.container.stated_counts[key] for key in topic.channel_ids)
             for topic in self._all.values()
@@ -135,6 +135,6 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
 
 def _listed(parts: Sequence[str], what: str) -> str:
-    """The first few, in one sentence."""
+    """Write the first few in one sentence."""
     more = f", and {len(parts) - 3} more {what}" if len(parts) > 3 else ""
     return f"{', '.join(parts[:3])}{more}"

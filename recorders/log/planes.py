@@ -60,7 +60,7 @@ def origin_of(parts: Sequence[str]) -> Origin | None:
 
 
 def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
-    """The origin that a topic's channel states, at height zero where it states none; None without one.
+    """Return the origin that a topic's channel states, by default at height zero; None without one.
 
     Raises BadInput where what it states is no place on the earth.
     """
@@ -93,19 +93,19 @@ def plane_in_words(metadata: Mapping[str, str]) -> str:
 
 
 def common_origin(channels: Mapping[str, Mapping[str, str]]) -> Origin | None:
-    """The origin of a log's plane by its topics' metadata: that which all state that state one."""
+    """Return the origin of a log's plane, that all topics state which state one."""
     stated = {origin for topic, each in channels.items() if (origin := stated_in(topic, each))}
     return stated.pop() if len(stated) == 1 else None
 
 
 def in_plane_of_log(streams: Sequence[Stream]) -> list[Stream]:
-    """The streams of one log; where some state its plane, all that have no frame of their own do."""
+    """Let all streams of one log that have no frame state its plane, where some of them do."""
     origin = common_origin({stream.topic: stream.metadata for stream in streams})
     return [in_plane(stream, origin) for stream in streams]
 
 
 def in_plane(stream: Stream, origin: Origin | None) -> Stream:
-    """A stream that states the log's plane, if it is of one and states neither plane nor frame."""
+    """Let a stream of the log's plane state it, if it states neither plane nor frame."""
     own = stream.metadata
     if origin is None or LATITUDE in own or own.get(FRAME):
         return stream

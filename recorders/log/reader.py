@@ -61,7 +61,7 @@ def read_streams(
 
 
 def read_span(log: Log, clock: Clock) -> tuple[int, int]:
-    """The first and the last stamp in ns of a log by one of its clocks; zeros where it has no messages.
+    """Find the first and last stamp of a log in ns by one of its clocks; zeros without messages.
 
     A file that notes only the log times of its chunks, as those of other writers do, is opened chunk by
     chunk for its publish times. Raises BadInput where one is damaged.
@@ -148,7 +148,7 @@ def _reading(log: Log) -> Iterator[BinaryIO]:
 
 
 def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) -> list[_Ranked]:
-    """The regions that can hold what is asked for, in the order in which their spans begin."""
+    """Choose the regions that can hold what is asked for, in the order in which their spans begin."""
     wanted = {identifier for topic in topics for identifier in log.topics[topic].channel_ids}
     chosen = []
     for rank, region in enumerate(log.container.regions):
@@ -160,7 +160,7 @@ def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) ->
 
 
 def _timed(log: Log, file: BinaryIO, region: Region, clock: Clock) -> Region:
-    """The region with its span of the clock: known, noted by our writer, or else found by opening it."""
+    """Return the region with its span by the clock: known, noted by our writer, or read from it."""
     if clock in region.spans:
         return region
     noted = noted_span(log.container.metadata.get(PUBLISH_SPANS, {}), *region.extent)
@@ -171,7 +171,7 @@ def _timed(log: Log, file: BinaryIO, region: Region, clock: Clock) -> Region:
 
 
 def _contents(log: Log, region: Region, raw: bytes) -> Contents:
-    """The opened region; raises BadInput where it is damaged, or not what the index says of it."""
+    """Open the region; raises BadInput where it is damaged, or not what the index says of it."""
     try:
         contents = open_region(raw, region.offset)
     except Damaged as damage:
@@ -194,7 +194,7 @@ def _contents(log: Log, region: Region, raw: bytes) -> Contents:
 def _decoded(
     log: Log, decoders: Sequence[Decoder], window: _Window, read: tuple[_Ranked, bytes]
 ) -> list[Stream]:
-    """The messages of one region that are asked for."""
+    """Decode the messages of one region that are asked for."""
     (rank, region), raw = read
     contents = _contents(log, region, raw)
     found = [stream for decoder in decoders for stream in decoder.decode(contents, rank)]
@@ -226,7 +226,7 @@ def _released(
 
 
 def _in_order(stream: Stream, clock: Clock) -> Stream:
-    """The same messages in the order of their stamps, equal stamps in file order."""
+    """Put messages in the order of their stamps, equal stamps in file order."""
     times, position = stream.times(clock), stream.position
     later = times[1:] > times[:-1]
     tied = (times[1:] == times[:-1]) & (position[1:] > position[:-1])

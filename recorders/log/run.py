@@ -81,7 +81,7 @@ _WANTED = {dict: "an object", int: "a whole number", NoneType: "null"}
 
 
 def _stated(record: dict[str, str], name: str, *kinds: type) -> Any:
-    """What the JSON under `name` states, of one of these types; no number of a run is negative."""
+    """Read the JSON under `name`, of one of these types; no number of a run is negative."""
     value = parse_json(record[name])
     if type(value) not in kinds:
         wanted = " or ".join(_WANTED[kind] for kind in kinds)

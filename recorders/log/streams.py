@@ -56,7 +56,7 @@ class Stream:
         return len(self.publish_time_ns)
 
     def __getitem__(self, name: str) -> NDArray:
-        """The column of one field."""
+        """Return the column of one field."""
         return self.columns[name]
 
     @property
@@ -105,7 +105,7 @@ class Stream:
         return pl.from_arrow(self.arrow())
 
     def _flat(self) -> dict[str, NDArray]:
-        """Columns with one axis, by name."""
+        """Return columns with one axis, by name."""
         columns = {"publish_time_ns": self.publish_time_ns, "log_time_ns": self.log_time_ns}
         for name, column in self.columns.items():
             if column.ndim == 1:
@@ -169,7 +169,19 @@ def stream_of(
     metadata: Mapping[str, str] | None = None,
     allow_nan: bool = False,
 ) -> Stream:
-    """Make a stream as `make_stream` does, of all columns by name; `allow_nan` lets NaN stand in any."""
+    """Make a stream as `make_stream` does, of all columns by name.
+
+    Args:
+        topic: its name.
+        schema: of its messages.
+        publish_time_ns: (n,), when the quantity was measured.
+        given: by field, (n,), or (n, width) for a vector; one that may be absent need not be given.
+        log_time_ns: (n,), when it reached the recorder; by default when it was measured.
+        metadata: what the channel states, as text.
+        allow_nan: whether any column may hold NaN.
+
+    Raises BadInput as `make_stream` does.
+    """
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
     # an empty vector is as good as an absent one
@@ -202,12 +214,20 @@ def computed_stream(
     columns: Mapping[str, NDArray],
     metadata: Mapping[str, str],
 ) -> Stream:
-    """Make a stream of columns that a kernel filled as the schema says, which nobody needs to check."""
+    """Make a stream of columns that a kernel filled as the schema says, which nobody needs to check.
+
+    Args:
+        topic: its name.
+        schema: of its messages.
+        time_ns: (n,), both of its clocks.
+        columns: by field, (n,) or (n, width).
+        metadata: what the channel states, as text.
+    """
     return Stream(topic, schema, time_ns, time_ns, columns, np.arange(len(time_ns)), metadata)
 
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:
-    """The values as an array of this type, which must be able to keep every one of them."""
+    """Make an array of this type, which must be able to keep every one of the values."""
     dtype, axes = NUMPY_TYPES[kind], 1 + (kind == "vector")
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes:
         return values

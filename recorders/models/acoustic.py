@@ -24,7 +24,7 @@ class Medium(NamedTuple):
 
     @property
     def mach_angle_rad(self) -> float:
-        """Half the opening of the shockwave's cone; eq (5)."""
+        """Return half the opening of the shockwave's cone; eq (5)."""
         return float(np.arcsin(1.0 / self.mach_number))
 
 
@@ -38,7 +38,7 @@ class Noise(NamedTuple):
 
 
 def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, Component]:
-    """Direction of arrival of the muzzle blast, eq (6) with atan2, and the distance in m."""
+    """Compute the muzzle blast's direction of arrival, eq (6) with atan2, and the distance in m."""
     x, y = shooter[0] - sensor[0], shooter[1] - sensor[1]
     return np.arctan2(y, x), np.hypot(x, y)
 
@@ -69,7 +69,7 @@ def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) ->
 
 
 def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) -> Component:
-    """Direction of arrival of the shockwave; eq (7)."""
+    """Compute the shockwave's direction of arrival; eq (7)."""
     return trajectory - side * (0.5 * np.pi + medium.mach_angle_rad)
 
 
@@ -94,14 +94,17 @@ def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Compon
 
 
 def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:
-    """Seconds from shockwave to muzzle blast; `separation` is muzzle blast less shockwave direction."""
+    """Compute the time in s from shockwave to muzzle blast.
+
+    `separation` is the direction of the muzzle blast less that of the shockwave.
+    """
     return distance * (1.0 - np.cos(separation)) / medium.speed_of_sound_mps
 
 
 def time_difference_gradient(
     distance: Component, separation: Component, medium: Medium
 ) -> tuple[Component, Component]:
-    """Derivatives of `time_difference` by distance and by separation."""
+    """Compute derivatives of `time_difference` by distance and by separation."""
     speed = medium.speed_of_sound_mps
     return (1.0 - np.cos(separation)) / speed, distance * np.sin(separation) / speed
 
@@ -114,7 +117,7 @@ def range_from_time_difference(delay: Component, separation: Component, medium: 
 def hear(
     shooter: Components, trajectory: Component, sensor: Components, medium: Medium
 ) -> tuple[Component, Component, Component]:
-    """Both directions of arrival and the time difference; NaN for a shockwave that is not heard."""
+    """Compute both directions of arrival and the time difference; NaN for a shockwave not heard."""
     azimuth, distance = azimuth_range(shooter, sensor)
     side = shockwave_side(azimuth, trajectory, medium)
     shockwave = np.where(side == 0.0, np.nan, shockwave_azimuth(trajectory, side, medium))
@@ -124,7 +127,7 @@ def hear(
 def local_estimate_covariances(
     distance: Component, separation: Component, noise: Noise, medium: Medium
 ) -> tuple[Component, Component, Component]:
-    """Variance of the range estimate, and its covariances with azimuth and trajectory.
+    """Compute the variance of the range estimate, and its covariances with azimuth and trajectory.
 
     Eq (26), whose numerator has c^2 sigma_tau^2, in m^2; eqs (17) and (18) in m rad.
     """
@@ -142,7 +145,7 @@ def local_estimate_covariances(
 def local_estimate_covariance_gradients(
     distance: Component, separation: Component, noise: Noise, medium: Medium
 ) -> tuple[tuple[Component, Component], ...]:
-    """Derivatives of `local_estimate_covariances` by distance and by separation.
+    """Compute derivatives of `local_estimate_covariances` by distance and by separation.
 
     With the chain rule these are eqs (63)-(77).
     """

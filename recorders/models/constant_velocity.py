@@ -9,7 +9,7 @@ from recorders.models.planar import Component
 def noise_moments(
     acceleration_density: Component, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """Variance of the position, covariance with the velocity, variance of the velocity, per axis.
+    """Compute per axis position's variance, its covariance with velocity, and velocity's variance.
 
     `acceleration_density` is the power spectral density of the acceleration, m^2/s^3.
     """

@@ -13,7 +13,7 @@ _MOST_NEWTON_STEPS = 50
 
 
 def saddlepoint(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """The root t > 0 (...) of sum_k 1 / (2 (t - z_k)) = 1 for concentrations z (..., d) with maximum 0.
+    """Find the root t > 0 (...) of sum_k 1 / (2 (t - z_k)) = 1 for concentrations z (..., d), max 0.
 
     It centres the saddlepoint approximation of the normalisation constant (Kume and Wood, Biometrika 92,
     2005) and, as b = 2 t, tunes the envelope of the sampler below.
@@ -119,7 +119,7 @@ class DirectionalNoise(Parameters):
         return self
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Unit vectors (count, d)."""
+        """Draw unit vectors (count, d)."""
         d = len(self.diagonal)
         if self.distribution == "bingham":
             return sample_bingham(np.eye(d), np.broadcast_to(self.diagonal, (count, d)), rng)

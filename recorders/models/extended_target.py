@@ -11,15 +11,15 @@ SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 
 
 def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
-    """The point of the rectangle at `scale` times the half sides, each in [-1, 1], from the centre."""
+    """Return the rectangle's point at `scale` times the half sides, each in [-1, 1], from the centre."""
     return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
 
 
 def quadratic(point: Components) -> tuple[Component, Component, Component, Component]:
-    """A point and its squares: without these a filter that is linear in y learns nothing of the size."""
+    """Return a point and its squares, without which a linear filter learns nothing of the size."""
     return point[0], point[1], point[0] * point[0], point[1] * point[1]
 
 
 def area_m2(target: Components) -> Component:
-    """The rectangle's area; the sign of a half side means nothing to the sensor, but changes this."""
+    """Compute the rectangle's area; a half side's sign, which no sensor sees, changes its sign."""
     return 4.0 * target[0] * target[1]

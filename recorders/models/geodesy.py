@@ -25,7 +25,15 @@ def earth_centred(
 
 
 def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
-    """Return east, north and up at places (...,) as rows (..., 3, 3), in earth-centred axes."""
+    """Compute the directions east, north and up at places on WGS 84, in earth-centred axes.
+
+    Args:
+        latitude_deg: (...).
+        longitude_deg: (...).
+
+    Returns:
+        (..., 3, 3), unit vectors as rows.
+    """
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     zero = np.zeros_like(latitude)
     rows = (
@@ -43,7 +51,7 @@ def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[n
 def out_of_tangent_plane(
     place_m: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Latitude, longitude (deg) and height (m) of a place (east, north) in the plane at the origin.
+    """Compute latitude, longitude (deg) and height (m) of a place (east, north) in the plane.
 
     Bowring's formula, Survey Review 23, 1976: exact to less than a micrometre near the ground.
     """
@@ -72,7 +80,7 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """East, north and up (m) of a place as it is seen from the origin.
+    """Compute east, north and up (m) of a place as it is seen from the origin.
 
     Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
     """

@@ -25,7 +25,7 @@ def turn_together(
 def turn_on(
     direction: Component, turn: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """A direction, and its turn from one step to the next, of which a part remains; without noise.
+    """Return a direction a step later, and its turn, of which a part remains; without noise.
 
     The turn is an angle too: by how much more than half a turn cannot be told from the other way round.
     """

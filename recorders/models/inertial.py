@@ -25,7 +25,7 @@ Vector = tuple[Component, Component, Component]
 
 
 def gravity(latitude_deg: Component, height_m: Component) -> Component:
-    """Normal gravity, m/s2, at a height over the WGS 84 ellipsoid: Somigliana's, less with height.
+    """Compute normal gravity, m/s2, at a height over the WGS 84 ellipsoid: Somigliana's, less above.
 
     NIMA TR8350.2, 3rd edition, (4-1) and (4-3).
     """
@@ -52,7 +52,7 @@ def cross(a: Components, b: Components) -> Vector:
 
 
 def product(p: Components, q: Components) -> tuple[Component, Component, Component, Component]:
-    """Hamilton's product of two quaternions."""
+    """Multiply two quaternions by Hamilton's product."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -69,7 +69,7 @@ def rotation(x: Component, y: Component, z: Component) -> Components:
 
 
 def into_plane(q: Components, v: Components) -> Vector:
-    """A vector of the body in the plane's axes: v + 2 w (u x v) + 2 u x (u x v) for q = (w, u)."""
+    """Turn a body's vector to the plane's axes: v + 2 w (u x v) + 2 u x (u x v) for q = (w, u)."""
     w, x, y, z = q
     a, b, c = cross((x, y, z), v)
     d, e, f = cross((x, y, z), (a, b, c))
@@ -98,7 +98,7 @@ def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Componen
 def strapdown(
     state: Components, force: Components, rate: Components, duration_s: Component, place: Components
 ) -> Components:
-    """Position, velocity and orientation (10 components) after a step of constant force and rate.
+    """Compute position, velocity, orientation (10) after a step of constant force and rate.
 
     Args:
         state: position (m), velocity (m/s) and quaternion before it.

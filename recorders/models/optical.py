@@ -15,12 +15,12 @@ SENSORS, TARGETS = 3, 2  # that move; those that stand may be as many as wanted
 
 
 def azimuth_elevation(x: Components) -> tuple[Component, Component]:
-    """Angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3) with atan2."""
+    """Compute angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3), atan2."""
     return np.arctan2(x[0], x[2]), np.arctan2(x[1], np.hypot(x[0], x[2]))
 
 
 def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
-    """Gradients in rad/m of azimuth and elevation by `x`; eqs (71)-(76), (74) with its root mended."""
+    """Compute gradients in rad/m of azimuth, elevation by `x`; eqs (71)-(76), (74) root mended."""
     ground = np.hypot(x[0], x[2])
     squared = ground**2 + x[1] ** 2
     azimuth = (x[2] / ground**2, 0.0 * x[1], -x[0] / ground**2)
@@ -41,14 +41,14 @@ def rotate(attitude: Components, x: Components) -> Triple:
 def line_of_sight(
     target: Components, sensor: Components, attitude: Components
 ) -> tuple[Component, Component]:
-    """Azimuth and elevation in rad of a target in m, eqs (2)-(4); `attitude` includes the bias."""
+    """Compute a target's azimuth and elevation in rad, eqs (2)-(4); `attitude` includes the bias."""
     return azimuth_elevation(rotate(attitude, _subtract(target, sensor)))
 
 
 def line_of_sight_gradients(
     target: Components, sensor: Components, attitude: Components
 ) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
-    """Gradients of azimuth and elevation by target x, y, z (rad/m) and yaw, pitch, roll (rad/rad).
+    """Compute gradients of azimuth and elevation by target (rad/m) and yaw, pitch, roll (rad/rad).
 
     The chain rule backwards through the three rotations; equals eqs (45)-(103) of the appendix once
     its misprints in (67), (74), (89), (92) and (102) are mended.
@@ -73,7 +73,7 @@ def line_of_sight_gradients(
 
 
 def direction(azimuth: Component, elevation: Component, attitude: Components) -> Triple:
-    """Unit vector, in the common frame, along which a sensor of this attitude sees these angles."""
+    """Compute the unit vector, in the common frame, along which a sensor sees these angles."""
     yaw, pitch, roll = attitude
     level = np.cos(elevation)
     seen = (level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth))
@@ -81,7 +81,7 @@ def direction(azimuth: Component, elevation: Component, attitude: Components) ->
 
 
 def turning_vector(attitude: Components, change: Components) -> Triple:
-    """The small rotation vector of the scene, in the common frame, that a change of attitude hides.
+    """Compute the small rotation of the scene, in the common frame, that a change of attitude hides.
 
     When the scene turns by it about the sensor while the attitude changes by `change` (yaw, pitch,
     roll), the sensor sees what it saw before.

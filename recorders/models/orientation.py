@@ -37,7 +37,15 @@ def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
 
 
 def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
-    """Multiply left and right (..., 2) as complex numbers (24), (..., 4) as quaternions (34)."""
+    """Multiply unit complex numbers (24), or quaternions (34).
+
+    Args:
+        left: (..., d), d = 2 or 4.
+        right: (..., d), the rotation that comes first.
+
+    Returns:
+        (..., d).
+    """
     return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
 
 
@@ -48,7 +56,15 @@ def conjugate(x: ArrayLike) -> NDArray[np.float64]:
 
 
 def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
-    """Return the vectors (..., 3) turned by the orientations (..., 4), (33)."""
+    """Turn vectors by orientations (33).
+
+    Args:
+        orientation: (..., 4), unit quaternions.
+        vector: (..., 3), in the axes of the body.
+
+    Returns:
+        (..., 3), in the axes that the orientations refer to.
+    """
     vector = np.asarray(vector, float)
     pure = np.concatenate([np.zeros_like(vector[..., :1]), vector], axis=-1)
     return compose(compose(orientation, pure), conjugate(orientation))[..., 1:]
@@ -61,9 +77,16 @@ def heading(orientation: ArrayLike) -> NDArray[np.float64]:
 
 
 def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """Return the angle in rad, 0 to pi/2, between the axes of a and b (..., d), (67)-(68).
+    """Compute the angle between axes (67)-(68).
 
     For quaternions it is half the angle of the rotation from one orientation to the other.
+
+    Args:
+        a: (..., d), unit vectors, d = 2 or 4.
+        b: (..., d), as those.
+
+    Returns:
+        (...), in rad, 0 to pi/2.
     """
     relative = compose(conjugate(a), b)
     return np.arctan2(np.linalg.norm(relative[..., 1:], axis=-1), np.abs(relative[..., 0]))

@@ -25,7 +25,7 @@ def wrap_angle(angle: Component) -> Component:
 def drive(
     pose: Components, velocity: Components, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """The pose after `duration_s` at a constant forward velocity (m/s) and turn rate (rad/s): an arc.
+    """Compute the pose after `duration_s` at a constant velocity (m/s) and turn rate (rad/s): an arc.
 
     >>> quarter_circle = drive((0.0, 0.0, 0.0), (np.pi / 2, np.pi / 2), 1.0)
     >>> [round(float(each), 6) for each in quarter_circle]
@@ -42,7 +42,7 @@ def drive(
 
 
 def range_bearing(pose: Components, target: Components) -> tuple[Component, Component]:
-    """Distance (m) and bearing (rad, not wrapped) from a pose to a point."""
+    """Compute distance (m) and bearing (rad, not wrapped) from a pose to a point."""
     dx = target[0] - pose[0]
     dy = target[1] - pose[1]
     return np.sqrt(dx * dx + dy * dy), np.arctan2(dy, dx) - pose[2]

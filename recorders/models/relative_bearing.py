@@ -10,7 +10,7 @@ from recorders.models.planar import Component, Components
 
 
 def relative_bearing(position: Components, first: Components, second: Components) -> Component:
-    """Bearing of `first` minus bearing of `second`, rad in (-pi, pi]; undefined on a landmark."""
+    """Compute bearing of `first` minus bearing of `second`, rad in (-pi, pi]; not on a landmark."""
     first_x, first_y = first[0] - position[0], first[1] - position[1]
     second_x, second_y = second[0] - position[0], second[1] - position[1]
     cross = second_x * first_y - second_y * first_x

@@ -99,7 +99,7 @@ def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
 
 
 def comparisons_of(stream: Stream) -> Comparisons:
-    """A score stream as matrices; raises BadInput where a pair of users is missing or there twice."""
+    """Read a score stream as matrices; raises BadInput where a pair of users lacks or is there twice."""
     matchers = matchers_of(stream.metadata)
     probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
     users = int(max(probe.max(initial=-1), gallery.max(initial=-1))) + 1

@@ -33,7 +33,7 @@ def unrest(time_ns: Integers, force: Floats, rate: Floats, window_s: float) -> t
     end = np.arange(1, len(time_ns) + 1)
 
     def mean(columns: NDArray) -> Floats:
-        """The mean over each window of columns (n, k)."""
+        """Average columns (n, k) over each window."""
         sums = np.vstack([np.zeros(columns.shape[1]), np.cumsum(columns, axis=0)])
         return (sums[end] - sums[begin]) / (end - begin)[:, None]
 

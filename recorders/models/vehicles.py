@@ -29,7 +29,7 @@ def turn(
 def noise_moments(
     acceleration_sigma_mps2: Component, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """Variance of the position, covariance with the velocity, variance of the velocity, per axis.
+    """Compute the position's variance, its covariance with the velocity, the velocity's variance.
 
     The acceleration is white and constant over the duration. (13) with T^4/4, T^3/2 and T^2, where the
     paper prints T^2/4, T^2/2 and T: the same for its T = 1.
@@ -39,7 +39,7 @@ def noise_moments(
 
 
 def into_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """A point (x, y) as a sensor with pose (x, y, heading) has it in its own frame."""
+    """Compute where a sensor with pose (x, y, heading) has a point (x, y) in its own frame."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = point[0] - pose[0], point[1] - pose[1]
     return cosine * dx + sine * dy, cosine * dy - sine * dx

@@ -35,7 +35,7 @@ class Series:
     holds: bool = False
 
     def integral(self, times_s: Floats) -> Floats:
-        """The integral of the values from the first stamp to others (...); NaN beyond the last."""
+        """Integrate the values from the first stamp to others (...); NaN beyond the last."""
         flat = self.values.reshape(len(self.values), -1)
         means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
         total = np.zeros_like(flat)
@@ -46,7 +46,7 @@ class Series:
         return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
 
     def moved(self, by_s: float, gain: float = 0.0) -> "Series":
-        """The series as it is where its stamps are not late, and its clock does not gain."""
+        """Return the series as it is where its stamps are not late, and its clock does not gain."""
         first_s = self.times_s[0]
         times_s = self.times_s - gain * (self.times_s - first_s) - by_s
         return Series(self.topic, self.field, times_s, self.values, self.holds)
@@ -95,7 +95,7 @@ class Body:
 
 
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
-    """The bodies that topics are of: one for every namespace, or one alone where no role comes twice.
+    """Return the bodies that topics are of: one per namespace, or one where no role comes twice.
 
     A namespace within another has what that has as well: a unit `/imu2/inertial` moves as `/fix` says.
     """
@@ -169,7 +169,7 @@ _TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
 
 
 def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True) -> Fixes:
-    """Places with the mean of the two variances that they state, NaN where they state none."""
+    """Return places with the mean of the two variances that they state, NaN where they state none."""
     column = stream.columns.get("covariance_m2")
     variances = np.full(len(places.times_s), np.nan)
     if column is not None and len(places.times_s) == len(rows) and column.shape[1]:
@@ -188,7 +188,7 @@ def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: 
 
 
 def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> Fixes:
-    """Places about the first one."""
+    """Return places about the first one."""
     place = stream["latitude_deg"][rows], stream["longitude_deg"][rows]
     known = np.isfinite(place[0]) & np.isfinite(place[1])
     latitude, longitude = (each[known] for each in place)

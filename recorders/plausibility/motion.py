@@ -48,13 +48,21 @@ class Slope(NamedTuple):
 
     @property
     def sign(self) -> int:
-        """1 or -1, or 0 where the two are not alike."""
+        """Return 1 or -1, or 0 where the two are not alike."""
         is_clear = self.windows >= FEWEST and abs(self.likeness) > ALIKE
         return int(np.sign(self.value)) if is_clear else 0
 
 
 def slope(x: Floats, y: Floats) -> Slope:
-    """Return the slope of y (k,) on x (k,) through zero, over windows where both are known."""
+    """Compute the slope of y on x through zero, over windows where both are known.
+
+    Args:
+        x: (k,), NaN where it is not known.
+        y: (k,), as x.
+
+    Returns:
+        The slope; its value is NaN where fewer than `FEWEST` windows are known, or x or y is zero.
+    """
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     xx, xy, yy = x @ x, x @ y, y @ y
@@ -67,7 +75,16 @@ def slope(x: Floats, y: Floats) -> Slope:
 
 
 def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """By what angle a rate says that one turns in windows."""
+    """Compute by what angle a turn rate says that one turns in windows.
+
+    Args:
+        source: the turn rate in rad/s.
+        begin_s: (k,), where the windows begin.
+        end_s: (k,), where they end.
+
+    Returns:
+        (k,), in rad; NaN beyond the rate's stamps.
+    """
     return source.integral(end_s) - source.integral(begin_s)
 
 
@@ -90,7 +107,7 @@ class Motion:
 
     @cached_property
     def speed_lags(self) -> list[Lag]:
-        """Of speeds and velocities, beside places."""
+        """Return the lags of speeds and velocities, beside places."""
         if self.places is None or (windows := distances(self.places, 1.0)) is None:
             return []
         return list(self._lags(windows, self.places.topic))
@@ -103,7 +120,7 @@ class Motion:
 
     @cached_property
     def turn_lags(self) -> list[Lag]:
-        """Of turn rates, beside courses."""
+        """Return the lags of turn rates, beside courses."""
         if self.courses is None:
             return []
         windows = turned(self.courses, 1.0)
@@ -142,7 +159,7 @@ class Motion:
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
     def _goes_where_it_points(self, lag: Lag) -> bool:
-        """Whether forces in the body's axes are those of its course: then course is heading."""
+        """Tell whether forces in the body's axes are those of its course: then course is heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
                 found = self.forces(force.moved(-lag.timing.lag_s))
@@ -171,7 +188,7 @@ class Motion:
         return source.moved(self.delays_s.get(source.topic, 0.0))
 
     def likened(self, source: Series) -> Series:
-        """A turn rate on the clock by which it is most like the course, be that a delay or not."""
+        """Return a turn rate on the clock by which it is most like the course, be it a delay or not."""
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
@@ -218,7 +235,7 @@ class Motion:
         return slope(windows.values, end - begin)
 
     def heading_offsets(self, orientation: Series) -> Floats:
-        """By how much headings exceed the course where the body moves clearly (k,), backwards too."""
+        """Return by how much headings (k,) exceed the course where the body moves clearly, also back."""
         if self.courses is None:
             return np.empty(0)
         course = self.timed(self.courses)
@@ -230,7 +247,7 @@ class Motion:
         return wrapped(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
-        """How horizontal forces fit the changes of the velocity; None where these tell nothing."""
+        """Compute how horizontal forces fit changes of the velocity; None where these tell nothing."""
         if not self.body.velocities or self.courses is None:
             return None
         velocity = self.body.velocities[0]
@@ -259,7 +276,15 @@ class Motion:
 
 
 def heading_at(orientation: Series, times_s: Floats) -> Floats:
-    """Headings (k,) in rad at other times, not wrapped; NaN beyond the first and the last."""
+    """Interpolate headings at other times.
+
+    Args:
+        orientation: quaternions (n, 4).
+        times_s: (k,), the other times.
+
+    Returns:
+        (k,), in rad, not wrapped; NaN beyond the first and the last.
+    """
     angle = np.unwrap(heading(orientation.values))
     return np.interp(times_s, orientation.times_s, angle, left=np.nan, right=np.nan)
 
@@ -276,13 +301,13 @@ class Forces(NamedTuple):
 
 
 def _hold_s(source: Series) -> float:
-    """What may be how a topic is meant: half a step held, or the mean of the step before."""
+    """Return what may be how a topic is meant: half a step held, or the mean of the step before."""
     step_s = float(np.median(np.diff(source.times_s)))
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 
 
 def _sure_lag_s(lag: Timing) -> float:
-    """The lag where it is one; a clock that gains has none."""
+    """Return the lag where it is one; a clock that gains has none."""
     is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
     is_sure = lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
     return lag.lag_s if is_lag and is_sure else 0.0

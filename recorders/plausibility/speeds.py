@@ -23,7 +23,7 @@ LEAST_RATIO = 1.5  # of variances, a difference that matters
 
 
 def delays(motion: Motion) -> Iterator[Finding]:
-    """Topics that are later than others of the same body, by how speeds and turns lag."""
+    """Find topics that are later than others of the same body, by how speeds and turns lag."""
     for topic, late_s in motion.delays_s.items():
         if not late_s:
             continue
@@ -49,7 +49,7 @@ def delays(motion: Motion) -> Iterator[Finding]:
 
 
 def clocks(motion: Motion) -> Iterator[Finding]:
-    """Clocks that gain on others, by how speeds drift apart."""
+    """Find clocks that gain on others, by how speeds drift apart."""
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
         yield Finding(
@@ -65,7 +65,7 @@ def clocks(motion: Motion) -> Iterator[Finding]:
 
 
 def factors(motion: Motion) -> Iterator[Finding]:
-    """Speeds in other units, by how far places move."""
+    """Find speeds in other units, by how far places move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
         ratio = motion.speed(source)
         if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:
@@ -101,7 +101,7 @@ def factors(motion: Motion) -> Iterator[Finding]:
 
 
 def rest(motion: Motion) -> Iterator[Finding]:
-    """Variances of fixes that their scatter at rest belies, where their errors are white."""
+    """Find variances of fixes that their scatter at rest belies, where their errors are white."""
     moving = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         source = next((each for each in moving if each.topic != fixes.topic), None)
@@ -156,7 +156,7 @@ def scatter(fixes: Fixes, source: Series) -> tuple[float, int, float] | None:
 
 
 def _filled(values: Floats) -> Floats:
-    """Values (n,), where they are not known at the ends those next to them."""
+    """Fill values (n,) that are not known at the ends with those next to them."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return values

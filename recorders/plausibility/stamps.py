@@ -32,7 +32,7 @@ REGULARS = {
 
 
 def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Messages that lack in a regular row of stamps, but for outages that the log states."""
+    """Find messages that lack in a regular row of stamps, but for outages that the log states."""
     if stream.schema.full_name not in REGULARS:
         return
     stamps_ns = np.unique(stream.publish_time_ns)
@@ -71,7 +71,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Measurements that are there twice; events may be alike, and what one scan detects."""
+    """Find measurements that are there twice; events may be alike, and what one scan detects."""
     names = {each.name for each in stream.schema}
     is_measured = "scan_id" not in names and any(
         each.kind in ("real", "vector") for each in stream.schema
@@ -97,7 +97,7 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Clocks of topics that run otherwise than the recorder's: all alike, as simulated time, or one."""
+    """Find topics' clocks that run otherwise than the recorder's: all alike, as simulated, or one."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }

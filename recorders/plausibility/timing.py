@@ -63,7 +63,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
 
 
 def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
-    """The gain of the source's clock, the lag then and their likeness."""
+    """Find the gain of the source's clock, the lag then and their likeness."""
     lags_s = np.arange(-10.0, 10.0, 0.2)
     best = (0.0, 0.0, 0.0)
     for gain in GAINS:
@@ -76,7 +76,7 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
 
 
 def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
-    """The correlation for each lag; NaN where less than half of the windows are in the source's span."""
+    """Correlate at each lag; NaN where less than half of the windows are in the source's span."""
     begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
     moves = account(source, begin_s, end_s)
     is_in = np.isfinite(moves)
@@ -90,7 +90,7 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
 
 
 def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
-    """The share of the windows that are in the source's span when they are earlier by the lag."""
+    """Compute the share of windows in the source's span when they are earlier by the lag."""
     is_within = (windows.begin_s - lag_s >= source.times_s[0]) & (
         windows.end_s - lag_s <= source.times_s[-1]
     )
@@ -98,12 +98,12 @@ def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
 
 
 def _independent(windows: Windows) -> int:
-    """How many windows do not overlap."""
+    """Count the windows that do not overlap."""
     span_s = float(np.median(windows.end_s - windows.begin_s))
     return len(np.unique(np.floor(windows.begin_s / span_s)))
 
 
 def _evidence(count: float, likeness: float, usual: float) -> float:
-    """What one correlation is more likely than another, of so many Gaussian pairs."""
+    """Compute how much likelier one correlation is than another, of so many Gaussian pairs."""
     rest, before = (max(1.0 - each * each, 1e-9) for each in (likeness, usual))
     return 0.5 * count * float(np.log(before / rest))

@@ -48,7 +48,7 @@ def signs(motion: Motion) -> Iterator[Finding]:
 
 
 def _by_forces(motion: Motion, source: Series) -> int:
-    """What horizontal forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
+    """Say what forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
     for force in motion.body.forces:
         if force.topic == source.topic:
             found = motion.forces(motion.aligned(force))
@@ -58,7 +58,7 @@ def _by_forces(motion: Motion, source: Series) -> int:
 
 
 def _mirrored(motion: Motion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """One of a rate and a frame is mirrored; a witness that goes with the rate says that it is right."""
+    """Find which of a rate and a frame is mirrored; a witness that goes with the rate clears it."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
@@ -143,7 +143,7 @@ def _is_degrees(ratio: Slope) -> bool:
 
 
 def headings(motion: Motion) -> Iterator[Finding]:
-    """Headings that are off the course by one angle, of bodies that go where they head."""
+    """Find headings that are off the course by one angle, of bodies that go where they head."""
     for orientation in motion.body.orientations:
         ratio = motion.heading_course(orientation)
         offsets = motion.heading_offsets(orientation)
@@ -167,7 +167,7 @@ def headings(motion: Motion) -> Iterator[Finding]:
 
 
 def mounting(motion: Motion) -> Iterator[Finding]:
-    """Units whose forward is not the body's, by the forces in curves and at changes of speed."""
+    """Find units whose forward is not the body's, by the forces in curves and at changes of speed."""
     for force in motion.body.forces:
         found = motion.forces(motion.aligned(force))
         if (
@@ -188,7 +188,7 @@ def mounting(motion: Motion) -> Iterator[Finding]:
 
 
 def gravity(motion: Motion) -> Iterator[Finding]:
-    """Forces in g, or with z down, by the quietest second."""
+    """Find forces in g, or with z down, by the quietest second."""
     for force in motion.body.forces:
         mean = quietest(force)
         if mean is None:
@@ -230,7 +230,7 @@ def gravity(motion: Motion) -> Iterator[Finding]:
 
 
 def quietest(force: Series) -> Floats | None:
-    """The mean force (3,) in the second in which forces vary least; None where no second is whole."""
+    """Average forces (3,) in the second in which they vary least; None where no second is whole."""
     second = np.floor(force.times_s - force.times_s[0]).astype(int)
     edges = np.flatnonzero(np.diff(second, prepend=-1, append=second[-1] + 1))
     parts = [force.values[begin:end] for begin, end in pairwise(edges) if end - begin >= 10]
@@ -248,7 +248,7 @@ ORDERS = {
 
 
 def quaternions(motion: Motion) -> Iterator[Finding]:
-    """Quaternions that are not unit, or in another order, by turn rates."""
+    """Find quaternions that are not unit, or in another order, by turn rates."""
     for orientation in (*motion.body.orientations, *motion.body.references):
         norm = np.linalg.norm(orientation.values, axis=1)
         off = float(np.median(np.abs(norm - 1.0)))
@@ -284,7 +284,7 @@ def quaternions(motion: Motion) -> Iterator[Finding]:
 
 
 def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
-    """By what (rad/s, rms) quaternions in each order turn otherwise than rates say; none at rest."""
+    """Compute how far (rad/s, rms) quaternions turn otherwise than rates, by order; none at rest."""
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]

@@ -36,7 +36,7 @@ def thinned(count: int, most: int) -> slice:
 
 
 def noise_of(places: Floats) -> float:
-    """The standard deviation of white noise of samples (n, 2), by how they differ from their neighbours.
+    """Estimate the sigma of white noise of samples (n, 2), by how they differ from their neighbours.
 
     What accelerates differs as well: it is too large rather than too small.
     """
@@ -45,7 +45,15 @@ def noise_of(places: Floats) -> float:
 
 
 def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of stamps that are a span apart, or a step where the steps are longer."""
+    """Find the pairs of stamps that are a span apart, or a step where the steps are longer.
+
+    Args:
+        times_s: (n,), ascending.
+        span_s: the span.
+
+    Returns:
+        The rows of the first and of the second stamps, (k,) each with k at most `MOST`.
+    """
     step_s = float(np.median(np.diff(times_s)))
     later = np.searchsorted(times_s, times_s + max(span_s, step_s) - 1e-6)
     first = np.flatnonzero(later < len(times_s))
@@ -64,13 +72,22 @@ def chords(fixes: Series, span_s: float) -> Windows:
 
 
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Return how far a speed or velocity says that one comes in windows, forward or not."""
+    """Compute how far a speed or velocity says that one comes in windows, forward or not.
+
+    Args:
+        source: the speed or velocity in m/s.
+        begin_s: (k,), where the windows begin.
+        end_s: (k,), where they end.
+
+    Returns:
+        (k,), in m, none negative; NaN beyond the source's stamps.
+    """
     moved = source.integral(end_s) - source.integral(begin_s)
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 
 
 def _moves(fixes: Fixes) -> bool:
-    """Whether places leave what they state as their error, by which a receiver at rest wanders too."""
+    """Tell whether places leave their stated error, in which a receiver at rest wanders too."""
     stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
     sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0
     away_m = np.linalg.norm(fixes.values - np.median(fixes.values, axis=0), axis=1)
@@ -78,7 +95,7 @@ def _moves(fixes: Fixes) -> bool:
 
 
 def places_of(body: Body) -> Series | None:
-    """Where the body is: its fixes, else what its velocities add up to; None where it is at rest."""
+    """Return where the body is: its fixes, else its velocities' sum; None where it is at rest."""
     if body.fixes:
         return body.fixes[0] if _moves(body.fixes[0]) else None
     if body.velocities and body.speeds:
@@ -98,7 +115,7 @@ def distances(places: Series, span_s: float) -> Windows | None:
 
 
 def clear_moves(places: Series) -> Windows | None:
-    """Moves (k, 2) that are well above the noise of places, in the shortest windows that have some."""
+    """Find moves (k, 2) well above the noise of places, in the shortest windows that have some."""
     noise = noise_of(places.values)
     for span_s in SPANS_S:
         moved = chords(places, span_s)
@@ -125,12 +142,12 @@ def courses(body: Body) -> Series | None:
 
 
 def turned(angles: Series, span_s: float) -> Windows:
-    """By how much angles change (k,) in windows of a span, wrapped to half a turn."""
+    """Compute by how much angles change (k,) in windows of a span, wrapped to half a turn."""
     first, second = pairs(angles.times_s, span_s)
     change = angles.values[second] - angles.values[first]
     return Windows(angles.times_s[first], angles.times_s[second], wrapped(change))
 
 
 def wrapped(angle_rad: Floats) -> Floats:
-    """Angles from -pi to pi."""
+    """Wrap angles to -pi to pi."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi

@@ -108,7 +108,7 @@ def require_time_to_hear(interval_s: float, longest_s: float) -> None:
 
 
 def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> Stream:
-    """The shot and the sensors' places, when it is fired and whenever it is heard."""
+    """State where the shot and the sensors are, when it is fired and whenever it is heard."""
     places = np.ravel(parameters.sensor_position_m)
     numbers = range(1, len(travel_s) + 1)
     components = [*SHOT_COMPONENTS, *(name for s in numbers for name in sensor_components(s))]
@@ -130,7 +130,7 @@ def _fixes(
     shots_s: Array,
     rng: np.random.Generator,
 ) -> Stream:
-    """Where a sensor believes to be, a message for each shot."""
+    """State where a sensor believes itself to be, a message for each shot."""
     sigma = parameters.sigma_position_m
     return make_stream(
         f"/sensor{number}/position",
@@ -148,7 +148,7 @@ def _detections(
     heard_s: Array,
     rng: np.random.Generator,
 ) -> Stream:
-    """What a sensor hears, a message for each shot that it does not miss."""
+    """Simulate what a sensor hears, a message for each shot that it does not miss."""
     shots = len(heard_s)
     trajectory = np.radians(parameters.trajectory_deg)
     noise, medium = parameters.noise, parameters.medium

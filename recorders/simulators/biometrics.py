@@ -124,7 +124,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Effects of the users; a few have poor fingers, the others so much better that marginals hold."""
+    """Draw effects of users; a few have poor fingers, others better ones, so that marginals hold."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
@@ -142,7 +142,7 @@ def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> U
 
 
 def _impostors(users: Users, rng: np.random.Generator) -> Floats:
-    """Standard normals (users, users, matchers) of all comparisons, by rank exactly normal."""
+    """Draw standard normals (users, users, matchers) of all comparisons, by rank exactly normal."""
     from scipy.stats import norm, rankdata  # which take long to import
 
     count = len(users.probe)
@@ -167,7 +167,7 @@ def _impostors(users: Users, rng: np.random.Generator) -> Floats:
 
 
 def _user_correlation() -> Floats:
-    """The correlation (12, 12) of g, a and b, made positive semidefinite."""
+    """Return the correlation (12, 12) of g, a and b, made positive semidefinite."""
     names = [effect + matcher for effect in "gab" for matcher in "CGLR"]
     correlation = np.eye(len(names))
     for pair, value in USER_CORRELATION.items():
@@ -180,7 +180,7 @@ def _user_correlation() -> Floats:
 
 
 def _rest_correlation() -> Floats:
-    """The correlation (4, 4) that both parts of the rest have, so that their sum has the stated one."""
+    """Find the correlation (4, 4) of both parts of the rest, so that their sum has the stated one."""
     correlation = np.full((4, 4), OTHER_REST_CORRELATION)
     for pair, value in REST_CORRELATION.items():
         row, column = ("CGLR".index(name) for name in pair)

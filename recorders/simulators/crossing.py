@@ -70,7 +70,7 @@ def simulate(parameters: CrossingParameters, rng: np.random.Generator) -> Record
 
 
 def _states(parameters: CrossingParameters, times_s: Floats, turned_rad: float) -> Floats:
-    """The true states (targets, n, 4), x, vx, y, vy."""
+    """Compute the true states (targets, n, 4), x, vx, y, vy."""
     half_s, speed, half_rad = 0.5 * times_s[-1], parameters.speed_mps, 0.5 * parameters.crossing_rad
     north, south = 0.25 * parameters.side_m, -0.25 * parameters.side_m
     side_by_side = [south - 0.5 * parameters.gap_m, south + 0.5 * parameters.gap_m]
@@ -93,7 +93,7 @@ def _states(parameters: CrossingParameters, times_s: Floats, turned_rad: float) 
 
 
 def _weaving(parameters: CrossingParameters, times_s: Floats, begin: tuple[float, float]) -> Floats:
-    """Poses (3, n) of the target that goes straight on, and turns left and right in turn."""
+    """Compute poses (3, n) of the target that goes straight on, and turns left and right in turn."""
     poses, pose, begin_s = np.empty((3, len(times_s))), (*begin, 0.0), 0.0
     way = -1.0
     while begin_s <= times_s[-1]:
@@ -115,7 +115,7 @@ def _radar(
     places: Floats,
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """The scans and their detections, in random order; `places` are (targets, n, 2)."""
+    """Simulate the scans and their detections, in random order; `places` are (targets, n, 2)."""
     half_m, scans = 0.5 * parameters.side_m, []
     for scan in range(len(stamps_ns)):
         is_seen = rng.uniform(size=len(places)) < parameters.detection_probability

@@ -145,7 +145,7 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
 def _network(
     parameters: IspaceParameters, rng: np.random.Generator
 ) -> tuple[list[Node], NDArray[np.int64]]:
-    """The nodes, and the directed links (m, 2) by number."""
+    """Draw the nodes, and the directed links (m, 2) by number."""
     count = parameters.random_nodes
     if count == 0:
         nodes = list(parameters.nodes)
@@ -176,7 +176,7 @@ def _check(parameters: IspaceParameters, count: int, links: NDArray[np.int64]) -
 
 
 def _truth(parameters: IspaceParameters, rng: np.random.Generator) -> NDArray[np.float64]:
-    """States (steps + 1, 4), the first drawn from the prior."""
+    """Draw states (steps + 1, 4), the first from the prior."""
     position, both, velocity = noise_moments(parameters.acceleration_density, parameters.step_s)
     factor = np.linalg.cholesky(np.array([[position, both], [both, velocity]]))
     kicks = rng.normal(size=(parameters.steps, 2, 2)) @ factor.T  # step, axis, (position, velocity)
@@ -193,7 +193,7 @@ def _link_events(
     times_s: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Stream:
-    """Every node sends on every link at every step; lost messages have the time of their loss."""
+    """Simulate the messages of every link at every step; lost ones have the time of their loss."""
     sender, receiver = np.tile(links, (len(times_s), 1)).T
     sent_s = np.repeat(times_s, len(links))
     delay_s = parameters.delay_s + parameters.delay_jitter_s * rng.exponential(size=len(sent_s))

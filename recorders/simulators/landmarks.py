@@ -51,7 +51,7 @@ class Drive(NamedTuple):
     odometry: NDArray[np.float64]
 
     def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Exact poses (n, 3) at any times within the drive."""
+        """Compute exact poses (n, 3) at any times within the drive."""
         steps = np.searchsorted(self.times_s, times_s, side="right") - 1
         steps = np.clip(steps, 0, len(self.true_velocity) - 1)
         return np.stack(
@@ -184,7 +184,7 @@ def _robot_streams(
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:
-    """Positions in the plane or on earth with their covariance, and when there were none."""
+    """Simulate positions in the plane or on earth with their covariance, and when there were none."""
     if receiver.rate_hz == 0:
         return []
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
@@ -220,7 +220,7 @@ def _targets(
     drives: list[Drive],
     landmarks: NDArray[np.float64],
 ) -> Mapping[int, Drive | NDArray[np.float64]]:
-    """What robot `number` may see, by target number: points, and robots that move."""
+    """Return what robot `number` may see, by target number: points, and robots that move."""
     seen: dict[int, Drive | NDArray[np.float64]] = {}
     if parameters.robots_see_each_other:
         seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
@@ -233,7 +233,7 @@ def _look(
     targets: Mapping[int, Drive | NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> Sightings:
-    """Everything in range and view at the sensor's rate, less dropouts and outages."""
+    """Look at everything in range and view at the sensor's rate, less dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
     outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
     pose = robot.pose_at(times_s)
@@ -263,7 +263,7 @@ def _dead(
     duration_s: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """A sensor's outages (k, 2), from and to, and whether it is in one of them at some times (n,)."""
+    """Draw a sensor's outages (k, 2), from and to, and tell at which times (n,) it is in one."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
     starts_s = np.sort(rng.uniform(0, duration_s, count))
     outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
@@ -272,7 +272,7 @@ def _dead(
 
 
 def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A measured range: bias, noise, and outliers anywhere in the sensor's range."""
+    """Measure a range: bias, noise, and outliers anywhere in the sensor's range."""
     measured = true_m + sensor.bias_range_m + rng.normal(size=len(true_m)) * sensor.sigma_range_m
     wild = rng.uniform(0, sensor.maximum_range_m, len(true_m))
     is_outlier = rng.uniform(size=len(true_m)) < sensor.outlier_probability
@@ -280,7 +280,7 @@ def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray
 
 
 def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A measured bearing: bias, noise, and outliers in any direction."""
+    """Measure a bearing: bias, noise, and outliers in any direction."""
     noise = rng.normal(size=len(true_rad)) * sensor.sigma_bearing_rad
     wild = rng.uniform(-np.pi, np.pi, len(true_rad))
     is_outlier = rng.uniform(size=len(true_rad)) < sensor.outlier_probability
@@ -290,7 +290,7 @@ def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDA
 def _clocks(
     sensor: Sensor, times_s: NDArray[np.float64], look: NDArray[np.int64], rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
-    """The three clocks of every message; messages of one look share them."""
+    """Return the three clocks of every message; messages of one look share them."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
     return {
         "publish_time_ns": simulation_stamps_ns(times_s + sensor.stamp_offset_s)[look],
@@ -302,7 +302,7 @@ def _clocks(
 def _measure(
     schema: Schema, sensor: Sensor, seen: Sightings, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """The look that every message belongs to, and the messages' columns."""
+    """Return the look that every message belongs to, and the messages' columns."""
     names = [entry.name for entry in schema]
     columns: dict[str, NDArray] = {"target_id": seen.target}
     if "range_m" in names:
@@ -322,7 +322,7 @@ def _measure(
 
 
 def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The rows of all pairs of targets that share a look."""
+    """Return the rows of all pairs of targets that share a look."""
     first, second = np.triu_indices(int(np.bincount(seen.look).max(initial=0)), k=1)
     count = np.bincount(seen.look, minlength=len(seen.times_s))
     start = np.cumsum(count) - count

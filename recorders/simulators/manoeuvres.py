@@ -102,12 +102,12 @@ def simulate(parameters: ManoeuvresParameters, rng: np.random.Generator) -> Reco
 
 
 def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Generator) -> Floats:
-    """The true states (n, 4), x, vx, y, vy, at times within the drive."""
+    """Compute the true states (n, 4), x, vx, y, vy, at times within the drive."""
     states, begin_s = np.empty((len(times_s), 4)), 0.0
     pose, speed = (0.0, 0.0, rng.uniform(-np.pi, np.pi)), parameters.speed_mps
 
     def after(part: Part, span_s: Floats) -> tuple[Floats, ...]:
-        """Poses and speeds so long after a part's beginning."""
+        """Compute poses and speeds so long after a part's beginning."""
         mean_mps = speed + 0.5 * part.acceleration_mps2 * span_s
         moved = drive(pose, (mean_mps, part.turn_radps), span_s)
         return *moved, speed + part.acceleration_mps2 * span_s
@@ -125,7 +125,7 @@ def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Ge
 
 
 def _parts(parameters: ManoeuvresParameters, rng: np.random.Generator) -> list[Part]:
-    """A straight and what follows it: a turn, or a stop and a start."""
+    """Draw a straight and what follows it: a turn, or a stop and a start."""
     straight = Part(rng.exponential(parameters.straight_s), 0.0, 0.0)
     if rng.uniform() < 0.5:
         way, angle = rng.choice([-1.0, 1.0]), rng.uniform(np.pi / 3, 5 * np.pi / 6)

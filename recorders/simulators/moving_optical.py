@@ -127,7 +127,7 @@ def _course(
     bias_rad: Floats,
     rng: np.random.Generator,
 ) -> Course:
-    """Targets under white accelerations and biases that walk at random, from the start on."""
+    """Draw targets under white accelerations and biases that walk at random, from the start on."""
     steps_s = np.diff(times_s)
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, steps_s)
     roots = np.zeros((len(steps_s), 2, 2))  # of a place and its velocity: root root' is their covariance
@@ -163,7 +163,7 @@ def _target_names() -> list[str]:
 
 
 def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
-    """Targets, biases and clocks."""
+    """Make the stream of targets, biases and clocks."""
     rows, sensors = course.rows(times_s), len(clocks_s)
     names = [
         *_target_names(),
@@ -183,7 +183,7 @@ def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
 
 
 def _fixes(course: Course, times_s: Floats, sigma_m: float | None, rng: np.random.Generator) -> Stream:
-    """Where the first target says that it is: a topic without messages where it does not."""
+    """Simulate where the first target says that it is: a topic without messages where it does not."""
     rows, known_m = (course.rows(times_s), sigma_m) if sigma_m else (np.empty(0, np.int64), 1.0)
     return make_stream(
         "/target1/fix",
@@ -202,7 +202,7 @@ def _sightings(
     course: Course,
     rng: np.random.Generator,
 ) -> Stream:
-    """One sensor's lines of sight with its poses, stamped by its own clock."""
+    """Simulate one sensor's lines of sight with its poses, stamped by its own clock."""
     places, to_world = _poses(parameters, number, times_s)
     rows, seen = course.rows(times_s), np.arange(len(times_s)) % TARGETS
     offset = course.targets[rows, seen, :3] - places
@@ -225,7 +225,7 @@ def _sightings(
 
 
 def _poses(parameters: MovingOpticalParameters, number: int, times_s: Floats) -> tuple[Floats, Rotation]:
-    """Places (n, 3) of a sensor, and how it is turned: ahead along its course."""
+    """Compute places (n, 3) of a sensor, and how it is turned: ahead along its course."""
     velocity, turn_radps = np.array(parameters.velocity_mps), 2.0 * np.pi / parameters.weave_period_s
     aside = np.cross([0.0, 1.0, 0.0], velocity / np.linalg.norm(velocity))
     phase = turn_radps * times_s[:, None]

@@ -83,7 +83,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
 
 
 def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
-    """The spline through the way-points, at rest first, and the attitude that goes with it."""
+    """Compute the spline through the way-points, at rest first, and the attitude that goes with it."""
     points = np.array(parameters.way_points_m, float).reshape(-1, 3)
     if not len(points):
         points = _random_points(parameters, rng)
@@ -141,7 +141,7 @@ def _lean(
 
 
 def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -> Floats:
-    """Way-points a leg apart: of a vehicle or person that goes on, of a quadrotor in a box."""
+    """Draw way-points a leg apart: of a vehicle or person that goes on, of a quadrotor in a box."""
     legs = max(3, round((parameters.duration_s - parameters.rest_s) / parameters.leg_s))
     length_m = parameters.speed_mps * parameters.leg_s
     if parameters.carrier == "quadrotor":
@@ -155,7 +155,7 @@ def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -
 def _inertial(
     parameters: NavigationParameters, path: Path, times_s: Floats, rng: np.random.Generator
 ) -> tuple[Stream, Floats, Floats]:
-    """What the unit says (n samples), and its biases of gyro and accelerometer (n, 3)."""
+    """Simulate what the unit says (n samples), and its biases of gyro and accelerometer (n, 3)."""
     unit = parameters.unit
     turned = path.orientation(times_s).inv()
     earth = np.array(earth_rate(parameters.origin_latitude_deg))
@@ -190,7 +190,7 @@ def _sensed(
     bias_sigma: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """What three axes measure of a true quantity (n, 3), and their biases (n, 3)."""
+    """Measure a true quantity (n, 3) along three axes; return also their biases (n, 3)."""
     step_s = 1.0 / unit.rate_hz
     walk = rng.normal(size=true.shape) * bias_density * np.sqrt(step_s)
     walk[0] = bias_sigma * rng.normal(size=3)
@@ -202,12 +202,12 @@ def _sensed(
 
 
 def _rounded(values: Floats, quantum: float) -> Floats:
-    """Values to whole numbers of a quantum."""
+    """Round values to whole numbers of a quantum."""
     return np.round(values / quantum) * quantum if quantum else values
 
 
 def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """The fixes and velocities of the receiver's antenna, and the outages."""
+    """Simulate the fixes and velocities of the receiver's antenna, and the outages."""
     gnss, origin = parameters.gnss, _origin(parameters)
     lever = np.array(gnss.lever_m)
 
@@ -259,7 +259,7 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
 
 
 def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """What wheels, compass and barometer say, of those that are on board."""
+    """Simulate what wheels, compass and barometer say, of those that are on board."""
     carried, streams = parameters.carried, []
 
     def times(rate_hz: float) -> Floats:
@@ -313,7 +313,7 @@ def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Genera
 
 
 def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
-    """Which times lie in one of the spans."""
+    """Tell which times lie in one of the spans."""
     spans = np.array(spans_s, float).reshape(-1, 2)
     inside = (times_s[:, None] >= spans[:, 0]) & (times_s[:, None] < spans[:, 1])
     return np.any(inside, axis=1, keepdims=True)[:, 0]
@@ -322,7 +322,7 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 def _prior(
     parameters: NavigationParameters, truth: Floats, metadata: dict[str, str], rng: np.random.Generator
 ) -> Stream:
-    """The first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
+    """Draw the first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
 
     The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
     """
@@ -362,7 +362,7 @@ def _prior(
 
 
 def _origin(parameters: NavigationParameters) -> dict[str, str]:
-    """Where on earth the plane lies, as channels state it."""
+    """Return where on earth the plane lies, as channels state it."""
     names = ("origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
     return {name: repr(getattr(parameters, name)) for name in names}
 

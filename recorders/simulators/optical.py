@@ -87,14 +87,14 @@ def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recordi
 
 
 def _look_times(parameters: OpticalParameters, targets: int) -> NDArray[np.int64]:
-    """When each target is looked at in each pass, (passes, targets)."""
+    """Choose when each target is looked at in each pass, (passes, targets)."""
     per_pass = 1 if parameters.all_at_once else targets
     look = np.arange(parameters.passes)[:, None] * per_pass + np.arange(targets) % per_pass
     return simulation_stamps_ns(look * parameters.interval_s)
 
 
 def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
-    """Where all targets are and the biases, at every look."""
+    """State where all targets are, and the biases, at every look."""
     components = [
         *(name for number in range(1, len(targets) + 1) for name in target_components(number)),
         *(name for number in range(1, len(bias) + 1) for name in bias_components(number)),
@@ -111,7 +111,7 @@ def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
 
 
 def _mounting(number: int, place: Array, attitude: Array) -> list[Stream]:
-    """Where a sensor stands, known exactly, and how it was meant to be turned."""
+    """State where a sensor stands, known exactly, and how it was meant to be turned."""
     to_sensor = Rotation.from_euler("ZYX", attitude)
     start_ns = [SIMULATION_EPOCH_NS]
     return [
@@ -140,7 +140,7 @@ def _sightings(
     looks_ns: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Stream:
-    """The lines of sight of one sensor, a message per target seen."""
+    """Simulate the lines of sight of one sensor, a message per target seen."""
     true = np.stack(line_of_sight(targets.T, place[:, None], attitude), axis=-1)
     noise = parameters.sigma_rad * rng.normal(size=(*looks_ns.shape, 2))
     seen = _in_view(parameters, place, targets) & (
@@ -163,7 +163,7 @@ def _sightings(
 
 
 def _in_view(parameters: OpticalParameters, place: Array, targets: Array) -> NDArray[np.bool_]:
-    """Which targets (n,) a sensor can see; never one that it stands on."""
+    """Tell which targets (n,) a sensor can see; never one that it stands on."""
     offset = targets - place
     distance = np.linalg.norm(offset, axis=1)
     away = distance > 0.0

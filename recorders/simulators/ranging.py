@@ -170,7 +170,7 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
 
 
 def _path(parameters: RangingParameters, steps: int, start: Floats, rng: np.random.Generator) -> Floats:
-    """The states (steps, 6) under white accelerations, exactly at every step."""
+    """Draw the states (steps, 6) under white accelerations, exactly at every step."""
     step_s = 1.0 / parameters.rate_hz
     place, mixed, speed = noise_moments(1.0, step_s)
     root = np.linalg.cholesky([[place, mixed], [mixed, speed]])
@@ -188,7 +188,7 @@ def _path(parameters: RangingParameters, steps: int, start: Floats, rng: np.rand
 def _lasting(
     parameters: RangingParameters, steps: int, anchors: int, rng: np.random.Generator
 ) -> Floats:
-    """The errors of every anchor (steps, anchors): first-order Gauss-Markov processes."""
+    """Draw the errors of every anchor (steps, anchors): first-order Gauss-Markov processes."""
     kept = np.exp(-1.0 / (parameters.rate_hz * parameters.error_time_s))
     error = parameters.error_sigma_m * rng.normal(size=(steps, anchors))
     for step in range(1, steps):
@@ -197,7 +197,7 @@ def _lasting(
 
 
 def _excess(blocked: Blocked, times_s: Floats, anchors: int, rng: np.random.Generator) -> Floats:
-    """By how much blocked ranges are too long (times, anchors)."""
+    """Draw by how much blocked ranges are too long (times, anchors)."""
     excess = np.zeros((len(times_s), anchors))
     for anchor in range(anchors):
         count = rng.poisson(blocked.times_per_minute * times_s[-1] / 60.0)

@@ -111,7 +111,7 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
 
 
 def _arena(parameters: RelativeBearingsParameters) -> tuple[float, float, float, float]:
-    """The rectangle's low x, low y, high x, high y."""
+    """Return the rectangle's low x, low y, high x, high y."""
     half = 0.5 * parameters.arena_m
     return (-half, -half, half, half)
 

@@ -88,7 +88,7 @@ def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Re
     path, aims = _path(parameters, len(path_s), path_rng), _aims(parameters, path_rng)
 
     def state_at(times_s: Floats) -> Floats:
-        """The states (n, 5); the aim is that of the last shot."""
+        """Compute the states (n, 5); the aim is that of the last shot."""
         shot = np.searchsorted(shots_s, times_s, side="right") - 1
         x, y, vx, vy = (np.interp(times_s, path_s, column) for column in path.T)
         return np.stack([x, y, wrap_angle(aims[shot]), vx, vy], axis=1)
@@ -118,7 +118,7 @@ def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Re
 
 
 def _path(parameters: ShotSequenceParameters, steps: int, rng: np.random.Generator) -> Floats:
-    """Places and velocities (steps, 4) every `PATH_S`."""
+    """Draw places and velocities (steps, 4) every `PATH_S`."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, PATH_S)
     noise = rng.multivariate_normal(
         np.zeros(2), [[place, mixed], [mixed, speed]], size=(steps, 2), method="eigh"
@@ -133,7 +133,7 @@ def _path(parameters: ShotSequenceParameters, steps: int, rng: np.random.Generat
 
 
 def _aims(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Floats:
-    """The bullet's direction (shots,), not wrapped."""
+    """Draw the bullet's direction (shots,), not wrapped."""
     sigma = np.full(parameters.shots, parameters.trajectory_density * np.sqrt(parameters.interval_s))
     sigma[0] = np.radians(parameters.start_sigma_deg)
     changes = sigma * rng.normal(size=parameters.shots)
@@ -147,7 +147,7 @@ def _heard(
     noise_rng: np.random.Generator,
     fault_rng: np.random.Generator,
 ) -> Heard:
-    """What sensors measure of shots that are fired in these states (shots, 5)."""
+    """Simulate what sensors measure of shots that are fired in these states (shots, 5)."""
     sensors = np.array(parameters.sensor_position_m).T[:, None]
     x, y, trajectory = fired.T[:3, :, None]
     noise, medium = parameters.noise, parameters.medium
@@ -174,7 +174,7 @@ def _heard(
 
 
 def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
-    """What all sensors tell, in the order of arrival."""
+    """Compute what all sensors tell, in the order of arrival."""
     noise, medium = parameters.noise, parameters.medium
     shot, sensor = np.nonzero(heard.is_heard)
     order = np.argsort(heard.arrival_s[shot, sensor], kind="stable")
@@ -199,7 +199,7 @@ def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
 
 
 def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -> Stream:
-    """What one sensor hears, a message for each shot that it does not miss."""
+    """Return what one sensor hears, a message for each shot that it does not miss."""
     shots = np.flatnonzero(heard.is_heard[:, number - 1])
     of_sensor = shots, number - 1
     return make_stream(
@@ -215,7 +215,7 @@ def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -
 
 
 def _fix(parameters: ShotSequenceParameters, number: int, place: Floats) -> Stream:
-    """Where a sensor was surveyed to be."""
+    """State where a sensor was surveyed to be."""
     return make_stream(
         f"/sensor{number}/position",
         schemas.POSITION_FIX,

@@ -87,7 +87,7 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
 def _recordings(
     parameters: SoundSourceParameters, places: Floats, source: Floats, rng: np.random.Generator
 ) -> Floats:
-    """What microphones at places (n, 3) record (n, samples), of the same time."""
+    """Simulate what microphones at places (n, 3) record (n, samples), of the same time."""
     rate_hz, distance_m = parameters.rate_hz, np.linalg.norm(places - source, axis=1)
     arrival_s = distance_m / parameters.speed_of_sound_mps
     sounding = round(parameters.sound_s * rate_hz)

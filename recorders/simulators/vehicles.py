@@ -208,7 +208,7 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
 
 
 def _times(parameters: VehiclesParameters, rate_hz: float) -> Floats:
-    """A sensor's times: none where it never reports."""
+    """Return a sensor's times: none where it never reports."""
     return np.arange(1, int(parameters.duration_s * rate_hz + 1e-9) + 1) / (rate_hz or 1.0)
 
 
@@ -233,7 +233,7 @@ def _drive(parameters: VehiclesParameters, rng: np.random.Generator) -> Drive:
 
 
 def _start(parameters: VehiclesParameters, rng: np.random.Generator) -> Floats:
-    """The nominal starts (vehicles, 4)."""
+    """Return the nominal starts (vehicles, 4)."""
     if not parameters.vehicles:
         return np.array(parameters.start)
     west, east, south, north = parameters.field_m
@@ -250,7 +250,7 @@ def _scan(
     offered: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> Detections:
-    """Unordered scans of places (scans, vehicles, 2): less what is missed, and with false detections."""
+    """Make unordered scans of places (scans, vehicles, 2): some are missed, false ones are added."""
     kept = offered & (rng.uniform(size=offered.shape) < sensor.detection_probability)
     false = rng.poisson(sensor.clutter_per_scan, len(places))
     west, east, south, north = parameters.field_m
@@ -263,7 +263,7 @@ def _scan(
 
 
 def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floats) -> list[Stream]:
-    """Prior and truth of every vehicle; the prior's channel states how the vehicle moves."""
+    """Make prior and truth of every vehicle; the prior's channel states how the vehicle moves."""
     states = drive.states_at(truth_s)
     covariance = np.diag(parameters.prior_variance).reshape(1, 16)
     streams = []
@@ -299,7 +299,7 @@ def _fix_streams(
     is_received: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """Every vehicle's fixes, in the plane and as latitude and longitude."""
+    """Simulate every vehicle's fixes, in the plane and as latitude and longitude."""
     covariance = (parameters.fix.variance_m2 * np.eye(2)).reshape(1, 4)
     streams = []
     for index in range(fixes.shape[1]):
@@ -337,7 +337,7 @@ def _scan_streams(
     detections: Detections,
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """Scans with their counts, and their detections; the channels state what a filter must know."""
+    """Make scans with counts, and their detections; the channels state what a filter must know."""
     published, logged = _clocks(sensor, times_s, rng)
     scan = np.repeat(np.arange(len(times_s)), detections.counts)
     variance_m2 = (sensor if isinstance(sensor, Infrastructure) else parameters.fix).variance_m2
@@ -369,7 +369,7 @@ def _scan_streams(
 
 
 def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple[Integers, Integers]:
-    """When messages are published, and when they reach the recorder."""
+    """Return when messages are published, and when they reach the recorder."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
     return simulation_stamps_ns(times_s), simulation_stamps_ns(times_s + delay_s)
 

@@ -661,12 +661,8 @@ REDRAWN = [
     ),
     Fault(
         "pipeline/diagnosing/search.py",
-        '    """The next values to look at: about the greatest gain, or beyond'
-        ' where that is the last one."""\n'
-        "    around = _around(known)\n    if around is None:",
-        '    """The next values to look at: about the greatest gain, or beyond'
-        ' where that is the last one."""\n'
-        "    around = _around(known)\n    if around is not None:",
+        "    around = _around(known)\n    if around is None:\n        best = max(known, key",
+        "    around = _around(known)\n    if around is not None:\n        best = max(known, key",
         "tests/pipeline/test_diagnosing.py tests/pipeline/test_diagnosing_without_prior.py",
     ),
     Fault(

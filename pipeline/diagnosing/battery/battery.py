@@ -198,7 +198,7 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
 
 
 def _named(cause: Cause) -> Iterator[Right]:
-    """What a cause names, and what the log does not tell from it; factors of noise as logarithms."""
+    """Yield what a cause names, and what the log does not tell from it; factors as logarithms."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for estimate in each.numbers:
@@ -237,7 +237,7 @@ def results(
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """By cell: how many runs, how many of them right, the median gain and the value with its spread."""
+    """Count the runs of each cell, and those that are right; its median gain, value and spread."""
     by = rows.groupby("cell", sort=False)
     return by.agg(
         runs=("seed", "size"),
@@ -250,7 +250,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """The runs whose fault is named first, and with its number within 4 standard deviations, by cell."""
+    """Count by cell the runs whose fault is named first, and with its number within 4 sigma."""
     found = {
         f"diagnosis.battery_{quantity}.{_case(row['cell'])}": float(row[quantity])
         for row in summary(rows).to_dict("records")
@@ -279,5 +279,5 @@ def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def _case(cell: str) -> str:
-    """A cell's name as the case of a metric."""
+    """Return a cell's name as the case of a metric."""
     return re.sub(r"[^a-z0-9]+", "-", cell.lower()).strip("-")

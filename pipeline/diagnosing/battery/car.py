@@ -31,7 +31,7 @@ class Truth(NamedTuple):
     pose: Floats
 
     def at(self, times_s: Floats) -> Floats:
-        """Poses (m, 3) at any times, exact; before the begin the car rests."""
+        """Interpolate poses (m, 3) at any times, exactly; before the begin the car rests."""
         step = np.clip(times_s // self.step_s, 0, len(self.speed_mps) - 1).astype(int)
         since_s = np.maximum(times_s - step * self.step_s, 0.0)
         return self.pose[step] + arcs(
@@ -56,7 +56,17 @@ class Car(NamedTuple):
 
 
 def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
-    """By how much poses (n, 3) change along exact arcs."""
+    """Compute how poses change along exact arcs.
+
+    Args:
+        heading_rad: (n,), before each step.
+        speed_mps: (n,), forward.
+        turn_radps: (n,), anticlockwise.
+        duration_s: (n,), of each step.
+
+    Returns:
+        (n, 3), what is added to x and y in m, and to the heading in rad.
+    """
     turned = turn_radps * duration_s
     chord = speed_mps * duration_s * np.sinc(0.5 * turned / np.pi)
     about = heading_rad + 0.5 * turned
@@ -101,7 +111,7 @@ def drive(seed: int, step_s: float = 0.1) -> Car:
 
 
 def late(by_s: float) -> Callable[[Car], Car]:
-    """Fixes are of where the car was so long before."""
+    """Make fixes say where the car was so long before."""
 
     def put(car: Car) -> Car:
         moved = car.truth.at(car.fix_s - by_s) - car.truth.at(car.fix_s)
@@ -111,7 +121,7 @@ def late(by_s: float) -> Callable[[Car], Car]:
 
 
 def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
-    """Fixes are of a point beside the car's own."""
+    """Make fixes those of a point beside the car's own."""
 
     def put(car: Car) -> Car:
         heading = car.truth.at(car.fix_s)[:, 2]
@@ -123,7 +133,7 @@ def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
 
 
 def half_lost(car: Car) -> Car:
-    """Half of the odometry is lost, but for its first."""
+    """Drop half of the odometry, but for its first."""
     kept = philox(car.seed + 10**6).random(len(car.odometry_s)) < 0.5
     kept[0] = True
     return car._replace(
@@ -161,7 +171,7 @@ def faulty(seed: int, *names: str) -> Car:
 
 
 def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
-    """Stamps (n,) in ns."""
+    """Return stamps (n,) in ns."""
     return np.rint(1e9 * times_s).astype(np.int64)
 
 
@@ -206,7 +216,7 @@ def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> 
 
 
 def source(streams: list[Stream]) -> MemorySource:
-    """Streams as a recording of a car."""
+    """Make a recording of a car from streams."""
     return MemorySource({each.topic: each for each in streams}, RunMetadata("car", epoch_ns=0), "car")
 
 
@@ -254,7 +264,7 @@ def ride(seed: int) -> Unit:
 
 
 def remapped(*axes: tuple[int, int]) -> Callable[[Unit], Unit]:
-    """Each axis of the force is another one with a sign."""
+    """Make each axis of the force another one with a sign."""
 
     def put(unit: Unit) -> Unit:
         return unit._replace(

@@ -92,7 +92,7 @@ def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
 
 
 def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
-    """The numbers of a topic, but for covariances and orientations."""
+    """Yield the numbers of a topic, but for covariances and orientations."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or entry.name.startswith(("covariance", "quaternion")):
@@ -105,7 +105,7 @@ def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
 
 
 def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
-    """Which of the numbers that are read are others."""
+    """Return which of the numbers that are read change."""
     same = np.isclose(
         reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
     )
@@ -302,7 +302,7 @@ def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:
 
 
 def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis]:
-    """The headings of orientations."""
+    """Suppose faults of the headings of orientations."""
 
     def words(at: float, low: float, high: float) -> str:
         at, low, high = (float(np.degrees(each)) for each in (at, low, high))

@@ -22,7 +22,7 @@ SUSPECTS = 12  # of which all pairs are tried
 def of_numbers(
     bound: Sequence[Bound], source: MemorySource, innovations: Mapping[str, Stream]
 ) -> Iterator[Hypothesis]:
-    """Two numbers of a map, or two topics, stand for each other."""
+    """Suppose that two numbers of a map, or two topics, stand for each other."""
     maps = {
         topic: field.name
         for each in bound
@@ -54,12 +54,12 @@ def of_numbers(
 
 
 def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
-    """The trial with the messages of two topics exchanged."""
+    """Return the trial with the messages of two topics exchanged."""
     return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Those with the largest mean NIS, if that is too large at all."""
+    """Choose those with the largest mean NIS, if that is too large at all."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

@@ -116,7 +116,7 @@ def has(parameters: Parameters | None, name: str) -> bool:
 
 
 def times(at: float, low: float, high: float) -> str:
-    """By what factor a standard deviation is wrong, from logarithms."""
+    """Say by what factor a standard deviation is wrong, from logarithms."""
     least, most = (
         number(np.exp(abs(end))) if at * end > 0 else "1" for end in sorted((low, high), key=abs)
     )
@@ -151,7 +151,7 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
 
 
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:
-    """How many times wider than a filter says the number of a fault is known, by its gain over a trial.
+    """Return a function that says how many times smaller than it looks a fault's gain is.
 
     Where the log's parts disagree about the number more than their likelihoods say, a gain is so many
     times smaller than it looks: the variance of the slopes of PARTS of the log, at the greatest gain, is

@@ -18,7 +18,7 @@ Metres = tuple[float, float]
 
 
 def of_origin(stream: Stream, reading: Reading | None) -> Iterator[Hypothesis]:
-    """The plane has another origin than a topic's positions are given in, or geodetic fixes state."""
+    """Suppose another origin than a topic's positions are given in, or geodetic fixes state."""
     if "latitude_deg" in stream.columns:
         yield from _of_geodetic(stream)
     elif "position_m" in stream.columns and reading and stream.topic not in reading.controls:
@@ -45,14 +45,14 @@ def _of_positions(stream: Stream) -> Hypothesis:
 
 
 def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
-    """None where the fixes state no origin."""
+    """Suppose another origin than geodetic fixes state; nothing where they state none."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return
     origin = stated
 
     def right(by_m: Metres) -> Origin:
-        """The origin, where fixes are so far east and north of where they should be."""
+        """Return the origin, where fixes are so far east and north of where they should be."""
         latitude, longitude, _ = out_of_tangent_plane(by_m, origin)
         return origin._replace(latitude_deg=float(latitude), longitude_deg=float(longitude))
 

@@ -78,7 +78,7 @@ def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
 def _noise_of(
     parameters: Parameters, name: str, read: Sequence[Topic], assumed: Mapping[str, float]
 ) -> float | None:
-    """The value of a parameter that is a noise: given, as a channel states it, or assumed."""
+    """Return the value of a parameter that is a noise: given, stated by a channel, or assumed."""
     value = getattr(parameters, name)
     if value is None:
         value = stated(read, name, type(parameters), needed=False)
@@ -114,7 +114,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
 
 
 def _factor(logarithm: float) -> float:
-    """How many times as large a standard deviation should be."""
+    """Return how many times as large a standard deviation should be."""
     return float(np.exp(logarithm))
 
 
@@ -123,7 +123,7 @@ def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float
 
 
 def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
-    """The parameters that may be estimated: those of one unit that the same functions read are a vector.
+    """Suppose other values of the parameters that may be estimated; of one unit they are a vector.
 
     Those that are the bias or factor of a number of a topic are left out: that is tried by itself.
     Angles are tried one by one as well, all around: a unit is mounted a quarter turn off, not by three.
@@ -155,7 +155,7 @@ def _parameters(
     *,
     is_angle: bool,
 ) -> Hypothesis:
-    """Some parameters have other values; the numbers are by how much."""
+    """Suppose that some parameters have other values; the numbers are by how much."""
     size = len(names)
 
     def numbers(by: Any) -> tuple[float, ...]:
@@ -199,7 +199,7 @@ def _parameters(
 
 
 def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
-    """Some measurements are of something else; a gate keeps these out."""
+    """Suppose that some measurements are of something else; a gate keeps these out."""
     if not has(parameters, "gate_probability"):
         return
 

@@ -73,7 +73,7 @@ def of_stamps(
 
 
 def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
-    """Half of the longest usual step of what drives, in s."""
+    """Return half of the longest usual step of what drives, in s."""
     steps = [
         np.median(np.diff(streams[topic].publish_time_ns))
         for topic in controls
@@ -83,7 +83,7 @@ def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
 
 
 def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
-    """By how much the speeds of positions lag behind a control that goes with them, in s, if it is told.
+    """Find how much later the speeds of positions are than a control that goes with them, in s.
 
     By the best correlation over a grid; a tenth of a second is near enough to begin a search at.
     """
@@ -110,7 +110,7 @@ def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
 
 
 def _correlations(rows: Floats, column: Floats, is_in: NDArray[np.bool_]) -> Floats:
-    """The correlation of each row (k, n) with a column (n,) where both count; -1 where unknown."""
+    """Correlate each row (k, n) with a column (n,) where both count; -1 where that is unknown."""
     count = np.maximum(is_in.sum(axis=1, keepdims=True), 1)
     rows, columns = (
         np.where(is_in, each - np.where(is_in, each, 0.0).sum(axis=1, keepdims=True) / count, 0.0)

@@ -15,7 +15,7 @@ SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # of a prior
 
 
 def of_start(prior: Stream) -> Iterator[Hypothesis]:
-    """The state at the start is another one."""
+    """Suppose that the state at the start is another one."""
     if len(prior) != 1 or not prior.components:
         return
     covariance = prior["covariance"][0]

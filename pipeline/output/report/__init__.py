@@ -142,7 +142,7 @@ def is_report(page: Path) -> bool:
 
 
 def _signed(page: bytes) -> bytes:
-    """The page with its own SHA-256 at its end."""
+    """Sign the page with its own SHA-256 at its end."""
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
 
 
@@ -151,24 +151,24 @@ def _asset(name: str) -> str:
 
 
 def _hashes(scripts: Sequence[str]) -> Markup:
-    """The scripts that a browser may run, as a content security policy lists them."""
+    """List the scripts that a browser may run, as a content security policy has them."""
     digests = [base64.b64encode(hashlib.sha256(each.encode()).digest()).decode() for each in scripts]
     return Markup(" ".join(f"'sha256-{digest}'" for digest in digests))
 
 
 def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
-    """A chart for the script, an estimator in one colour in all of a section; `<` ends no element."""
+    """Write a chart for the script, an estimator in one colour in a section; `<` ends no element."""
     values = {**chart.model_dump(mode="json"), "colours": chart.colours(estimators)}
     return Markup(json.dumps(values, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _hues(labels: Sequence[str]) -> dict[str, str]:
-    """The class by which the page colours the name of an estimator."""
+    """Return the class by which the page colours the name of an estimator."""
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
 
 
 def _named(text: str, labels: Sequence[str]) -> Markup:
-    """A sentence in which estimators have their colours."""
+    """Write a sentence in which estimators have their colours."""
     hues = _hues(labels)
     if not hues:
         return escape(text)
@@ -234,13 +234,13 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
 
 
 def _legend(begun: Opening) -> str:
-    """What estimators are compared by, where that is no plain error."""
+    """Say what estimators are compared by, where that is no plain error."""
     by = quantity(begun.found.main) if begun.found.compared else None
     return f"{by.name}: {by.meaning} Less is better." if by and by.group == TRACKING else ""
 
 
 def _timings(folder: Path, result: Result) -> Timings:
-    """What estimators cost; nothing where the result does not keep it."""
+    """Return what estimators cost; nothing where the result does not keep it."""
     path = folder / TIMINGS
     if TIMINGS not in result.files or not path.is_file():
         return {}
@@ -251,7 +251,7 @@ def _timings(folder: Path, result: Result) -> Timings:
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:
-    """Errors come first, then what is drawn with its intervals; of these, what compares the most."""
+    """Rank figures: errors first, then what is drawn with intervals, then what compares the most."""
     chart = shown.chart or Chart(panels=[])
     has_bands = any(panel.bands for panel in chart.panels)
     return (
@@ -262,7 +262,7 @@ def _rank(shown: Shown) -> tuple[bool, bool, int]:
 
 
 def _figure(path: Path) -> Shown:
-    """A figure by its SVG file: as a chart where it is one, else as a picture."""
+    """Show a figure by its SVG file: as a chart where it is one, else as a picture."""
     name = unquote(path.stem)
     described = path.with_suffix(".json")
     if described.is_file():
@@ -283,7 +283,7 @@ def _chart(name: str, chart: Chart) -> Shown:
 
 
 def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: bool) -> list[Shown]:
-    """The first run in space: as the viewer shows it, or from above where it has paths, and a lens."""
+    """Show the first run in space: as the viewer does, or from above where it has paths, and a lens."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
         return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
@@ -298,7 +298,7 @@ def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: b
 
 
 def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
-    """What an estimator errs in each case."""
+    """Return what an estimator errs in each case."""
     by_case = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
     return {
         case: float(each.value)
@@ -308,5 +308,5 @@ def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
 
 
 def _address(kind: str, image: bytes) -> str:
-    """An image as the address of itself; what scripts and links it may hold are dead in it."""
+    """Write an image as its own address; what scripts and links it may hold are dead in it."""
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"

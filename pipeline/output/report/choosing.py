@@ -10,7 +10,7 @@ NONE_SOUND = "Believe none of them as they are set."
 
 
 def broken_of(found: Findings) -> list[Evidence]:
-    """Who cannot be believed: who fails, then who is too sure, the worst first."""
+    """List who cannot be believed: who fails, then who is too sure, the worst first."""
 
     def badness(each: Evidence) -> float:
         return math.inf if each.state == "failed" else each.decisive.factor if each.decisive else 0.0
@@ -20,7 +20,7 @@ def broken_of(found: Findings) -> list[Evidence]:
 
 
 def choice_of(found: Findings) -> tuple[str, list[str]]:
-    """Whom to take, empty where there is none, and who draws with it: of those that can be believed.
+    """Choose whom to take, empty where there is none, and who draws with it, of the believable.
 
     Of those that draw, whose covariances are too large comes last.
     """
@@ -40,7 +40,7 @@ def choice_of(found: Findings) -> tuple[str, list[str]]:
 
 
 def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """Whom to take, then who cannot be believed, the worst first, then the others by their error."""
+    """Order estimators: whom to take, who cannot be believed, worst first, the others by error."""
     rest = sorted(
         found.labels,
         key=lambda label: error.value if (error := found.of[label].error) else math.inf,
@@ -50,7 +50,7 @@ def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str
 
 
 def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
-    """Whom to take of estimators that err alike, and these: who is not too careful, if there are any."""
+    """Choose whom to take of estimators that err alike, and these: not too careful ones, if any."""
     careful = [label for label in tied if found.of[label].state == "too careful"]
     left = [label for label in tied if label not in careful] or tied
     whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"

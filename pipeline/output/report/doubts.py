@@ -40,7 +40,7 @@ def doubts_of(found: Findings, alarms: Sequence[Alarm], take: str, equal: Sequen
 
 
 def named(labels: Sequence[str], among: int = 0) -> str:
-    """Estimators by name where they are few; `among` is how many there are."""
+    """Name estimators where they are few; `among` is how many there are."""
     if len(labels) == among > 1:
         return "both" if among == 2 else f"all {among}"
     if len(labels) > MOST_NAMED:
@@ -49,7 +49,7 @@ def named(labels: Sequence[str], among: int = 0) -> str:
 
 
 def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
-    """Whose covariances are not right, by what."""
+    """Say whose covariances are not right, by what."""
     states = {label: each.state for label, each in found.of.items()}
     sentences = []
     for size, state in (("small", "too sure"), ("large", "too careful")):
@@ -68,7 +68,7 @@ def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
 
 
 def _of_checks(alarms: Sequence[Alarm]) -> list[str]:
-    """What else the checks of a replay found."""
+    """Say what else the checks of a replay found."""
     whose: dict[str, list[str]] = {}
     for each in alarms:
         if each.kind in _CHECKS:
@@ -85,7 +85,7 @@ def _of_failures(found: Findings) -> list[str]:
 
 
 def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
-    """In how many cases another one errs less than the one to take."""
+    """Say in how many cases another one errs less than the one to take."""
     best = found.least_in()
     others = {label: number for label, number in best.items() if label not in (take, *equal)}
     if not take or len(found.cases) < 2 or not others:
@@ -99,7 +99,7 @@ def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
 
 
 def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Sequence[str]) -> list[str]:
-    """What so few runs leave open."""
+    """Say what so few runs leave open."""
     runs = count(found.runs, "run")
     if compared and found.runs < FEWEST_RUNS:
         do = "does" if found.runs == 1 else "do"
@@ -113,7 +113,7 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
 
 
 def _of_what_is_not_known(found: Findings) -> list[str]:
-    """Who was not judged, or not compared."""
+    """Say who was not judged, or not compared."""
     unknown = []
     unjudged = [
         label

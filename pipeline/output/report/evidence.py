@@ -73,12 +73,12 @@ class Consistency:
 
     @property
     def is_far(self) -> bool:
-        """Whether errors are so much larger than claimed that nobody should go by the covariance."""
+        """Tell whether errors are so far beyond what is claimed that the covariance is no guide."""
         return self.factor > FAR
 
     @property
     def state(self) -> State:
-        """What that says of the estimator: by chance over the stated covariances, and over the runs."""
+        """Return what that says of the estimator: by chance over covariances, and over the runs."""
         low, high = self.honest
         is_excluded = self.found.is_known and not self.found.low <= self.aim <= self.found.high
         is_usual = low <= self.found.value <= high and not is_excluded
@@ -121,7 +121,7 @@ class Evidence:
 
     @property
     def decisive(self) -> Consistency | None:
-        """By what its state is: NEES, or NIS where that alone is off."""
+        """Return by what its state is: NEES, or NIS where that alone is off."""
         if self.also is not None and self.consistency is not None and self.consistency.state == "honest":
             return self.also if self.also.state != "honest" else self.consistency
         return self.consistency
@@ -172,7 +172,7 @@ class Findings:
 
     @cached_property
     def cases(self) -> list[dict[str, Measured]]:
-        """Of each case in which estimators are compared: their errors, by label."""
+        """Return of each case in which estimators are compared their errors, by label."""
         return [each.quantities[self.main] for each in self.tables if self.main in each.quantities]
 
     @property
@@ -181,7 +181,7 @@ class Findings:
         return [label for label in self.labels if self.of[label].error is not None]
 
     def least_in(self) -> Counter[str]:
-        """In how many cases each estimator errs least, of those that have an error in every case."""
+        """Count the cases in which each estimator errs least, of those with an error in every case."""
         found: Counter[str] = Counter()
         for case in self.cases:
             of = {label: case[label].value for label in self.compared}
@@ -191,7 +191,7 @@ class Findings:
         return found
 
     def by_run(self, label: str, key: str) -> "pd.Series[float]":
-        """A quantity in every run: of errors the root mean square over the cases, else the mean."""
+        """Return a quantity of every run: the root mean square of errors over cases, else the mean."""
         if key not in self.rows:
             return pd.Series(dtype=float)
         own = self.rows[self.rows["estimator"] == label]
@@ -201,7 +201,7 @@ class Findings:
         return np.sqrt(squared).dropna()
 
     def difference(self, first: str, second: str, key: str, target: Target = None) -> Difference | None:
-        """What the second has more of a quantity, over the runs of both; see `fuselog compare`."""
+        """Return what the second has more of a quantity, by the runs of both; see `fuselog compare`."""
         both = pd.concat([self.by_run(first, key), self.by_run(second, key)], axis=1).dropna()
         if both.empty:
             return None
@@ -248,7 +248,7 @@ class Findings:
         )
 
     def _error(self, label: str) -> Spread | None:
-        """The error over all cases; an estimator that lacks one that another has is not compared."""
+        """Return the error over all cases; an estimator that lacks one of them is not compared."""
         values = self.values(label, self.main)
         if not values or len(values) < len(self.cases):
             return None
@@ -270,7 +270,7 @@ class Findings:
         return self._consistency(label, "nis_per_component", "NIS")
 
     def _consistency(self, label: str, key: str, name: str) -> Consistency | None:
-        """The mean over the cases, judged by the interval of one of them; None without any."""
+        """Return the mean over the cases, judged by the interval of one of them; None without any."""
         measured = [
             each
             for table in self.tables
@@ -287,7 +287,7 @@ class Findings:
         return Consistency(name, Spread(float(np.mean(values)), *mean_interval(each_run)), aim, honest)
 
     def _size(self, honest: tuple[float, float]) -> float:
-        """How many components NEES is of: as many as have this chi-square interval over the runs."""
+        """Return of how many components NEES is: of as many as have this chi-square interval."""
         from replay.judging.errors.evaluation import chi_square_interval
 
         sizes = range(1, 100)
@@ -296,7 +296,7 @@ class Findings:
 
 
 def relation(found: Findings, first: str, second: str) -> Relation:
-    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
+    """Say whether two estimators' errors differ: by the runs, or, of few runs, by the margin."""
     difference = found.difference(first, second, found.main, "low")
     if difference is not None and math.isfinite(difference.low):
         if difference.verdict == "no difference":
@@ -314,7 +314,7 @@ def relation(found: Findings, first: str, second: str) -> Relation:
 
 
 def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:
-    """Whether changes that should not matter move one of two estimators farther than they differ."""
+    """Tell whether changes that should not matter move one of two farther than they differ."""
     return abs(difference) < found.stressed(first, second)
 
 
@@ -337,7 +337,7 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
 
 
 def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
-    """The metrics of two estimators: quantities whose cases all begin with another one's label."""
+    """Pair the metrics of two estimators: quantities whose cases begin with another one's label."""
     labels = {split_metric(key)[0] for key in metrics}
     found: dict[str, list[Pair | None]] = {}
     for key, value in metrics.items():

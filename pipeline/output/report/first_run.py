@@ -42,12 +42,12 @@ class Followed:
 
     @property
     def estimate(self) -> Floats:
-        """(n, 2) where the estimator says that it is."""
+        """Return where the estimator says that it is, (n, 2)."""
         return self.truth + self.error
 
     @property
     def squared(self) -> Floats:
-        """(n,) the squared error over what is claimed; NaN where the covariance is none."""
+        """Return the squared error over what is claimed, (n,); NaN where the covariance is none."""
         found = np.full(len(self.error), np.nan)
         sound = np.linalg.det(self.covariance) > 0.0
         solved = np.linalg.solve(self.covariance[sound], self.error[sound, :, None])[..., 0]
@@ -66,7 +66,7 @@ class FirstRun:
 
 
 def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None:
-    """The first run whose log has a truth over the plane, and estimates of it; None where none has.
+    """Return the first run whose log has a truth over the plane and estimates of it; else None.
 
     Of several things that are estimated, such as robots, it is of the first. Raises BadInput where a log
     is damaged.
@@ -81,7 +81,7 @@ def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None
 
 
 def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> FirstRun | None:
-    """A run by its log and what was estimated; None without a truth and estimates over the plane."""
+    """Return a run by its log and estimates; None without truth and estimates over the plane."""
     found = _followed(source, output, gap_limit_s)
     if not found:
         return None
@@ -91,7 +91,7 @@ def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> First
 
 
 def _followed(source: Source, output: Source, gap_limit_s: float) -> dict[tuple[str, str], Followed]:
-    """By estimator and case, what has errors over the plane."""
+    """Return by estimator and case what has errors over the plane."""
     topics = {
         topic: each.metadata.get("truth", "")
         for topic, each in ((topic, output.empty(topic)) for topic in output.topics)
@@ -133,7 +133,7 @@ def _joined(parts: list[Followed]) -> Followed:
 
 
 def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats, Innovations]]]:
-    """By estimator and case the innovations of runs whose estimates are kept, with their times in s."""
+    """Return by estimator and case the innovations of runs that are kept, with their times in s."""
     found: dict[tuple[str, str], list[tuple[Floats, Innovations]]] = {}
     for path in sorted(folder.glob(RUNS))[:MOST_RUNS]:
         output = LogSource(open_log(path))

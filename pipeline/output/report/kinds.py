@@ -79,7 +79,7 @@ class Opening:
 
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
-    """The beginning of a result's page; `timings` are what its estimators cost, where that was kept."""
+    """Write how a result's page begins; `timings` are what its estimators cost, if that was kept."""
     if "sides" in result.settings:
         return _of_comparison(result, tables)
     if "sweep" in result.settings:
@@ -124,7 +124,7 @@ def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
 
 
 def _length(tables: Tables) -> str:
-    """How long a run is, where a table has the time."""
+    """Say how long a run is, where a table has the time."""
     for name, column in (("times", "until_s"), ("steps", "elapsed_s")):
         if name in tables and column in tables[name] and len(tables[name]):
             seconds = float(tables[name][column].max())
@@ -133,7 +133,7 @@ def _length(tables: Tables) -> str:
 
 
 def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Story:
-    """The story of an experiment's estimators, whatever else its study measures; of no single one.
+    """Tell the story of an experiment's estimators, whatever its study measures; of no single one.
 
     What only one of several has is no error by which to choose.
     """
@@ -145,7 +145,7 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
 
 
 def _with_claims(base: Story, result: Result) -> Story:
-    """A story, then how many claims hold, with a card of those that do not."""
+    """Tell a story, then how many claims hold, with a card of those that do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
     notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
@@ -177,7 +177,7 @@ def claims_sentences(result: Result) -> list[str]:
 
 
 def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
-    """What is wrong comes first; that an estimator is inconsistent is on its card."""
+    """Tell what is wrong first; that an estimator is inconsistent is on its card."""
     first = notes[0].removeprefix("1. ") if notes else ""
     what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
@@ -186,7 +186,7 @@ def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
 
 
 def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
-    """The values that were found, then whether they change what the estimator is worth."""
+    """Tell the values that were found, then whether they change what the estimator is worth."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
         ends = row["low"], row["high"]
@@ -237,7 +237,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
-    """The sides of a comparison as estimators: their means over the runs, which both have."""
+    """Return the sides of a comparison as estimators: their means over the runs that both have."""
     quantities: dict[str, dict[str, dict[str, Measured]]] = {}
     for row in tables["differences"].to_dict("records"):
         if row["case"] == "all":
@@ -258,7 +258,7 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
 
 
 def how_many_differ(rows: pd.DataFrame) -> str:
-    """In how many metrics each pair differs; of many pairs together."""
+    """Say in how many metrics each pair differs; of many pairs together."""
     pairs = rows.groupby(["first", "second"], sort=False)
     if len(pairs) > MOST_PAIRS:
         number_of = int(rows["verdict"].isin(DIFFER).sum())
@@ -271,7 +271,7 @@ def how_many_differ(rows: pd.DataFrame) -> str:
 
 
 def _difference_sentence(row: Mapping[Any, Any]) -> str:
-    """What differs, in words."""
+    """Say in words what differs."""
     words = quantity(str(row["quantity"]))
     first, second = (_number(row[f"{side}_mean"]) for side in ("first", "second"))
     own = scale(words.unit, first, second)
@@ -291,7 +291,7 @@ def _number(value: object) -> float:
 
 
 def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
-    """Every metric's difference in percent, with its interval, and the margin where none matters."""
+    """Draw every metric's difference in percent, with its interval and the margin."""
     shown = rows[(rows["margin"] > 0) & rows["low"].notna()]
     shown = shown[[key in FOREST or is_error(key) for key in shown["quantity"]]][:12]
     if shown.empty or not margin:

@@ -20,7 +20,7 @@ READABLE = 4.6  # WCAG 2.2, 1.4.3 asks for 4.5 to 1
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
-    """A name for each result: its experiment, and where several are of one, the settings that differ.
+    """Name each result by its experiment, and of several of one by the settings that differ.
 
     Results of one experiment with the same settings are told apart by their folders.
     """
@@ -67,7 +67,7 @@ def _flat(
 
 
 def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
-    """What a person reads as a heading: the experiment's title, or what was done with whose logs."""
+    """Write a heading for a person: the experiment's title, or what was done with whose logs."""
     settings = result.settings
     title = str(settings.get("title") or result.experiment)
     if "sides" in settings:
@@ -78,20 +78,20 @@ def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
 
 
 def luminance(colour: str) -> float:
-    """The relative luminance of a colour such as `#2f7fd1`, from 0 to 1 (WCAG 2.2)."""
+    """Compute the relative luminance of a colour such as `#2f7fd1`, from 0 to 1 (WCAG 2.2)."""
     channels = [int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)]
     linear = [each / 12.92 if each <= 0.04045 else ((each + 0.055) / 1.055) ** 2.4 for each in channels]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def contrast(one: str, other: str) -> float:
-    """The contrast of two colours, from 1 to 21."""
+    """Compute the contrast of two colours, from 1 to 21."""
     dark, light = sorted((luminance(one), luminance(other)))
     return (light + 0.05) / (dark + 0.05)
 
 
 def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
-    """The colour, mixed with black (0) or white (255) until it is read on all grounds."""
+    """Mix the colour with black (0) or white (255) until it is read on all grounds."""
     channels = [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
     for share in range(0, 101, 2):
         mixed = [round(each + (towards - each) * share / 100) for each in channels]
@@ -103,5 +103,5 @@ def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
 
 @cache
 def text_colours() -> list[tuple[str, str]]:
-    """Of each curve's colour what is read on the light page and on the dark one."""
+    """Return for each curve's colour what is read on the light page and on the dark one."""
     return [(readable(each, LIGHT, 0), readable(each, DARK, 255)) for each in COLOURS]

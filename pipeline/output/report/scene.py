@@ -39,7 +39,7 @@ MOST_FIXES = 600
 
 
 def plan(run: FirstRun) -> Chart:
-    """The scene: truth under the estimates, landmarks, fixes, ellipses that can be seen, particles."""
+    """Draw the scene: truth under the estimates, landmarks, fixes, ellipses to be seen, particles."""
     longest = max(run.followed.values(), key=lambda each: len(each.time_s))
     series: list[Series] = []
     clouds = _clouds(run)
@@ -61,7 +61,7 @@ def plan(run: FirstRun) -> Chart:
 
 
 def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
-    """A second of the run at one scale for all estimators whose ellipses the scene is too large for.
+    """Draw a second of the run at one scale for estimators whose ellipses the scene is too large for.
 
     It is the second whose share of truths outside the ellipses is nearest the whole run's, over all
     estimators that are shown; of several the one nearest the middle. None where the scene shows all.
@@ -110,7 +110,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
-    """When that second begins, and how long it is: longer where estimates are rare; (0, 0) for none."""
+    """Find when that second begins, and its length: more where estimates are rare; (0, 0) for none."""
     if not followed or min(len(each.time_s) for each in followed) < DOTS:
         return 0.0, 0.0
     step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)
@@ -133,7 +133,7 @@ def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
 
 
 def _rows_within(each: Followed, begin_s: float, length_s: float) -> NDArray[np.int64]:
-    """The estimates nearest to a few times of the second, evenly spread."""
+    """Find the estimates nearest to a few times of the second, evenly spread."""
     times = np.linspace(begin_s, begin_s + length_s, DOTS)
     return np.unique(np.abs(each.time_s[:, None] - times).argmin(axis=0))
 
@@ -143,12 +143,12 @@ def _extent(points: Floats) -> float:
 
 
 def _half_axis(each: Followed) -> float:
-    """The longer half axis of the ellipses, as a rule."""
+    """Compute the longer half axis of the ellipses, as a rule."""
     return float(np.sqrt(INSIDE * np.nanmedian(np.linalg.eigvalsh(each.covariance)[:, 1].clip(0.0))))
 
 
 def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
-    """95 % of the plane as an estimator claims it, at some of its estimates."""
+    """Draw 95 % of the plane as an estimator claims it, at some of its estimates."""
     points = _shapes(each, rows)
     return Series(
         label=label,
@@ -159,7 +159,7 @@ def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
 
 
 def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
-    """The borders of ellipses, one after the other, NaN between them."""
+    """Compute the borders of ellipses, one after the other, NaN between them."""
     turn = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     circle = np.stack([np.cos(turn), np.sin(turn)])
     values, axes = np.linalg.eigh(each.covariance[rows])
@@ -180,7 +180,7 @@ def _landmarks(run: FirstRun) -> list[Series]:
 
 
 def _fixes(run: FirstRun) -> list[Series]:
-    """Measured positions of what is estimated."""
+    """Draw measured positions of what is estimated."""
     topics = [
         topic
         for topic, each in run.source.topics.items()
@@ -195,7 +195,7 @@ def _fixes(run: FirstRun) -> list[Series]:
 
 
 def _clouds(run: FirstRun) -> list[Series]:
-    """Particles of densities at a few times spread over the run.
+    """Draw particles of densities at a few times spread over the run.
 
     They are drawn systematically, so that a particle's chance to be shown is its weight.
     """
@@ -234,7 +234,7 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
 def tracked(
     folder: Path, labels: Sequence[str], errors: Mapping[str, float], of_what: str
 ) -> Chart | None:
-    """The first run of trackers from above: tracks over the true ways, a panel for each of the first.
+    """Draw the first run of trackers from above, a panel for each of the first: tracks, true ways.
 
     Of several cases it is that of the median error. None where no run has both ways and tracks. Raises
     BadInput where a log is damaged.
@@ -273,7 +273,7 @@ def tracked(
 
 
 def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
-    """The first log of each case that has estimates: first that of the median error, then by name."""
+    """Find the first log with estimates of each case: that of the median error, then by name."""
     logs = {
         "/".join(log.parent.parent.relative_to(folder).parts): log
         for log in sorted(folder.rglob("logs/run-0000.mcap"))
@@ -285,7 +285,7 @@ def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
 
 
 def _detections(source: LogSource) -> list[Series]:
-    """What the sensors of a log detected, as a series of dots; bearings have no place."""
+    """Draw what the sensors of a log detected as a series of dots; bearings have no place."""
     found = []
     for topic, each in source.topics.items():
         name = f"{topic.rpartition('/')[0]}/detection"
@@ -302,12 +302,12 @@ def _detections(source: LogSource) -> list[Series]:
 
 
 def _dots(label: str, points: Floats) -> Series:
-    """Measured places (n, 2), as many as a picture holds."""
+    """Draw measured places (n, 2), as many as a picture holds."""
     return path(label, points[thinned(len(points), MOST_FIXES)], "dots", reference=True)
 
 
 def _ways(source: LogSource) -> list[Floats]:
-    """The true ways of the targets of a log, each (n, 2)."""
+    """Return the true ways of the targets of a log, each (n, 2)."""
     topics = [
         topic
         for topic, each in source.topics.items()
@@ -322,7 +322,7 @@ def _ways(source: LogSource) -> list[Floats]:
 
 
 def _tracks(output: LogSource, label: str) -> list[Floats]:
-    """The tracks that an estimator gave, each (n, 2)."""
+    """Return the tracks that an estimator gave, each (n, 2)."""
     topic = f"/estimates/{label}/track"
     if topic not in output.topics or not set(PLANE) <= {*output.empty(topic).components}:
         return []
@@ -332,13 +332,13 @@ def _tracks(output: LogSource, label: str) -> list[Floats]:
 
 
 def _parted(ways: Sequence[Floats]) -> Floats:
-    """Ways one after the other, NaN between them."""
+    """Join ways one after the other, NaN between them."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for way in ways for part in (way, gap)])
 
 
 def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
-    """NIS per component over time, of runs whose estimates are kept, and where 95 % of it lies."""
+    """Draw NIS over time, of runs whose estimates are kept, and where 95 % of it lies."""
     found = innovations_of_runs(folder)
     cases = list(dict.fromkeys(case for _, case in found))
     drawn = []

@@ -75,7 +75,7 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
 
 
 def table_of_pairs(found: Findings) -> pd.DataFrame:
-    """What one estimator has more than another: a row per pair and quantity, a column per case."""
+    """Tabulate what one estimator has more than another: a row by pair and quantity, a case a column."""
     rows: dict[tuple[str, str, str], dict[str, str]] = {}
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
@@ -88,7 +88,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
 
 
 def _medians(tables: list[MetricTable]) -> MetricTable:
-    """The median over the cases that have a number."""
+    """Compute the median over the cases that have a number."""
     quantities: dict[str, dict[str, Measured]] = {}
     for key, of in _numbers(tables).items():
         quantities[key] = {label: Measured(float(median(values))) for label, values in of.items()}
@@ -170,7 +170,7 @@ def _is_material(each: Measured) -> bool:
 
 
 def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
-    """Where a value lies with 95 % over other runs, where one case has a table of runs."""
+    """Say where a value lies with 95 % over other runs, where one case has a table of runs."""
     stem = key.replace("_rmse", "")
     column = key if key in found.rows else f"rmse_{stem}"
     if quantity(key).group not in (ACCURACY, CONSISTENCY) or column not in found.rows:
@@ -181,7 +181,7 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
 
 
 def _aim(found: Findings, key: str) -> str:
-    """How large NEES should be, where all estimators have as many components."""
+    """Say how large NEES should be, where all estimators have as many components."""
     sizes = {
         number(each.consistency.aim)
         for each in found.of.values()
@@ -191,7 +191,7 @@ def _aim(found: Findings, key: str) -> str:
 
 
 def _best(key: str, numbers: Mapping[str, float], aim: str) -> set[str]:
-    """Who has the best value, and who is as good but for the margin."""
+    """Find who has the best value, and who is as good but for the margin."""
     target = target_of(key) or ("low" if quantity(key).group == ACCURACY else None)
     finite = {label: value for label, value in numbers.items() if math.isfinite(value)}
     if target not in ("low", "high") or len(finite) < 2 or len({*finite.values()}) == 1 or aim:

@@ -109,7 +109,7 @@ def _verdict(
     causes: dict[str, Cause],
     timings: Timings,
 ) -> list[str]:
-    """What to do, then who cannot be believed, and why."""
+    """Say what to do, then who cannot be believed, and why."""
     if not found.labels:
         return []
     if len(found.labels) == 1:
@@ -139,7 +139,7 @@ def _advice(
     own: Scale,
     timings: Timings,
 ) -> str:
-    """Whom to take; or that who errs least is not to be believed."""
+    """Say whom to take; or that who errs least is not to be believed."""
     error = found.of[take].error
     main = quantity(found.main).name.removesuffix(", RMS")
     better = [
@@ -181,7 +181,7 @@ def _advice(
 
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
-    """Who of estimators that are as good needs the least time, where that is known and matters."""
+    """Say who of equally good estimators needs the least time, where that is known and matters."""
     of = sorted((timings.get(label, {}).get("seconds", 0.0), label) for label in labels)[:2]
     if len(of) < 2 or not TIMED_S < of[0][0] < CHEAPER * of[1][0]:
         return ""
@@ -190,7 +190,7 @@ def _cheapest(labels: list[str], timings: Timings) -> str:
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
-    """What is said of the only estimator."""
+    """Say what there is of the only estimator."""
     main = quantity(found.main).name.removesuffix(", RMS")
     errs = f"{only.estimator} has a {main} of {_value(only.error, own)} RMS" if only.error else ""
     state = only.state
@@ -203,7 +203,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 
 
 def _of_innovations(found: Findings) -> str:
-    """What is known without a truth."""
+    """Say what is known without a truth."""
     honest = [each.estimator for each in found.of.values() if each.state == "honest"]
     without = "Without a truth nobody's error is known"
     if not honest:
@@ -217,7 +217,7 @@ def _value(error: Spread | None, own: Scale) -> str:
 
 
 def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
-    """Why an estimator is not to be believed, in a sentence."""
+    """Say in a sentence why an estimator is not to be believed."""
     if each.decisive is None or each.decisive.state != "too sure":
         return f"{each.estimator} fails in every run."
     how = "overconfident" if each.decisive.is_far else "slightly overconfident"
@@ -231,7 +231,7 @@ def _times(factor: float) -> str:
 
 
 def _claim(each: Evidence, runs: int) -> str:
-    """What errors are to what is claimed of them, in a few words."""
+    """Say in a few words what errors are to what is claimed of them."""
     by = each.decisive
     if by is None:
         return "its covariance was not judged"
@@ -275,7 +275,7 @@ def _card(
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
-    """How a card looks, its sign, and its word."""
+    """Return how a card looks, its sign, and its word."""
     state = each.state
     if state == "failed":
         return "broken", "✕", "Fails in every run"
@@ -297,7 +297,7 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
 
 
 def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list[str]:
-    """What else is worth a sentence."""
+    """Say what else is worth a sentence."""
     notes = _of_tracks(found, each.estimator)
     best = found.of[take].error if take else None
     if each.estimator == take and len(found.labels) > 1 and not equal:
@@ -317,7 +317,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
 
 
 def _of_tracks(found: Findings, label: str) -> list[str]:
-    """What a tracker misses, invents and mixes up, on average."""
+    """Say what a tracker misses, invents and mixes up, on average."""
     counts = []
     for key, words in (("missed_targets", "missed"), ("false_targets", "false")):
         values = found.values(label, key)
@@ -331,7 +331,7 @@ def _of_tracks(found: Findings, label: str) -> list[str]:
 
 
 def _in_how_many(found: Findings, take: str) -> list[str]:
-    """In how many cases the best is the best, or in how many runs of the only one."""
+    """Say in how many cases the best is the best, or in how many runs of the only one."""
     import pandas as pd
 
     if len(found.cases) > 1:
@@ -347,7 +347,7 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
 
 
 def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
-    """What it cost, also beside the one to take, and how often it failed."""
+    """Say what it cost, also beside the one to take, and how often it failed."""
     foot = []
     own, best = (timings.get(label, {}) for label in (each.estimator, take))
     seconds, messages = own.get("seconds", 0.0), own.get("messages", 0.0)
@@ -363,14 +363,14 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
 
 
 def _beside(factor: float, take: str) -> str:
-    """How much time an estimator needs, beside the one to take."""
+    """Say how much time an estimator needs, beside the one to take."""
     if CHEAPER <= factor <= 1.0 / CHEAPER:
         return f"; a run takes as long as with {take}"
     return f"; a run takes {number(factor, 2)} times as long as with {take}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
-    """Whom to take against each other: those that cannot be told apart, and what is beyond chance."""
+    """Say which estimators cannot be told apart, and what differences are beyond chance."""
     draws, differences = [], []
     main = quantity(found.main).name.removesuffix(", RMS")
     for label in labels if take else ():

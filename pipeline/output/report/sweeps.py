@@ -61,7 +61,7 @@ class Sweep:
         return own.groupby("point")["value"].mean()
 
     def consistency(self, label: str, point: int) -> Consistency | None:
-        """NEES at a point, where the sweep kept its interval: of the first case."""
+        """Return NEES at a point, where the sweep kept its interval: of the first case."""
         table = self.table
         if "bound_low" not in table:
             return None
@@ -79,7 +79,7 @@ class Sweep:
         return by is not None and by.state == "too sure"
 
     def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
-        """Estimators at one point each, as if these were an experiment: by name, label and point."""
+        """Return estimators at one point each, as if these were an experiment: by name and point."""
         metrics, bounds, rows = {}, {}, []
         for name, (label, point) in places.items():
             own = self.table[(self.table["estimator"] == label) & (self.table["point"] == point)]
@@ -96,7 +96,7 @@ class Sweep:
 
     @property
     def of_world(self) -> bool:
-        """Whether the scenario is swept too, so that no point is better than another, but only other."""
+        """Tell whether the scenario is swept too: then points are not better or worse, but other."""
         estimators: Mapping[str, Any] = self.result.settings.get("estimators") or {}
         of_all = {key for values in estimators.values() for key in values}
         return any(
@@ -104,7 +104,7 @@ class Sweep:
         )
 
     def everywhere(self) -> Findings:
-        """Estimators at all points, as if each of these were a case of an experiment."""
+        """Return estimators at all points, as if each of these were a case of an experiment."""
         metrics, bounds = {}, {}
         for row in self.table.to_dict("records"):
             case = ", ".join(filter(None, (self.where(int(row["point"]), brief=True), row["case"])))
@@ -157,7 +157,7 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
 
 
 def _tried(sweep: Sweep, labels: list[str]) -> str:
-    """Over which values, with how many runs, of whom."""
+    """Say over which values, with how many runs, of whom."""
     over = []
     for key in sweep.points[0]:
         unit = unit_of(key)
@@ -171,7 +171,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
-    """Where an estimator errs least, of the points at which it is not overconfident if there are any."""
+    """Find where an estimator errs least, if possible of the points where it is not overconfident."""
     sure = [point for point in own.index if sweep.is_too_sure(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])
@@ -188,7 +188,7 @@ def _with_points(
     best: Mapping[str, int],
     still: list[str],
 ) -> Story:
-    """The story of estimators at their best points, with these points."""
+    """Tell the story of estimators at their best points, with these points."""
     moved = [label for label in errors if label not in still]
     sentences = []
     for point in dict.fromkeys(best[label] for label in moved):
@@ -218,7 +218,7 @@ def _with_points(
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
-    """The other points at which it errs as little, but for chance or less than the margin."""
+    """Find the other points at which it errs as little, but for chance or less than the margin."""
     found = sweep.at({str(point): (label, int(point)) for point in own.index})
     return [
         int(point)
@@ -239,7 +239,7 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
 
 
 def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
-    """What is doubtful of a best point."""
+    """Say what is doubtful of a best point."""
     parts = []
     sure = [int(point) for point in own.index if sweep.is_too_sure(label, int(point))]
     if sure and best not in sure:

@@ -57,7 +57,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
-    """Figures 15-21: NEES, RMSE, CRLB and stray solutions of every mode by noise."""
+    """Tabulate NEES, RMSE, CRLB and stray solutions of every mode by noise, figures 15-21."""
     low, high = chi_square_interval(2, runs)
     rows = [
         (
@@ -95,7 +95,7 @@ def _nominal(cases: list[Case]) -> list[Case]:
 
 
 def _table_of_components(cases: list[Case]) -> pd.DataFrame:
-    """Every parameter at the paper's noise: RMSE against sigma_CRLB, mean error, NEES of its own."""
+    """Tabulate parameters at the paper's noise: RMSE against sigma_CRLB, mean error, own NEES."""
     parts = []
     for case in _nominal(cases):
         for label, mode in case.modes.items():
@@ -119,7 +119,7 @@ def _table_of_components(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_ellipses(cases: list[Case]) -> pd.DataFrame:
-    """Figures 6-14: areas of the 95 % ellipses of the CRLB and of the estimates."""
+    """Tabulate areas of the 95 % ellipses of the CRLB and of the estimates, figures 6-14."""
     rows = [
         (case.number, label, mode.area_m2, float(ellipse_area(mode.covariance)), mode.bound_m)
         for case in _nominal(cases)
@@ -130,7 +130,7 @@ def _table_of_ellipses(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
-    """Figures 3-5: how the local range estimates are distributed."""
+    """Tabulate how the local range estimates are distributed, figures 3-5."""
     rows = [
         (case.number, sensor, error.mean(), error.std(), sigma, skew(error))
         for case in _nominal(cases)
@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Figures 22 and 23: how much smaller the ellipse is than that of bearings only."""
+    """Tabulate how much smaller the ellipse is than that of bearings only, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)
@@ -152,7 +152,7 @@ def _table_of_maps(maps: Maps) -> pd.DataFrame:
 
 
 def _metrics(cases: list[Case]) -> dict[str, Any]:
-    """Of one scenario: at the paper's noise, and lists over all noises."""
+    """Return the metrics of one scenario: at the paper's noise, and lists over all noises."""
     values: dict[str, Any] = {}
     name = f"scenario-{cases[0].number}"
     for case in _nominal(cases):
@@ -193,7 +193,7 @@ def _metrics(cases: list[Case]) -> dict[str, Any]:
 
 
 def _metrics_of_maps(maps: pd.DataFrame) -> dict[str, Any]:
-    """Where an ellipse is smallest beside that of bearings only, by how much there, and the median."""
+    """Find where an ellipse is smallest beside that of bearings only, how much, and the median."""
     values: dict[str, Any] = {}
     for label, rows in maps.groupby("mode", sort=False):
         best = rows.iloc[int(np.nanargmax(rows["ratio"]))]

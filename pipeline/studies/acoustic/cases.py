@@ -93,48 +93,48 @@ class Mode:
 
     @property
     def bound_m(self) -> float:
-        """Root of the trace of the position's CRLB."""
+        """Return the root of the trace of the position's CRLB."""
         return float(np.sqrt(np.trace(self.bound[:2, :2])))
 
     @property
     def rmse_m(self) -> float:
-        """Of the position."""
+        """Return the RMSE of the position."""
         return float(np.sqrt(np.nanmean(self.distance_m**2)))
 
     @property
     def distance_m(self) -> Floats:
-        """Of the estimates from the truth, (repetitions, shots of one)."""
+        """Return the distance of estimates from the truth, (repetitions, shots of one)."""
         return np.linalg.norm(self.error[..., :2], axis=-1)
 
     @property
     def mean_nees(self) -> float:
-        """Over all solutions."""
+        """Return the mean NEES over all solutions."""
         return float(np.nanmean(self.nees))
 
     @property
     def covariance(self) -> Floats:
-        """Of the estimated positions, (2, 2)."""
+        """Return the covariance of the estimated positions, (2, 2)."""
         error = self.error[..., :2].reshape(-1, 2)
         return np.cov(error[np.isfinite(error).all(axis=1)].T)
 
     @property
     def area_m2(self) -> float:
-        """Of the 95 % ellipse of the CRLB."""
+        """Return the area of the 95 % ellipse of the CRLB."""
         return float(ellipse_area(self.bound[:2, :2]))
 
     @property
     def area_ratio(self) -> float:
-        """Of the estimates' 95 % ellipse by that of the CRLB."""
+        """Return the area of the estimates' 95 % ellipse by that of the CRLB."""
         return float(ellipse_area(self.covariance)) / self.area_m2
 
     @property
     def far_per_1000(self) -> float:
-        """Solutions that are missing, or more than 50 m off."""
+        """Return the solutions in a thousand that are missing, or more than 50 m off."""
         return 1000.0 * float(np.mean(~(self.distance_m <= FAR_M)))
 
     @property
     def rmse(self) -> Floats:
-        """Of every parameter."""
+        """Return the RMSE of every parameter."""
         return root_mean_square(self.error, (0, 1))
 
 
@@ -195,7 +195,7 @@ def bound_of(parameters: AcousticParameters, settings: Mapping[str, Any], label:
 
 
 def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
-    """Shooter (1, 2), trajectory (1,) and sensors (sensors, 2)."""
+    """Return the shooter (1, 2) in m, the trajectory (1,) in rad, and the sensors (sensors, 2) in m."""
     return (
         np.array([parameters.shooter_position_m]),
         np.radians([parameters.trajectory_deg]),
@@ -204,7 +204,7 @@ def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
 
 
 def _heard(sources: list[MemorySource]) -> Detections:
-    """What all sensors heard of all shots."""
+    """Gather what all sensors heard of all shots."""
     numbers = range(1, len([topic for topic in sources[0].topics if topic.endswith("/detections")]) + 1)
     streams = [
         [gather([source.streams[f"/sensor{n}/{leaf}"] for source in sources]) for n in numbers]
@@ -220,7 +220,7 @@ def hearing(case: Case) -> list[float]:
 
 
 def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
-    """Errors of the range estimates of each sensor that hears the shockwave, and sigma_r of eq (26)."""
+    """Compute the range errors of each sensor that hears the shockwave, and sigma_r of eq (26)."""
     parameters, heard = case.parameters, case.heard
     shooter, trajectory, sensors = truth_of(parameters)
     true = acoustic.noise_free(parameters.medium, shooter, trajectory, sensors)
@@ -237,7 +237,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Ellipse area of bearings only over that of another mode on a grid of shooters: x, y, ratio."""
+    """Compute on a grid of shooters (x, y) the ellipse area of bearings only by that of a mode."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

@@ -27,7 +27,7 @@ def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[
 
 
 def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Chart:
-    """Figures 6-14: the CRLB's 95 % ellipses, and those of the estimates."""
+    """Draw the CRLB's 95 % ellipses, and those of the estimates, figures 6-14."""
     panels = []
     for case in nominal:
         shooter = np.array(case.parameters.shooter_position_m)
@@ -45,7 +45,7 @@ def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Chart:
 
 
 def _range_errors(case: Case) -> Figure:
-    """Figures 3-5: errors of the local range estimates and the Gaussian of eq (25), of mean zero."""
+    """Draw errors of local range estimates and the Gaussian of eq (25), of mean zero, figures 3-5."""
     found = range_errors_m(case)
     figure = Figure(figsize=(11, 3), layout="constrained")
     for axes, (sensor, (error, sigma)) in zip(
@@ -65,7 +65,7 @@ def _sweep(
     value: Callable[[Mode], float],
     interval_runs: int | None,
 ) -> Chart:
-    """Figures 15-20: a value by noise; with an interval for NEES, else with the CRLB."""
+    """Draw a value by noise; with an interval for NEES, else with the CRLB, figures 15-20."""
     numbers = sorted({case.number for case in cases})
     panels = []
     for number in numbers:
@@ -86,7 +86,7 @@ def _sweep(
 
 
 def _maps(options: AcousticOptions) -> Figure:
-    """Figures 22 and 23: ellipse area of bearings only over that of the mode."""
+    """Draw the ellipse area of bearings only over that of the mode, figures 22 and 23."""
     aims = options.maps.aims
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, (label, aim) in zip(figure.subplots(1, len(aims)), aims.items(), strict=True):

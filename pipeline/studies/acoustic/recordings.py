@@ -131,7 +131,7 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
 
 
 def known_place(errors: Errors) -> dict[str, MetricValue]:
-    """How far a sound of known place is from it, in how many coordinates, and the largest NEES."""
+    """Compute how far a sound of known place is from it, in how many coordinates, and NEES."""
     axes = [errors.components.index(name) for name in ("x_m", "y_m", "z_m") if name in errors.components]
     away_m = np.linalg.norm(errors.error[:, axes], axis=1)
     found = {
@@ -162,7 +162,7 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
 
 
 def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
-    """How well one place explains the differences of a sound, and how many are more than it needs.
+    """Compute how well one place explains a sound's differences, and how many are more than needed.
 
     The sum of squared innovations, less those that the start leaves nothing of, has as many degrees of
     freedom as there are differences beyond the coordinates.
@@ -174,7 +174,7 @@ def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, Met
 
 
 def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
-    """Errors (m), NEES and whether the 95 % region has the place in it, of every simulated sound."""
+    """Simulate sounds: errors (m), NEES, and whether the 95 % region has the place in it."""
     tables = []
     for snr_db in asked.snr_db:
         parameters = {**asked.parameters, "snr_db": snr_db}
@@ -202,7 +202,7 @@ def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
 
 
 def _chart(simulated: pd.DataFrame) -> Chart:
-    """How large errors are in how many of the simulated sounds, by noise."""
+    """Draw how large errors are in how many of the simulated sounds, by noise."""
     panel = Panel(x=Axis(label="error (m)", log=True), y=Axis(label="share of the sounds below it"))
     for snr_db, rows in simulated.groupby("snr_db", sort=False):
         error_m = np.sort(rows["error_m"])

@@ -89,7 +89,7 @@ def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
 
 
 def shots_of(source: MemorySource) -> tuple[Floats, Any]:
-    """From where each shot was fired that anybody heard (shots, 2), and when it was heard last (ns)."""
+    """Return from where each shot that anybody heard was fired (shots, 2), and when last heard (ns)."""
     detections = [stream for topic, stream in source.streams.items() if topic.endswith("/detections")]
     shot = np.concatenate([stream["shot_id"] for stream in detections]).astype(np.int64)
     heard_ns = np.concatenate([stream.publish_time_ns for stream in detections])
@@ -108,7 +108,7 @@ def positions(source: MemorySource, time_ns: Any) -> Floats:
 
 
 def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
-    """The RMSE and the mean NEES of every run over the shots that were located, and their share."""
+    """Compute every run's RMSE and mean NEES over the shots that were located, and their share."""
     grouped = shots.groupby(["case", "estimator", "run"], sort=False)
     return pd.DataFrame(
         {
@@ -120,7 +120,7 @@ def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
 
 
 def log_ratio(runs: pd.DataFrame, case: str, label: str, other: str) -> Interval:
-    """The mean logarithm of the ratio of two estimators' RMSE, over the runs that both located."""
+    """Average the logarithm of the ratio of two estimators' RMSE, over runs that both located."""
     rmse: Any = runs[runs["case"] == case].pivot_table("rmse_m", "run", "estimator")
     return mean_interval(np.log(rmse[label] / rmse[other]).dropna().tolist())
 
@@ -130,7 +130,7 @@ def _median(shots: pd.DataFrame, case: Any, label: Any) -> float:
 
 
 def _chart(shots: pd.DataFrame) -> Chart:
-    """The median error over the runs, shot by shot, a panel for each case."""
+    """Draw the median error over the runs, shot by shot, a panel for each case."""
     panels = []
     for case, of_case in shots.groupby("case", sort=False):
         axis = Axis(label="median error (m)", log=True)

@@ -96,7 +96,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _repeated(
     runner: Runner, sources: Sequence[MemorySource], first: Mapping[str, float]
 ) -> dict[str, float]:
-    """Means and standard deviations over the seeds of the fusions that draw a trimmed database."""
+    """Compute means and deviations over the seeds of the fusions that draw a trimmed database."""
     drawn = {}
     for label, settings in runner.experiment.estimators.items():
         _, parameters = configure(label, settings)
@@ -127,7 +127,7 @@ def printed_metrics() -> dict[str, float]:
 
 
 def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFrame:
-    """Tables 2 to 4: each subset's rate and relative increase by each fusion, paper beside ours.
+    """Tabulate each subset's rate and relative increase by each fusion beside the paper, tables 2-4.
 
     Rates of single matchers and of arithmetic fusion are of identification, as in the paper; the paper's
     relative increases follow from its printed rates, the swapped ones put right.
@@ -161,7 +161,7 @@ def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFr
 
 
 def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
-    """Table 5: the mean relative increase by fusing matchers of one modality, of two, and all."""
+    """Tabulate the mean relative increase by fusing one modality, two, and all, table 5."""
     kinds = {case: "one modality" if case in METHODS else "two modalities" for case in CASES[:-1]}
     judged = factors[factors["fusion"].isin(PAPER_FUSED) & factors["subset"].isin(CASES)]
     kind = judged["subset"].map(kinds).fillna("all").rename("fused")
@@ -169,7 +169,7 @@ def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
 
 
 def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
-    """95 % intervals of GAR at FAR and EER of the first run, of drawing users again."""
+    """Compute 95 % intervals of GAR at FAR and EER of the first run, by drawing users again."""
     names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
     rows = []
     for topic, fused in _complete(replayed).items():
@@ -181,7 +181,7 @@ def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
 
 
 def _complete(replayed: Replayed) -> dict[str, Fused]:
-    """The first run's fusions of all pairs, of single matchers and of all together."""
+    """Return the first run's fusions of all pairs, of single matchers and of all together."""
     found = {
         topic: fused_of(rows.of_run(0))
         for topic, rows in replayed.outputs.items()
@@ -192,7 +192,7 @@ def _complete(replayed: Replayed) -> dict[str, Fused]:
 
 
 def _counts(replayed: Replayed) -> dict[str, list[float]]:
-    """Identified users in every run, by fusion and case."""
+    """Count identified users in every run, by fusion and case."""
     counts: dict[str, list[float]] = {}
     for run in range(len(replayed.sources)):
         of_run = {
@@ -207,7 +207,7 @@ def _counts(replayed: Replayed) -> dict[str, list[float]]:
 
 
 def distribution_figure(source: MemorySource) -> Figure:
-    """Histograms of genuine and impostor scores, a plot per matcher."""
+    """Draw histograms of genuine and impostor scores, a plot per matcher."""
     compared = comparisons_of(source.streams[TOPIC])
     same = np.eye(len(compared.scores), dtype=bool)
     figure = Figure(figsize=(8, 5), layout="constrained")
@@ -223,7 +223,7 @@ def distribution_figure(source: MemorySource) -> Figure:
 
 
 def curve_chart(replayed: Replayed, *, deviates: bool) -> Chart:
-    """ROC, or with normal deviates on both axes the detection error trade-off."""
+    """Draw ROC, or with normal deviates on both axes the detection error trade-off."""
     series = []
     for topic, fused in _complete(replayed).items():
         found = roc(fused.score, fused.genuine)

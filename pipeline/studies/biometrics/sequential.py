@@ -86,14 +86,14 @@ class Drawn(NamedTuple):
     users: Integers
 
     def others(self, gallery: Integers, rng: np.random.Generator) -> Integers:
-        """For each gallery entry (n,) a user that is another."""
+        """Draw for each gallery entry (n,) a user that is another."""
         probe = rng.choice(self.users, len(gallery))
         while (same := probe == gallery).any():
             probe[same] = rng.choice(self.users, int(same.sum()))
         return probe
 
     def impostors(self, count: int, rng: np.random.Generator) -> tuple[Integers, Integers]:
-        """Users of probes and of gallery entries (count,), never the same."""
+        """Draw users of probes and of gallery entries (count,), never the same."""
         gallery = rng.choice(self.users, count)
         return self.others(gallery, rng), gallery
 
@@ -128,7 +128,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _matrix(fused: Fused) -> Floats:
-    """Ratios (users, users) by probe and gallery entry; raises BadInput where they are none of all."""
+    """Return ratios (users, users) by probe and gallery entry; raises BadInput where some lack."""
     if not (fused.is_ratio and fused.is_complete):
         raise BadInput(
             "study biometrics-sequential needs log-likelihood ratios of all pairs: give a score-mixture "
@@ -143,7 +143,7 @@ def _matrix(fused: Fused) -> Floats:
 def wald_tests(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Rates of error and numbers of probes of Wald's test, by way, matcher and stated rates."""
+    """Try Wald's test: rates of error and numbers of probes, by way, matcher and stated rates."""
     count, most = options.sequences, options.most_probes
     for stated in options.rates:
         rates = Rates(*stated)
@@ -182,7 +182,7 @@ def probes_of(
 
 
 def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioOf:
-    """Probes whose ratios are distributed as these, and whose normal scores are correlated."""
+    """Draw probes whose ratios are distributed as these, and whose normal scores are correlated."""
     ordered, share = np.sort(ratios), options.alike
     own = rng.normal(size=options.sequences)
 
@@ -194,13 +194,13 @@ def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioO
 
 
 def in_turn(ratios: Sequence[Floats]) -> RatioOf:
-    """The first probe of every sequence has the ratio of the first matcher, and so on."""
+    """Give the first probe of every sequence the ratio of the first matcher, and so on."""
     left = iter(ratios)
     return lambda going: next(left)[going]
 
 
 def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
-    """Shares of wrong decisions and of none, and how many probes a decision took."""
+    """Compute shares of wrong decisions and of none, and how many probes a decision took."""
     undecided = np.concatenate([genuine.probes, impostors.probes]) == 0
     return {
         "false_accept": float(impostors.accepted.mean()),
@@ -212,7 +212,16 @@ def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
 
 
 def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> float:
-    """The least number of independent probes whose summed ratios hold both rates; NaN for none."""
+    """Find the least number of independent probes whose summed ratios hold both rates of error.
+
+    Args:
+        ratios: (users, users), log-likelihood ratios by probe and gallery entry.
+        rates: the rates to hold.
+        rng: draws the probes.
+
+    Returns:
+        The number; NaN where `FIXED_PROBES` are not enough.
+    """
     drawn = Drawn(ratios, np.arange(len(ratios)))
     same, other = np.zeros(IMPOSTORS), np.zeros(IMPOSTORS)
     for number in range(1, FIXED_PROBES + 1):
@@ -265,9 +274,17 @@ def watched(
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
-    """About so many probes, half of them of the person; those that the others leave open are left out.
+    """Draw probes and label them by the other matchers; those that these leave open are left out.
 
-    `label` (users, users) is the summed ratio of the other matchers.
+    Args:
+        drawn: the matcher's ratios, and the users.
+        label: (users, users), the summed log-likelihood ratios of the other matchers.
+        least: beyond this such a ratio, of either sign, is a label.
+        count: how many are drawn, about half of them of the person.
+        rng: draws them.
+
+    Returns:
+        The probes that have a label.
     """
     probe, gallery = drawn.impostors(count, rng)
     probe = np.where(rng.random(count) < 0.5, gallery, probe)
@@ -277,7 +294,7 @@ def labelled(
 
 
 def _intervals(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Of every quantity the value of all users, and where it lies with 95 % over the replicates."""
+    """Compute the value of all users, and where it lies with 95 % over the replicates."""
     quantities = table.columns.drop([*by, "replicate"])
     rows = []
     for key, group in table.groupby(by, sort=False):
@@ -296,7 +313,7 @@ def _tell_tests(
     outcome: Outcome,
     rng: np.random.Generator,
 ) -> None:
-    """Metrics and the figure of Wald's tests."""
+    """Add metrics and the figure of Wald's tests."""
     for row in records(table):
         quantity, case = row["quantity"], f"{row['matcher']}-{_case(row['rates'])}"
         is_share = quantity in ("false_accept", "false_reject", "undecided")
@@ -318,7 +335,7 @@ def _tell_tests(
 
 
 def _tell_watches(table: pd.DataFrame, outcome: Outcome) -> None:
-    """Metrics of the watch over matchers."""
+    """Add metrics of the watch over matchers."""
     outcome.tables["watch"] = table
     for row in records(table):
         name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)
@@ -336,7 +353,7 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
-    """The rows in which columns have these values."""
+    """Choose the rows in which columns have these values."""
     for name, value in of.items():
         table = table[table[name] == value]
     return table
@@ -351,7 +368,7 @@ def _case(rates: tuple[float, float]) -> str:
 
 
 def _chart_of_tests(table: pd.DataFrame, options: Options) -> Chart:
-    """False accepts and mean numbers of probes by matcher, a series for every way and stated rates."""
+    """Draw false accepts and mean numbers of probes by matcher, a series per way and rates."""
     panels = []
     for quantity, label in (
         ("false_accept", "false accepts (share)"),

@@ -19,9 +19,16 @@ class Labelled(NamedTuple):
 
 
 def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """Return the ratios (n,) of probes by a matcher with a fault.
+    """Draw the ratios of a matcher with a fault.
 
-    `steady` are the ratios of impostors and of persons before, in rising order.
+    Args:
+        fault: one of "misses", "accepts" and "drifts"; any other is none.
+        seen: n probes without the fault.
+        steady: the ratios of impostors and of persons before, each in rising order.
+        rng: draws what takes their place.
+
+    Returns:
+        (n,), the log-likelihood ratios of the same probes.
     """
     others, own = steady
     match fault:
@@ -36,7 +43,15 @@ def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.
 
 
 def normal_scores(values: Floats, reference: Floats) -> Floats:
-    """Where values (n,) lie in a reference in rising order, as normal numbers; ties in the middle."""
+    """Compute where values lie in a reference, as quantiles of the standard normal distribution.
+
+    Args:
+        values: (n,).
+        reference: (m,), in rising order; a tie counts as in its middle.
+
+    Returns:
+        (n,).
+    """
     rank = 0.5 * (
         np.searchsorted(reference, values, "left") + np.searchsorted(reference, values, "right")
     )
@@ -44,10 +59,15 @@ def normal_scores(values: Floats, reference: Floats) -> Floats:
 
 
 def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
-    """Log-likelihood ratios (4, n) of four changes, zero for probes that say nothing of them.
+    """Compute log-likelihood ratios of four changes, zero for probes that say nothing of them.
 
-    That the person's ratios become those of impostors, or fall by `DRIFT_SIGMA` of their normal scores;
-    that those of impostors become the person's, or rise so.
+    Args:
+        seen: n probes.
+        steady: the ratios of impostors and of persons before, each in rising order.
+
+    Returns:
+        (4, n): that the person's ratios become those of impostors, or fall by `DRIFT_SIGMA` of their
+        normal scores; that those of impostors become the person's, or rise so.
     """
     others, own = (
         DRIFT_SIGMA * sign * normal_scores(seen.ratio, reference) - 0.5 * DRIFT_SIGMA**2

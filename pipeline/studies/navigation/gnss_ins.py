@@ -161,7 +161,7 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
-    """The experiment whose estimator `delayed` takes velocities for those of their rows' stamps."""
+    """Return the experiment whose estimator `delayed` takes velocities at their rows' stamps."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
@@ -177,7 +177,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """The recording with the fixes that are used, and the rows of the receiver."""
+    """Return the recording with the fixes that are used, and the rows of the receiver."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))
@@ -193,7 +193,7 @@ def _recording(
 def innovations_of(
     outputs: Mapping[str, Ragged], rows: Rows, options: GnssInsOptions
 ) -> dict[str, Innovations]:
-    """What the filter's innovations of positions and velocities are worth in the run without outages."""
+    """Judge the filter's innovations of positions and velocities in the run without outages."""
     stream = outputs[f"/estimates/{options.filter}/innovation"].stream
     size = stream["innovation"].shape[1]
     covariance = stream["covariance"].reshape(-1, size, size)
@@ -215,7 +215,7 @@ def innovations_of(
 
 
 def _chart(errors: pd.DataFrame) -> Chart:
-    """The error since the beginning of outages, root mean square over the windows of a length."""
+    """Draw the error since the beginning of outages, root mean square over the windows of a length."""
     panels = []
     for length_s, rows in errors.sort_values("length_s", kind="stable").groupby("length_s"):
         panel = Panel(

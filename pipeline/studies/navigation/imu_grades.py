@@ -84,7 +84,7 @@ def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
 
 
 def _chart(largest: pd.DataFrame) -> Chart:
-    """The largest error over the time since the last fix, by grade and estimator."""
+    """Draw the largest error over the time since the last fix, by grade and estimator."""
     panel = Panel(
         x=Axis(label="time since the last fix (s)"),
         y=Axis(label="95 % of drives are within (m)", log=True),

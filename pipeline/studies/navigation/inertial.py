@@ -41,7 +41,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.DataFrame:
-    """One row per trial and estimator: total RMSE over movement (deg), how many samples that are."""
+    """Tabulate by trial and estimator the total RMSE over movement (deg), and how many samples."""
     rows = []
     for errors in found:
         moving = np.concatenate(
@@ -58,14 +58,23 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
 
 
 def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return what the last message before each stamp says; the topic speaks at every change."""
+    """Tell at which stamps a trial is marked as movement; the topic speaks at every change.
+
+    Args:
+        source: the log.
+        case: the trial, which begins the topic's name.
+        time_ns: (n,), the stamps.
+
+    Returns:
+        (n,), what the last message at or before each stamp says; False before the first.
+    """
     stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
     row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1
     return (row >= 0) & (stream["value"][row.clip(0), 0] != 0.0)
 
 
 def trials_figure(trials: pd.DataFrame) -> Figure:
-    """Total RMSE over movement of every trial and estimator; on a logarithmic axis."""
+    """Draw the total RMSE over movement of every trial and estimator on a logarithmic axis."""
     figure = Figure(figsize=(8, 1.5 + 0.5 * trials["trial"].nunique()), layout="constrained")
     axes = figure.subplots()
     table = trials.pivot_table(index="trial", columns="estimator", values="movement_rmse_deg")

@@ -141,7 +141,7 @@ def states_of(replayed: Replayed, trial: str) -> Iterator[tuple[str, Stream]]:
 
 
 def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, Any]]:
-    """The RMSE of every estimator over the movement of a trial, in deg, and what was not estimated."""
+    """Yield every estimator's RMSE over the movement of a trial, in deg, and what was not estimated."""
     [source] = replayed.sources
     truth = source.streams[f"/{trial}/truth"]
     truth = truth.take(is_moving(source, trial, truth.publish_time_ns))
@@ -163,14 +163,30 @@ def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, A
 
 
 def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
-    """Return the rows (n,) of stamps that are wanted (n,), and which of these there are."""
+    """Find the rows of wanted stamps.
+
+    Args:
+        time_ns: (m,), ascending.
+        wanted_ns: (n,).
+
+    Returns:
+        Rows (n,) of `time_ns`, and (n,) whether the wanted stamp is there; only then its row counts.
+    """
     row = np.searchsorted(time_ns, wanted_ns).clip(0, max(len(time_ns) - 1, 0))
     known = time_ns[row] == wanted_ns if len(time_ns) else np.zeros(len(wanted_ns), bool)
     return row, known
 
 
 def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
-    """The whole angle from the true orientations (n, 4) to the estimated ones, and its two parts."""
+    """Compute the angle between the true orientation and the estimated one, and its two parts.
+
+    Args:
+        estimate: (n, 4), quaternions from the body's axes to the earth's.
+        truth: (n, 4), as those.
+
+    Returns:
+        The whole angle, and the parts heading and inclination, (n,) each in rad, none negative.
+    """
     w, x, y, z = np.abs(compose(estimate, conjugate(truth)).T)
     return ErrorAngles(
         2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), w),
@@ -200,7 +216,7 @@ def disturbed_spans(
 
 
 def by_kind(table: pd.DataFrame) -> pd.DataFrame:
-    """Means over the trials of each kind of movement that there is, by estimator."""
+    """Average over the trials of each kind of movement that there is, by estimator."""
     words = table["trial"].str.split("_")
     recorded = table["case"] == AS_RECORDED
     chosen = {AS_RECORDED: recorded, WITH_MAGNET: ~recorded}
@@ -216,7 +232,7 @@ def by_kind(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _compare(table: pd.DataFrame, own: str, outcome: Outcome) -> None:
-    """How much more the others err than an estimator, and it beside a magnet: means over the trials."""
+    """Measure how much more than one the others err, and it beside a magnet, over the trials."""
     totals = table.pivot_table(index="trial", columns=["case", "estimator"], values="total_deg")
     for case in (AS_RECORDED, WITH_MAGNET):
         for other in totals[case].columns.drop(own):
@@ -232,7 +248,7 @@ def _measure_disturbances(
     options: OrientationOptions,
     outcome: Outcome,
 ) -> None:
-    """In undisturbed trials: for how long one is told, and how far off that of the magnet is."""
+    """Measure in undisturbed trials how long one is told, and how far off that of the magnet is."""
     own = spans[spans["estimator"] == options.estimator]
     quiet = [name for name in sources if "undisturbed" in name.split("_")]
     if not quiet:
@@ -253,7 +269,7 @@ def _measure_disturbances(
 
 
 def _noticed_late(spans: pd.DataFrame, near: tuple[float, float]) -> float:
-    """How far (s) the span found that is nearest is from that in which a magnet was near."""
+    """Compute how far (s) the nearest span found is from that in which a magnet was near."""
     off = np.maximum((spans["begin_s"] - near[0]).abs(), (spans["end_s"] - near[1]).abs())
     return float(off.min()) if len(off) else np.inf
 

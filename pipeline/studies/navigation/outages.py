@@ -41,7 +41,7 @@ class Rows(NamedTuple):
 
     @property
     def since_s(self) -> Floats:
-        """Seconds since the first row."""
+        """Return seconds since the first row."""
         return (self.time_ns - self.time_ns[0]) * 1e-9
 
 
@@ -59,7 +59,7 @@ class Window(NamedTuple):
 
 
 def rows_of(source: MemorySource) -> Rows:
-    """The receiver's rows of a recording; raises BadInput where a topic is missing or has no message."""
+    """Read the receiver's rows; raises BadInput where a topic is missing or has no message."""
     for topic in NEEDED:
         if topic not in source.topics or not source.topics[topic].messages:
             why = "; rows with a fixed solution make it, and there are none" if topic == TRUTH else ""
@@ -81,7 +81,7 @@ def rows_of(source: MemorySource) -> Rows:
 
 
 def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> list[Window]:
-    """The windows of a length, of which all rows, the one before and the one after are a truth."""
+    """Find the windows of a length with truth in all rows, and in those before and after."""
     since_s = rows.since_s
     found = []
     for start_s in np.arange(first_s, since_s[-1] - length_s, every_s).tolist():
@@ -94,7 +94,7 @@ def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> l
 
 
 def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[Window]]:
-    """Windows of a length that share a run: `apart` steps of `every_s` lie between their starts."""
+    """Share windows of a length among runs: `apart` steps of `every_s` lie between their starts."""
     shared: dict[int, list[Window]] = {}
     for window in windows:
         shared.setdefault(round((window.start_s - windows[0].start_s) / every_s) % apart, []).append(
@@ -124,14 +124,14 @@ def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> Mem
 
 
 def coasted(rows: Rows, window: Window) -> Floats:
-    """Errors (m, 2) of the place and the velocity, as they are printed, of the row before."""
+    """Compute errors (m, 2) of the place and the velocity, as they are printed, of the row before."""
     before = window.rows[0] - 1
     ahead_s = (rows.since_s[window.rows] - rows.since_s[before])[:, None]
     return rows.place[before] + ahead_s * rows.velocity[before] - rows.place[window.rows]
 
 
 def hermite(rows: Rows, window: Window) -> Floats:
-    """Errors (m, 2) of the cubic through the places and velocities of the rows at both ends.
+    """Compute errors (m, 2) of the cubic through the places and velocities of the rows at both ends.
 
     It is the smoother of a white acceleration.
     """
@@ -141,7 +141,7 @@ def hermite(rows: Rows, window: Window) -> Floats:
 
 
 def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float]:
-    """Errors (m, 2) of estimates, NaN where there are none, and their NEES at the last withheld row."""
+    """Compute errors (m, 2) of estimates, NaN for none, and their NEES at the last withheld row."""
     time_ns = rows.time_ns[window.rows]
     plane = [states.components.index(name) for name in ("x_m", "y_m")]
     place = states["mean"][:, plane]
@@ -158,7 +158,7 @@ def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float
 def error_table(
     rows: Rows, runs: Sequence[Sequence[Window]], outputs: Mapping[str, Ragged], labels: Sequence[str]
 ) -> pd.DataFrame:
-    """One row per withheld row and estimator: window, seconds since its start, error, NEES at its end.
+    """Tabulate by withheld row and estimator: window, seconds since its start, error, NEES at its end.
 
     `runs` are the windows of each run of the outputs.
     """
@@ -193,7 +193,7 @@ def _errors(
 
 
 def window_table(errors: pd.DataFrame) -> pd.DataFrame:
-    """One row per window and estimator: the error at the end, the RMSE over the window, the NEES."""
+    """Tabulate by window and estimator the error at the end, the RMSE over the window, the NEES."""
     by = errors.groupby(["estimator", "length_s", "start_s", "window"], sort=False)
     found = by.agg(
         end_m=("error_m", "last"),
@@ -204,7 +204,7 @@ def window_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def length_table(windows: pd.DataFrame) -> pd.DataFrame:
-    """One row per estimator and length: root mean square errors over the windows, and the mean NEES."""
+    """Tabulate by estimator and length the RMS errors over the windows, and the mean NEES."""
     by = windows.groupby(["estimator", "length_s"], sort=False)
     found = by.agg(
         windows=("window", "size"),

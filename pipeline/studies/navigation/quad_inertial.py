@@ -140,7 +140,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _flights(experiment: Experiment, setting: Setting) -> list[Flight]:
-    """All recordings at --data or below, with fixes whose seed is the number in the folder's name."""
+    """Read all recordings at --data or below; their fixes' seed is the number in the folder's name."""
     assert setting.data is not None
     assert experiment.import_ is not None
     source, values = experiment.import_.source, experiment.import_.parameters
@@ -153,7 +153,7 @@ def _flights(experiment: Experiment, setting: Setting) -> list[Flight]:
 
 
 def flight_of(name: str, source: MemorySource) -> Flight:
-    """A recording of the mapping `quadrotor`; raises BadInput where it has no units, or no truth."""
+    """Read a recording of the mapping `quadrotor`; raises BadInput where it has no units or truth."""
     topics = sorted(topic for topic in source.topics if re.fullmatch(r"/imu\w+/inertial", topic))
     if not topics or not {"/truth", "/fix"} <= source.topics.keys():
         raise BadInput(
@@ -168,7 +168,7 @@ def flight_of(name: str, source: MemorySource) -> Flight:
 
 
 def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None = None) -> MemorySource:
-    """The recording as one unit has it whose stamps are moved, begun at the first fix that it covers."""
+    """Move the stamps of one unit, and begin the recording at the first fix that the unit covers."""
     fix = flight.fix if fix is None else fix
     moved = np.int64(round(1e9 * offset_s))
     unit_ns = samples.publish_time_ns + moved
@@ -201,7 +201,7 @@ def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None 
 
 
 def mean_of(units: Sequence[Stream]) -> Stream:
-    """The mean of all units at the times of the first; samples of one stamp are averaged before."""
+    """Average all units at the times of the first; samples of one stamp are averaged before."""
     first = units[0]
     columns = {}
     for name in ("specific_force_mps2", "turn_rate_radps"):
@@ -224,7 +224,7 @@ def _offsets(
     *,
     of_truth: bool,
 ) -> dict[str, float]:
-    """The offset of the first unit of each recording that explains positions best.
+    """Find the offset of the first unit of each recording that explains positions best.
 
     The positions are those of the truth, at all its times, or the fixes.
     """
@@ -245,7 +245,7 @@ def _offset(
     estimator: Mapping[str, Mapping[str, Any]],
     search_s: tuple[float, float, float],
 ) -> float:
-    """The offset of the first unit that explains fixes best; sought further out where that is an end."""
+    """Find the first unit's offset that explains fixes best; beyond an end it is sought further."""
     (low, high, step), [label] = search_s, estimator
     tried = np.arange(low, high + 0.5 * step, step)
     # the same fixes for all offsets: likelihoods of other data cannot be compared
@@ -264,7 +264,7 @@ def _offset(
 
 
 def _highest(places: Floats, values: Floats) -> float:
-    """Where the parabola through the greatest of equidistant values and its neighbours is highest."""
+    """Find where the parabola through the greatest of equidistant values and its neighbours peaks."""
     best = int(np.argmax(values))
     if best in (0, len(values) - 1):
         return float(places[best])
@@ -274,7 +274,7 @@ def _highest(places: Floats, values: Floats) -> float:
 
 
 def _truth_as_fixes(flight: Flight, sigma_m: float) -> Stream:
-    """All positions of the truth as fixes."""
+    """Return all positions of the truth as fixes."""
     count = len(flight.time_ns)
     return make_stream(
         "/fix",
@@ -294,7 +294,7 @@ def _judged(
     runs: Mapping[tuple[str, str, str], int],
     options: QuadInertialOptions,
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """The errors with one unit, with the mean of all, and with all filters fused."""
+    """Yield the errors with one unit, with the mean of all, and with all filters fused."""
     estimates = outputs[f"/estimates/{label}/state"]
     innovation = outputs[f"/estimates/{label}/innovation"]
     late_ns = flight.time_ns[0] + round(1e9 * options.scored_from_s)
@@ -319,7 +319,7 @@ def _poses(states: Stream) -> tuple[Integers, Floats]:
 
 
 def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
-    """The poses (n, 10) of several filters by covariance intersection, at the stamps that all have.
+    """Fuse poses (n, 10) of several filters by covariance intersection, at the stamps all have.
 
     Their orientations differ by so little that the tangent space of the first serves for all.
     """
@@ -341,7 +341,17 @@ def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
 
 
 def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -> dict[str, float]:
-    """RMSE at the stamps of the truth from `late_ns` on."""
+    """Compute the RMSE of a flight's poses at the stamps of the truth.
+
+    Args:
+        flight: has the truth.
+        time_ns: (m,), the stamps of the poses.
+        pose: (m, 10), position in m, velocity in m/s, orientation as a quaternion.
+        late_ns: stamps before are left out.
+
+    Returns:
+        By name: of position, horizontal position, velocity, and heading in deg.
+    """
     _, own, true = np.intersect1d(time_ns, flight.time_ns, return_indices=True)
     late = flight.time_ns[true] >= late_ns
     estimate, truth = pose[own[late]], flight.state[true[late]]
@@ -356,7 +366,7 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
 
 
 def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
-    """Position and heading by recording, for the units and offsets of the smoother."""
+    """Draw position and heading by recording, for the units and offsets of the smoother."""
     rows = table[table["estimator"] == options.smoother]
     panels = []
     for name, label in (

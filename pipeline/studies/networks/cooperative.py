@@ -26,7 +26,7 @@ def by_robot(metrics: Mapping[str, MetricValue], estimator: str, quantity: str) 
 
 
 def mode_chart(metrics: Mapping[str, MetricValue], estimators: Sequence[str]) -> Chart:
-    """RMSE and NEES of every robot's position, estimator by estimator."""
+    """Draw RMSE and NEES of every robot's position, estimator by estimator."""
     panels = []
     for quantity, label in (
         ("position_rmse_m", "RMSE of the position (m)"),

@@ -89,7 +89,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int]:
-    """The numbers of a log's robots; raises BadInput where one that is to leave or to lie is none."""
+    """List a log's robots; raises BadInput where one that is to leave or to lie is none of them."""
     topics = [topic.removeprefix("/robot").partition("/") for topic in source.streams]
     numbers = sorted(int(number) for number, _, leaf in topics if leaf == "range_bearing")
     for name in ("leaving", "liar"):
@@ -102,7 +102,7 @@ def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int
 
 
 def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemorySource:
-    """The log with some of the sightings of robots left out."""
+    """Leave some of the sightings of robots out of the log."""
     streams = dict(source.streams)
     for number in numbers:
         stream = streams[f"/robot{number}/range_bearing"]
@@ -112,7 +112,7 @@ def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemoryS
 
 
 def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Booleans:
-    """At most one sighting of each robot in an interval."""
+    """Choose at most one sighting of each robot in an interval."""
     kept = np.zeros(len(stream), bool)
     for target in np.unique(stream["target_id"][fellow]):
         last_ns = -np.inf
@@ -123,12 +123,12 @@ def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Boo
 
 
 def _half(generator: np.random.Generator, stream: Stream, _: int, __: Booleans) -> Booleans:
-    """A random half."""
+    """Choose a random half."""
     return generator.uniform(size=len(stream)) < 0.5
 
 
 def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Booleans:
-    """Those in which the leaving robot has no part, in the middle third of the log."""
+    """Choose those in which the leaving robot has no part, in the middle third of the log."""
     times = stream.publish_time_ns
     first, second = times[0] + (times[-1] - times[0]) * np.array([1, 2]) // 3
     is_away = (times >= first) & (times < second)
@@ -136,7 +136,7 @@ def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Boole
 
 
 def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySource:
-    """The log with one robot as sure as ever of a start that is wrong."""
+    """Make one robot of the log as sure as ever of a start that is wrong."""
     prior = source.streams[f"/robot{options.liar}/prior"]
     mean = prior["mean"].copy()
     mean[:, 0] += options.lie_m
@@ -145,7 +145,7 @@ def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySou
 
 
 def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence[int]) -> pd.DataFrame:
-    """RMSE and NEES of the position by estimator and robot, and what a robot sends a second."""
+    """Tabulate RMSE and NEES of the position by estimator and robot, and what it sends a second."""
     sightings, span_s = 0, 0.0
     for source in sources:
         seen = [source.streams[f"/robot{number}/range_bearing"] for number in numbers]
@@ -171,7 +171,7 @@ def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Errors and NEES, means over the robots, over what a robot sends a second."""
+    """Draw errors and NEES, means over the robots, over what a robot sends a second."""
     chosen = table[table["case"].str.startswith("once") | (table["case"] == "calm")]
     means = chosen.groupby(["estimator", "case", "bytes_per_s"], sort=False).mean(numeric_only=True)
     panels = []

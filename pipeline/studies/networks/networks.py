@@ -73,7 +73,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _after(errors: Errors, settle_s: float) -> Errors:
-    """The errors from more than `settle_s` after the epoch on; raises BadInput where there are none."""
+    """Take the errors from `settle_s` after the epoch on; raises BadInput where there are none."""
     kept = errors.elapsed_s > settle_s + 1e-9
     if not kept.any():
         raise BadInput(
@@ -85,7 +85,7 @@ def _after(errors: Errors, settle_s: float) -> Errors:
 
 
 def network_table(found: Sequence[Errors]) -> pd.DataFrame:
-    """Per estimator: RMSE of the first node, ratio of the nodes' mean to the centralised one's, NEES."""
+    """Tabulate by estimator the first node's RMSE, the nodes' mean by the centralised one's, NEES."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for errors in found:
         squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
@@ -106,7 +106,7 @@ def network_table(found: Sequence[Errors]) -> pd.DataFrame:
 
 
 def _loads(experiment: Experiment, sources: Sequence[MemorySource]) -> dict[str, float | None]:
-    """Bytes a directed link carries per run: what is sent, lost or not."""
+    """Count the bytes that a directed link carries per run: what is sent, lost or not."""
     links = gather([source.streams["/links"] for source in sources])
     run = np.repeat(np.arange(links.runs), np.diff(links.offsets))
     ends = np.stack([run, links["sender_id"], links["receiver_id"]])
@@ -120,13 +120,13 @@ def _loads(experiment: Experiment, sources: Sequence[MemorySource]) -> dict[str,
 
 
 def _rule(label: str, values: Mapping[str, Any]) -> str:
-    """The fusion rule of an experiment's estimator."""
+    """Return the fusion rule of an experiment's estimator."""
     variant = str(values.get("kind", label)).partition(":")[2]
     return variant or str(values.get("rule", NetworkParameters().rule))
 
 
 def _by_loss(runner: Runner, options: NetworkOptions, settled: Replayed) -> pd.DataFrame:
-    """NEES and ratio of some rules over the share of messages that are lost."""
+    """Tabulate NEES and ratio of some rules over the share of messages that are lost."""
     experiment = runner.experiment
     labels = [label for label in experiment.estimators if label in options.loss_rules]
     chosen = {
@@ -159,7 +159,7 @@ def _loss_chart(table: pd.DataFrame) -> Chart:
 
 
 def traces_of_equation_17() -> dict[str, float]:
-    """Of independent errors: the trace of (17) as printed, and that of the fused error's covariance.
+    """Compute for independent errors the trace of (17) as printed, and of the fused error's covariance.
 
     The print equates P_c^-1 with the bracket that belongs between two factors P.
     """

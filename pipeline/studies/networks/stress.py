@@ -102,13 +102,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _measure(rows: pd.DataFrame, key: str, outcome: Outcome) -> None:
-    """The mean NEES and the RMSE of rows by run; `key` has a place for the quantity."""
+    """Measure the mean NEES and the RMSE of rows by run; `key` has a place for the quantity."""
     outcome.measure(key.format("nees"), *mean_interval(rows["nees"].to_list()))
     outcome.metrics[key.format("position_rmse_m")] = float(np.sqrt(rows["squared_m2"].mean()))
 
 
 def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
-    """RMSE of sending news over that of sending in intervals at equal bandwidth, between its points."""
+    """Measure the RMSE of sending news by that of sending in intervals at equal bandwidth."""
     by_interval, by_news = (rows[rows["policy"] == policy] for policy in (INTERVAL, NEWS))
     grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
     for limit, own in by_news.groupby("limit", sort=False):
@@ -136,13 +136,13 @@ def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> 
 
 
 def summarised(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Means over the runs."""
+    """Average over the runs."""
     found = rows.groupby(by, sort=False).mean(numeric_only=True).drop(columns="run").reset_index()
     return found.assign(position_rmse_m=np.sqrt(found["squared_m2"]))
 
 
 def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Errors and bytes a second and node, by run, estimator and how it is decided when to send."""
+    """Tabulate errors and bytes a second and node, by run, estimator and rule of when to send."""
     policies = [(INTERVAL, "send_interval_s", value) for value in options.intervals_s]
     policies += [("when it has news", "send_divergence", value) for value in options.divergences]
     parts = []
@@ -160,7 +160,7 @@ def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataF
 
 
 def _bytes_per_s(replayed: Replayed, estimator: str) -> float:
-    """What a node sends a second, on the average."""
+    """Compute what a node sends a second, on the average."""
     first = replayed.sources[0]
     begin_ns, end_ns = first.extent("publish_time")
     sent = _of(replayed.outputs, estimator, "/sent")
@@ -175,7 +175,7 @@ def _of(outputs: Mapping[str, Ragged], estimator: str, leaf: str) -> list[Ragged
 
 
 def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Errors of the honest nodes while one lies, by run, size of the lie, without a gate and with it."""
+    """Tabulate honest nodes' errors while one lies, by run, size of the lie, and gate or none."""
     parts = []
     own = runner.experiment.estimators[CI]
     for lie_m in (0.0, *options.lies_m):
@@ -192,7 +192,7 @@ def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFra
 
 
 def _refused(replayed: Replayed, options: StressOptions) -> dict[str, dict[int, float]]:
-    """What share of the liar's and of the others' messages honest nodes refuse while it lies, by run."""
+    """Compute what shares of the liar's and the others' messages honest nodes refuse, by run."""
     [refused] = _of(replayed.outputs, "gated", "/refused")
     shares: dict[str, dict[int, float]] = {"liar_refused": {}, "honest_refused": {}}
     for run, source in enumerate(replayed.sources):
@@ -212,7 +212,7 @@ STATES = 4
 
 
 def _bandwidth_chart(table: pd.DataFrame) -> Chart:
-    """Error and NEES over what a node sends a second."""
+    """Draw error and NEES over what a node sends a second."""
     panels = []
     for quantity, label in (
         ("position_rmse_m", "RMSE of the position (m)"),
@@ -230,7 +230,7 @@ def _bandwidth_chart(table: pd.DataFrame) -> Chart:
 
 
 def _lie_chart(table: pd.DataFrame) -> Chart:
-    """Error and NEES of the honest nodes, and what is refused, over the size of the lie."""
+    """Draw error and NEES of the honest nodes, and what is refused, over the size of the lie."""
     labels = {
         "position_rmse_m": "RMSE of honest nodes (m)",
         "nees": "mean NEES of honest nodes",

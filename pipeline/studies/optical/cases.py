@@ -129,7 +129,7 @@ class Case:
 
     @property
     def bias_error_mrad(self) -> Floats:
-        """Errors of the biases (repetitions, runs, biases)."""
+        """Return errors of the biases (repetitions, runs, biases)."""
         return 1e3 * self.error[JOINT][..., 3 * self.targets :]
 
     @property
@@ -139,22 +139,22 @@ class Case:
         return np.nanmean(squared, axis=(0, 1))[3 * self.targets :]
 
     def position_error_m(self, scheme: str) -> Floats:
-        """Distances between estimated and true targets, (repetitions, runs, targets)."""
+        """Compute distances between estimated and true targets, (repetitions, runs, targets)."""
         error = self.error[scheme][..., : 3 * self.targets]
         return np.linalg.norm(error.reshape(*error.shape[:2], self.targets, 3), axis=-1)
 
     def position_rmse_m(self, scheme: str) -> Floats:
-        """Of each target over all repetitions."""
+        """Compute the RMSE of each target over all repetitions."""
         return root_mean_square(self.position_error_m(scheme), (0, 1))
 
     def dilution(self) -> Floats:
-        """GDOP (targets, sensors), eq (32)."""
+        """Compute GDOP (targets, sensors), eq (32)."""
         offset = np.array(self.parameters.target_position_m)[:, None] - self.scene.position_m
         error_m = self.position_rmse_m(ALONE)[:, None]
         return dilution_of_precision(error_m, np.linalg.norm(offset, axis=2), self.scene.sigma_rad)
 
     def observability(self, scene: Scene | None = None, targets: Floats | None = None) -> Observability:
-        """Of scheme 3, or of another scene or other targets (n, 3) with the same biases."""
+        """Analyse scheme 3, or another scene or other targets (n, 3) with the same biases."""
         scene = scene or self.scene
         places = np.array(self.parameters.target_position_m) if targets is None else targets
         bias = self.parameters.bias_rad.ravel()[scene.wanted]
@@ -201,7 +201,7 @@ def _judged(
     free: Replayed,
     biased: Replayed,
 ) -> Case:
-    """The case that was replayed, with its bounds."""
+    """Judge the case that was replayed, with its bounds."""
     scene = scene_of(parameters, configure(JOINT, experiment.estimators[JOINT])[1])
     bias = parameters.bias_rad.ravel()[scene.wanted]
     truth = np.concatenate([np.ravel(parameters.target_position_m), bias])
@@ -263,7 +263,7 @@ def observabilities(case: Case) -> dict[str, Observability]:
 
 
 def one_bias_known(case: Case) -> Floats:
-    """CRLB deviations in mrad of all biases (columns) when one of them (row) is known."""
+    """Compute CRLB deviations in mrad of all biases (columns) when one of them (row) is known."""
     scene = case.scene._replace(known_bias_rad=np.full_like(case.scene.known_bias_rad, np.nan))
     biases = case.parameters.bias_rad.ravel()
     truth = np.concatenate([np.ravel(case.parameters.target_position_m), biases])

@@ -22,7 +22,7 @@ def figures(cases: Sequence[Case], runs: int) -> dict[str, Chart]:
 
 
 def _scenes(cases: Sequence[Case]) -> Chart:
-    """Figures 2-6 and 11-15: every scenario from the side, with its true lines of sight."""
+    """Draw every scenario from the side, with its true lines of sight, figures 2-6 and 11-15."""
     panels = []
     for case in cases:
         targets = 1e-3 * np.array(case.parameters.target_position_m)[:, :2]
@@ -42,7 +42,7 @@ def _scenes(cases: Sequence[Case]) -> Chart:
 
 
 def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
-    """Figures 7 and 16: the mean NEES of each repetition, CRLB at the truth and at the estimate."""
+    """Draw each repetition's mean NEES, CRLB at the truth and at the estimate, figures 7 and 16."""
     panels = []
     for name, cases in by_condition.items():
         numbers = [case.number for case in cases]
@@ -67,7 +67,7 @@ def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
 
 
 def _component_nees(cases: Sequence[Case], runs: int) -> Chart:
-    """Figures 8 and 17: mean NEES of each bias, all repetitions together."""
+    """Draw the mean NEES of each bias, all repetitions together, figures 8 and 17."""
     nees = [case.component_nees.tolist() for case in cases]
     numbers = [str(case.number) for case in cases]
     x, series = groups(nees, bias_names(cases[0]), numbers, "scenario")
@@ -77,7 +77,7 @@ def _component_nees(cases: Sequence[Case], runs: int) -> Chart:
 
 
 def _dilution(cases: Sequence[Case]) -> Chart:
-    """Figures 9 and 18: GDOP of all targets and sensors."""
+    """Draw GDOP of all targets and sensors, figures 9 and 18."""
     targets, sensors = cases[0].dilution().shape
     labels = [f"target {t + 1}, sensor {s + 1}" for t in range(targets) for s in range(sensors)]
     dilution = [case.dilution().ravel().tolist() for case in cases]

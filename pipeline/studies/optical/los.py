@@ -69,7 +69,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _table_of_sensors(cases: list[Case], paper: Printed) -> pd.DataFrame:
-    """Tables I and V: as printed, and as x, y (up), z."""
+    """Tabulate the sensors of tables I and V: as printed, and as x, y (up), z."""
     rows = [
         (paper.table_of_sensors, case.number, sensor + 1, *printed, *ours)
         for case in cases
@@ -83,7 +83,7 @@ def _table_of_sensors(cases: list[Case], paper: Printed) -> pd.DataFrame:
 
 
 def _table_of_positions(cases: list[Case], paper: Printed) -> pd.DataFrame:
-    """Tables II and VI, for all scenarios: RMSE of each target by scheme."""
+    """Tabulate for all scenarios the RMSE of each target by scheme, tables II and VI."""
     rows = []
     for case in cases:
         for scheme in (ALONE, BLIND, JOINT):
@@ -106,7 +106,7 @@ def _table_of_positions(cases: list[Case], paper: Printed) -> pd.DataFrame:
 
 
 def _table_of_biases(cases: list[Case], paper: Printed) -> pd.DataFrame:
-    """Tables III and VII, IV and VIII: RMSE against sigma_CRLB, mean error of the first repetition."""
+    """Tabulate RMSE, sigma_CRLB, and the first repetition's mean error, tables III, IV, VII, VIII."""
     parts = []
     for case in cases:
         row = case.number - 1
@@ -134,7 +134,7 @@ def _table_of_biases(cases: list[Case], paper: Printed) -> pd.DataFrame:
 
 
 def _table_of_nees(cases: list[Case]) -> pd.DataFrame:
-    """Figures 7 and 16: one row per repetition."""
+    """Tabulate NEES, one row per repetition, figures 7 and 16."""
     parts = [
         pd.DataFrame(
             {
@@ -151,7 +151,7 @@ def _table_of_nees(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_dilution(cases: list[Case]) -> pd.DataFrame:
-    """Figures 9 and 18: GDOP of every target and sensor."""
+    """Tabulate GDOP of every target and sensor, figures 9 and 18."""
     rows = [
         (case.condition, case.number, target + 1, sensor + 1, value)
         for case in cases
@@ -161,7 +161,7 @@ def _table_of_dilution(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
-    """Ranks as scheme 3 has it, with all biases wanted, other numbers of targets, sensors in a line."""
+    """Tabulate ranks by scheme 3: all biases wanted, other numbers of targets, sensors in a line."""
     rows = []
     for case in cases:
         if case.condition != cases[0].condition:
@@ -172,7 +172,7 @@ def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_one_bias_known(cases: list[Case]) -> pd.DataFrame:
-    """Deviations in mrad of all biases (columns) by the one that is known (rows)."""
+    """Tabulate deviations in mrad of all biases (columns) by the one that is known (rows)."""
     parts = []
     for case in cases:
         if case.condition == cases[0].condition:

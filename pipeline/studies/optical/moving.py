@@ -92,7 +92,7 @@ def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
 
 
 def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -> pd.DataFrame:
-    """What the measurements of each run tell least of: an eigenvalue, in priors, and its direction."""
+    """Find what each run's measurements tell least of: an eigenvalue, in priors, and its direction."""
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})
     stream = found["/estimates/observability/observability"].stream
@@ -131,14 +131,14 @@ def seconds_of(errors: Errors) -> pd.DataFrame:
 
 
 def _common(errors: Errors, columns: list[int]) -> Floats:
-    """The mean square of the mean of some components."""
+    """Compute the mean square of the mean of some components."""
     if errors.is_bound:
         return errors.covariance[:, columns][:, :, columns].mean(axis=(1, 2))
     return errors.error[:, columns].mean(axis=1) ** 2
 
 
 def _last(table: pd.DataFrame, label: str, quantity: str) -> Floats:
-    """The mean of a quantity over the last seconds, by run."""
+    """Average a quantity over the last seconds, by run."""
     own = table[(table["estimator"] == label) & (table["second"] > table["second"].max() - LAST_S)]
     return own.groupby("run")[quantity].mean().to_numpy()
 
@@ -150,7 +150,7 @@ def _measure(
     sigmas: Mapping[str, float],
     outcome: Outcome,
 ) -> None:
-    """Errors at the end, and by intervals over the runs what they are worth."""
+    """Measure errors at the end, and by intervals over the runs what they are worth."""
     found, labels = outcome.metrics, set(table["estimator"])
     logs = np.log10(weakest_of["least_eigenvalue"])
     found[f"observability.least_eigenvalue.{case}"] = float(10.0 ** logs.mean())
@@ -191,7 +191,7 @@ def _aligned_nees(table: pd.DataFrame, label: str) -> Floats:
 
 
 def weakest(direction: Mapping[str, float], sigmas: Mapping[str, float]) -> str:
-    """The components with the largest parts in a direction, in units of what is known beforehand."""
+    """Name the components with the largest parts in a direction, in units of the prior."""
     parts = {name: share / sigmas[name] for name, share in direction.items()}
     largest = max(abs(part) for part in parts.values())
     return " ".join(
@@ -202,7 +202,7 @@ def weakest(direction: Mapping[str, float], sigmas: Mapping[str, float]) -> str:
 
 
 def _chart(every: pd.DataFrame) -> Chart:
-    """Over time: common roll, all biases and NEES, a column for each case."""
+    """Draw over time common roll, all biases and NEES, a column for each case."""
     axes = {
         "common_roll_rad2": Axis(label="RMSE of the common roll (mrad)", log=True, limits=(0.1, 6.0)),
         "bias_rad2": Axis(label="RMSE of a bias (mrad)", log=True, limits=(0.1, 6.0)),

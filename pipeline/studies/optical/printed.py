@@ -31,7 +31,7 @@ def metrics_of_print(paper: Printed) -> dict[str, Any]:
 
 
 def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
-    """Deviations of biases by those printed, shares of the paper's rules that hold, positions."""
+    """Compute deviations of biases by those printed, shares of the paper's rules kept, positions."""
     name, error = f"{case.condition}-{case.number}", case.bias_error_mrad
     runs, sigma = error.shape[1], case.sigma_mrad
     rule = RULE * np.sqrt(paper.runs / runs)
@@ -86,7 +86,7 @@ def steepest_deg(case: Case) -> float:
 
 
 def _share_from_print(case: Case, runs: int = 200) -> float:
-    """How many noisy runs reach the estimate from the printed starting point."""
+    """Compute how many noisy runs reach the estimate from the printed starting point."""
     clean = optical.predict(case.scene, case.truth[None])
     noise = np.random.default_rng(case.number).normal(size=(runs, *clean.shape[1:]))
     measured = clean + case.scene.sigma_rad * noise
@@ -97,7 +97,7 @@ def _share_from_print(case: Case, runs: int = 200) -> float:
 
 
 def _widest_span_deg(case: Case) -> float:
-    """The largest angle between two targets as a sensor sees them."""
+    """Compute the largest angle between two targets as a sensor sees them."""
     offset = np.array(case.parameters.target_position_m) - case.scene.position_m[:, None]
     unit: Floats = offset / np.linalg.norm(offset, axis=2, keepdims=True)
     cosine = np.einsum("sik,sjk->sij", unit, unit)

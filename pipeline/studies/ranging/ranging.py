@@ -49,7 +49,7 @@ class Replayed(NamedTuple):
 
 
 def recordings(setting: Setting, pattern: str) -> list[Path]:
-    """The files of this name in the folder of data or below; raises BadInput where there are none."""
+    """Find the files of this name in the data's folder or below; raises BadInput where none is."""
     assert setting.data is not None
     found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
     if not found:
@@ -89,7 +89,7 @@ class Reference(NamedTuple):
     state: Floats
 
     def at(self, time_ns: Integers) -> Floats:
-        """Linear between stamps."""
+        """Interpolate linearly between stamps."""
         since = (self.time_ns - self.time_ns[0]) * 1e-9
         wanted = (time_ns - self.time_ns[0]) * 1e-9
         return np.stack([np.interp(wanted, since, column) for column in self.state.T], axis=1)
@@ -103,7 +103,7 @@ def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
 
 
 def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
-    """Metrics and tables of figures by estimator and recording."""
+    """Tabulate figures by estimator and recording, and compute metrics of them."""
     table = pd.DataFrame(rows)
     outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
     for row in rows:
@@ -119,7 +119,12 @@ def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
 
 
 def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:
-    """Errors of every estimator (n,) over time, of one recording."""
+    """Draw every estimator's errors over time, of one recording.
+
+    Args:
+        errors: by estimator stamps in ns and errors, (n,) each.
+        label: of the axis of the errors, with their unit.
+    """
     begin_ns = min(int(time_ns[0]) for time_ns, _ in errors.values() if len(time_ns))
     panel = Panel(x=Axis(label="time (s)"), y=Axis(label=label, log=True))
     for name, (time_ns, error) in errors.items():

@@ -132,7 +132,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[Reference, int, int]:
-    """The truth x, y, z, and the stamps between which is scored; BadInput where it misses the window."""
+    """Return the truth x, y, z, and between which stamps to score; raises BadInput for no overlap."""
     stream = of.source.streams["/truth"]
     time_ns, state = stream.publish_time_ns, stream["state"][:, :3]
     begin, end = 0, len(time_ns) - 1

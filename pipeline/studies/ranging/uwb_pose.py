@@ -71,7 +71,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def figures_of(
     of: Replayed, label: str, options: UwbPoseOptions
 ) -> tuple[dict[str, float], Integers, Floats]:
-    """The figures of one estimator, and its errors x, y, heading (n, 3) with their stamps (n,)."""
+    """Compute one estimator's figures, and its errors x, y, heading (n, 3) with their stamps (n,)."""
     captured = of.source.streams["/truth"]
     order = np.argsort(captured.publish_time_ns, kind="stable")
     yaw = np.unwrap(heading(captured["state"][order, 3:7])) + np.radians(options.mounting_yaw_deg)

@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _stated(experiment: Experiment) -> AxisParameters:
-    """The scenario's parameters; BadInput where it is none of axes or orientations."""
+    """Return the scenario's parameters; raises BadInput where it is none of axes or orientations."""
     if not experiment.record:
         raise BadInput(f"experiment '{experiment.title}': names no scenario; give it in [record]")
     name, values, label = load_scenario(experiment.record.scenario)
@@ -93,7 +93,7 @@ def _stated(experiment: Experiment) -> AxisParameters:
 
 
 def _cases(stated: AxisParameters) -> dict[str, dict[str, Any]]:
-    """Both kinds of noise; the Gaussian one has the covariance of the Bingham one about its mode."""
+    """Return both kinds of noise; the Gaussian one has the covariance of the Bingham one."""
     gaussian = {
         name: {
             "distribution": "gaussian",
@@ -107,7 +107,7 @@ def _cases(stated: AxisParameters) -> dict[str, dict[str, Any]]:
 def _errors_deg(
     replayed: Replayed, stated: AxisParameters, options: BinghamOptions, case: str
 ) -> dict[str, Floats]:
-    """Every estimator's angular RMSE of every run, (runs,)."""
+    """Compute every estimator's angular RMSE of every run, (runs,)."""
     runs = len(replayed.sources)
     is_axis = stated.dimension() == 2
     scale = np.degrees(1.0 if is_axis else 0.5)
@@ -118,7 +118,7 @@ def _errors_deg(
 
 
 def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> Floats:
-    """What any filter can reach: Bayes' rule on a grid over the half circle."""
+    """Compute what any filter can reach: Bayes' rule on a grid over the half circle."""
     logs = [source.read(["/truth", "/axis"]) for source in replayed.sources]
     truth = np.stack([log["/truth"]["state"] for log in logs])
     measured = np.concatenate([log["/axis"]["axis"] for log in logs])

@@ -128,7 +128,7 @@ def turned_areas(at_keys: pd.DataFrame, label: str, step: int) -> list[float]:
 
 
 def error_chart(steps: pd.DataFrame) -> Chart:
-    """Fig. 9: RMSE of position and area against the exact moments, and the band of the rotations."""
+    """Draw RMSE of position and area against exact moments, and the rotations' band, Fig. 9."""
     is_turned = steps["estimator"].str.contains(TURNED)
     own = steps[~is_turned & (steps["estimator"] != REFERENCE)]
     panels = []

@@ -71,7 +71,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
-    """The best set of some starts: D / pi^(N/2), the covariance's eigenvalues, and what it cost."""
+    """Find the best set of some starts: D / pi^(N/2), the covariance's eigenvalues, and its cost."""
     begin = process_time()
     points = lcd_samples(dimension, count, np.random.default_rng(seed), starts=starts)
     seconds = process_time() - begin
@@ -111,7 +111,7 @@ def _invariants(points: np.ndarray) -> np.ndarray:
 
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:
-    """Fig. 1: the sets with the circle that holds 95 %; the area of a point is its weight."""
+    """Draw the sets with the circle that holds 95 %, areas of points their weights, Fig. 1."""
     figure = Figure(figsize=(2.6 * len(drawn), 3.2), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 100)
     radius = np.sqrt(chi2.ppf(0.95, 2))
@@ -126,7 +126,7 @@ def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Fig
 
 
 def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) -> str:
-    """The sets as a log and its timeline; returns a hash of all samples."""
+    """Write the sets as a log and its timeline; return a hash of all samples."""
     digest = hashlib.sha256()
     streams = []
     for name, (points, weights) in drawn.items():

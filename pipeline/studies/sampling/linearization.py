@@ -92,7 +92,7 @@ def ensembles(
 
 
 def track(estimates: Ragged, steps: int) -> Track:
-    """The estimates of all runs as arrays; a run's estimates go from the first step to its failure."""
+    """Put the estimates of all runs into arrays; a run's go from the first step to its failure."""
     counts = np.diff(estimates.offsets)
     there = np.arange(steps) < counts[:, None]
     size = estimates["mean"].shape[1]
@@ -104,7 +104,7 @@ def track(estimates: Ragged, steps: int) -> Track:
 
 
 def rmse(difference: Floats) -> Floats:
-    """Root mean square by step of differences (runs, steps, ...), over the runs that have one."""
+    """Compute the RMS by step of differences (runs, steps, ...), over the runs that have one."""
     squared = np.sum(difference**2, axis=tuple(range(2, difference.ndim)))
     return np.sqrt(np.nanmean(squared, axis=0))
 

@@ -121,7 +121,7 @@ def exact(waves: Waves) -> Moments:
     fading = np.exp(-0.5 * squared)
 
     def product(sign: float) -> Floats:
-        """E cos((k_i + sign k_j)'x + phase_i + sign phase_j)."""
+        """Compute E cos((k_i + sign k_j)'x + phase_i + sign phase_j)."""
         apart = vectors[:, None] + sign * vectors
         return np.exp(-0.5 * np.sum(apart**2, axis=2)) * np.cos(phases[:, None] + sign * phases)
 
@@ -211,7 +211,7 @@ def driven(
 
 
 def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
-    """Errors with their intervals over the functions; logarithms of `RATED`'s over those of others."""
+    """Measure errors with intervals over the functions; and logarithms of `RATED`'s by others'."""
     for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
         case = f"n{dimension}-{direction}"
         for quantity in ("mean_error", "covariance_error", "cross_error"):
@@ -225,7 +225,7 @@ def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
-    """Errors by drive, and by how much (%) those of the position change with other samples."""
+    """Measure errors by drive, and by how much (%) those of the position change with other samples."""
     found = outcome.metrics
     for drive, of_drive in runs.groupby("drive", sort=False):
         quantities = ["position_rmse_m", "nees_per_component", "samples"]
@@ -243,7 +243,7 @@ def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> No
 
 
 def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
-    """Errors of means over the number of samples by dimension; of drives, errors and time."""
+    """Draw errors of means over the number of samples by dimension; of drives, errors and time."""
     panels = []
     for direction, words in DIRECTIONS.items():
         of_direction = moments[moments["direction"] == direction]
@@ -262,7 +262,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """A line for each family of samplings; the extended filter, which has no samples, as a level."""
+    """Draw a line for each family of samplings; the extended filter, without samples, as a level."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

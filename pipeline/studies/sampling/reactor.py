@@ -48,7 +48,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _in_case(experiment: Experiment, case: str) -> Experiment:
-    """The experiment with the prior of a case."""
+    """Give the experiment the prior of a case."""
     if experiment.record is None:
         raise BadInput("study reactor records its own runs; give the experiment a [record] table")
     mean = experiment.record.parameters.get("prior_mean", (0.5, 3.5))
@@ -90,7 +90,7 @@ def step_errors(ensemble: Ensemble) -> pd.DataFrame:
 
 
 def metrics(steps: pd.DataFrame, case: str) -> dict[str, MetricValue]:
-    """Averages over steps and seeds; of the errors that are compared also those of every seed.
+    """Average over steps and seeds; of the errors that are compared also return those of every seed.
 
     Those of the mean also of the first and of the last steps, and by step beside the UKF's: in which
     share of them they are above.
@@ -116,7 +116,7 @@ def metrics(steps: pd.DataFrame, case: str) -> dict[str, MetricValue]:
 
 
 def error_chart(steps: pd.DataFrame, case: str) -> Chart:
-    """Fig. 7: RMSE of mean and covariance against the exact moments, over the steps."""
+    """Draw RMSE of mean and covariance against the exact moments, over the steps, Fig. 7."""
     approximate = steps[steps["estimator"] != REFERENCE]
     return Chart(
         title=f"Batch reactor against the analytic moments, {case}",

@@ -63,7 +63,7 @@ class MomentErrors(NamedTuple):
 def propagation_errors(
     options: PropagationOptions, coupling_rad: float, runs: int, rng: np.random.Generator
 ) -> dict[str, MomentErrors]:
-    """Samples are moved once and refitted by mixed maximum likelihood, as the truth is.
+    """Move samples once and refit them by mixed maximum likelihood, as the truth is.
 
     Keys: `five-wW` for every central weight, W in percent, `ukf`, `random`.
     """
@@ -96,7 +96,7 @@ def propagation_errors(
 
 
 def _gauss_hermite(order: int = 40) -> tuple[Floats, Floats]:
-    """Nodes (n, 2) and weights (n,) of a standard normal in the plane."""
+    """Return nodes (n, 2) and weights (n,) of a standard normal in the plane."""
     x, w = np.polynomial.hermite_e.hermegauss(order)
     nodes = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     weights = np.outer(w, w).ravel() / w.sum() ** 2
@@ -117,7 +117,7 @@ def _moved(samples: Samples, coupling_rad: float) -> Samples:
 
 
 def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
-    """Figure 3; see `pipeline.runs.experiment.Study`. `runs` are those of the random samples."""
+    """Study propagation, figure 3; see `pipeline.runs.experiment.Study`. `runs` are the random ones."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")
@@ -159,7 +159,7 @@ def _rows(
 
 
 def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
-    """Errors over the correlation: a column per coupling, mean above and covariance below."""
+    """Draw errors over the correlation: a column per coupling, mean above and covariance below."""
     quantities = {
         "mean_error_rad": "error of the mean (rad)",
         "covariance_error_rad2": "error of the covariance (rad²)",
@@ -196,7 +196,7 @@ class FilterOptions(Parameters):
 
 
 def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
-    """The recursive toroidal filter beside unscented filters; see `pipeline.runs.experiment.Study`."""
+    """Study the toroidal filter beside unscented ones; see `pipeline.runs.experiment.Study`."""
     options: FilterOptions = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []
@@ -220,7 +220,7 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
-    """The RMSE per angle of every run (runs,) of Bayes' rule on a grid over the torus."""
+    """Compute the RMSE per angle of every run (runs,) of Bayes' rule on a grid over the torus."""
     logs = [source.read(["/truth", "/headings"]) for source in replayed.sources]
     stated = replayed.sources[0].run
     assert stated is not None

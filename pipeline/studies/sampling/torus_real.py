@@ -112,9 +112,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame:
-    """The log density of every pair of angles under what was fitted to the other stretches of the chain.
+    """Compute the log density of every pair of angles by fits to the other stretches of the chain.
 
     The number of a mixture's components is that which does best on stretches held out of the others.
+
+    Args:
+        angles: (n, 2), in rad, in the order of the chain.
+        options: say how many stretches there are.
+        setting: shows the progress.
+
+    Returns:
+        A row for each pair, a column for each density.
     """
     stretches = np.array_split(np.arange(len(angles)), options.folds)
     found = np.full((len(angles), 7), np.nan)
@@ -138,7 +146,7 @@ def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame
 
 
 def _count_of(angles: Floats, options: Options) -> int:
-    """How many wrapped normals are most likely on stretches that they were not fitted to."""
+    """Find how many wrapped normals are most likely on stretches that they were not fitted to."""
     stretches = np.array_split(np.arange(len(angles)), 3)
     scores = []
     for count in range(1, options.most_components + 1):
@@ -192,7 +200,12 @@ def _judge_predictions(
 
 
 def interval(values: Floats | pd.Series, block: int) -> Interval:
-    """The mean, and where it lies with 95 % by Student's distribution of the means of whole blocks."""
+    """Compute the mean and its 95 % interval, by Student's distribution of the means of whole blocks.
+
+    Args:
+        values: (n,), whose neighbours may be alike.
+        block: how many make a block; a last one that is not whole is left out.
+    """
     whole = np.asarray(values)[: len(values) // block * block]
     return mean_interval(whole.reshape(-1, block).mean(axis=1).tolist())
 
@@ -206,7 +219,15 @@ FILTERS: dict[str, Filter] = {
 def most_likely(
     wind: Floats, run: Callable[..., tuple[WrappedNormal, WrappedNormal]]
 ) -> dict[str, float]:
-    """The coupling and both sigmas, by their names as parameters, that predict directions best."""
+    """Find the coupling and both sigmas that predict directions best.
+
+    Args:
+        wind: (hours,), directions in rad.
+        run: the filter.
+
+    Returns:
+        Their values by their names as parameters.
+    """
 
     def given(x: Floats) -> dict[str, float]:
         system, measurement = np.exp(x[1:])
@@ -231,12 +252,21 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Every hour but the first: the direction is measured, its turn is not."""
+    """Return every hour but the first as measurements: of the direction, not of its turn."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
 def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> WrappedNormal:
-    """Direction and turn of every hour, from those before it; it begins at the first direction."""
+    """Predict direction and turn of every hour but the first, from those before it.
+
+    Args:
+        wind: (hours,), directions in rad; the filter begins at the first.
+        run: the filter.
+        parameters: its coupling and sigmas, by name.
+
+    Returns:
+        Means (hours - 1, 2) in rad, and their covariances.
+    """
     model, measured = _model(parameters), _measured(wind)
     prior = WrappedNormal(np.array([[wind[0], 0.0]]), _PRIOR[None])
     _, after = run(model, prior, np.array([0, len(measured)]), measured)
@@ -248,7 +278,16 @@ def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> 
 
 
 def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Prediction:
-    """Return what a filter says of every hour."""
+    """Judge a filter's prediction of every hour but the first by what was measured.
+
+    Args:
+        wind: (hours,), directions in rad.
+        run: the filter.
+        parameters: its coupling and sigmas, by name.
+
+    Returns:
+        The log densities and the errors in rad, (hours - 1,) each.
+    """
     next_ = predicted_by(wind, run, parameters)
     variance = next_.covariance[:, 0, 0] + parameters["measurement_sigma_rad"] ** 2
     return _of_normal(wind[1:] - next_.mean[:, 0], variance)
@@ -262,7 +301,16 @@ def _of_normal(deviation: Floats, variance: Floats | float) -> Prediction:
 
 
 def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -> Prediction:
-    """Return the same by Bayes' rule on a grid."""
+    """Judge the predictions of Bayes' rule on a grid, as `predict` does those of a filter.
+
+    Args:
+        wind: (hours,), directions in rad.
+        parameters: coupling and sigmas, by name.
+        cells: of the grid, per angle.
+
+    Returns:
+        The log densities and the errors in rad, (hours - 1,) each.
+    """
     measured = _measured(wind)
     prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
     begin = (prior / prior.sum())[None]
@@ -273,7 +321,15 @@ def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -
 
 
 def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
-    """The next hour is like this one, up to a wrapped normal; or, now and then, any direction."""
+    """Predict that every hour is like the one before.
+
+    Args:
+        wind: (hours,), directions in rad.
+        half: how many hours the width is fitted to, the first.
+
+    Returns:
+        Two predictions by name: up to a wrapped normal; and, now and then, any direction.
+    """
     turn = np.diff(wind)
 
     def predicted(x: Floats, share: float) -> Prediction:
@@ -296,7 +352,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
 
 def _chart(table: pd.DataFrame, half: int) -> Chart:
-    """How much more was said of the later hours than persistence says, summed up."""
+    """Draw how much more was said of the later hours than persistence says, summed up."""
     wide = table.pivot_table(index="hour", columns="predictor", values="log_density").loc[half:]
     gains = wide.sub(wide["persistence"], axis=0).cumsum()
     panel = Panel(x=Axis(label="hour"), y=Axis(label="log density above persistence, summed"))
@@ -306,7 +362,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
 
 
 def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
-    """A filter's predictions of every hour but the first, as estimates."""
+    """Return a filter's predictions of every hour but the first, as estimates."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)
     return Ragged(stream, np.array([0, len(stream)]))

@@ -54,7 +54,7 @@ class RobotErrors:
 def state_bounds(
     sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
 ) -> list[MemorySource]:
-    """The runs with bounds stated by each robot's channels: those that the others keep in all runs.
+    """State in each robot's channels the bounds that the others keep in all runs.
 
     Raises BadInput where fewer than two robots have odometry, bearings and truth.
     """
@@ -90,7 +90,7 @@ def state_bounds(
 def _bounds(
     others: Sequence[RobotErrors], options: BoundOptions
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """What the channels of odometry and of bearings state."""
+    """Return what the channels of odometry and of bearings state."""
     largest = options.margin * np.max([errors.odometry for errors in others], axis=0)
     spans_s = np.array(SPANS_S)
     offset = largest[spans_s <= SHORT_S].max(axis=0)
@@ -130,7 +130,7 @@ def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> Robot
 def _bearing_errors(
     seen: Stream, landmarks: Stream, truth: Stream, gap_limit_s: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Errors (n,) of the bearings to mapped landmarks where the truth is known, and their stamps."""
+    """Compute errors (n,) of bearings to mapped landmarks where truth is known, and their stamps."""
     numbers = landmarks["landmark_id"]
     order = np.argsort(numbers)
     row = np.searchsorted(numbers, seen["target_id"], sorter=order).clip(max=len(numbers) - 1)

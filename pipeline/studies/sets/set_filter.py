@@ -64,7 +64,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _set_rows(found: JudgedSets) -> pd.DataFrame:
-    """The sets of one estimator and robot, where the truth is known."""
+    """Tabulate the sets of one estimator and robot, where the truth is known."""
     columns = {
         "estimator": found.estimator,
         "case": found.case,
@@ -77,7 +77,7 @@ def _set_rows(found: JudgedSets) -> pd.DataFrame:
 
 
 def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
-    """The ellipses of one estimator and robot at the stamps of its sets: the estimate last said."""
+    """Tabulate one estimator's and robot's ellipses at its sets' stamps: the estimate last said."""
     squared_radius = float(chi2.ppf(ELLIPSE, 2))
     place = errors.position
     error, covariance = errors.error[:, place], errors.covariance[:, place][:, :, place]
@@ -107,14 +107,14 @@ def compared(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
-    """Median area of what is not empty, and share that holds the truth, by estimator, robot and run."""
+    """Compute the median area not empty, and the share that holds the truth, by robot and run."""
     there = table.assign(area_m2=table["area_m2"].where(table["area_m2"] > 0.0))
     groups = there.groupby(["estimator", "case", "run"], sort=False)
     return groups.agg(area_m2=("area_m2", "median"), inside=("inside", "mean")).reset_index()
 
 
 def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """What the sets rest on, how often that held, and what was found wrong; by filter and robot."""
+    """Measure what the sets rest on, how often that held, what was found wrong; by filter, robot."""
     metrics: dict[str, MetricValue] = {}
     for each in found:
         known = each.sets.known
@@ -140,7 +140,7 @@ def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
 
 
 def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
-    """The filter's areas over those of the others, and how much more often it holds the robot."""
+    """Measure the filter's areas by those of the others, and how much more often it holds the robot."""
     wide = summary.pivot_table(index=["case", "run"], columns="estimator")
     area, inside = wide["area_m2"], wide["inside"]
     for other in (FRAMES, L8, EKF, BEARINGS):
@@ -171,7 +171,7 @@ def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]
 
 
 def _chart(summary: pd.DataFrame) -> Chart:
-    """Area and containment, robot by robot."""
+    """Draw area and containment, robot by robot."""
     panels = []
     for quantity, label in (("area_m2", "median area (m²)"), ("inside", "share that holds the robot")):
         series = [

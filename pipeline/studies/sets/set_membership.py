@@ -67,7 +67,7 @@ def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
 
 
 def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
-    """Share of the sets that hold the truth, median area, and how many miss it although they must not.
+    """Measure the share of sets that hold the truth, the median area, and how many wrongly miss it.
 
     A set must hold the truth where its bounds hold and the robot is in its arena; how often it is not is
     counted apart. Per case and all cases together, of the frames that have a truth.
@@ -92,14 +92,14 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
 
 
 def _without_errors(runner: Runner) -> dict[str, MetricValue]:
-    """The ratios of the same scenes where nothing errs: their exact sets are the largest."""
+    """Compute the ratios of the same scenes where nothing errs: their exact sets are the largest."""
     replayed = runner.replay(runner.obtain({"error_share": 0.0}))
     gap_limit_s = runner.experiment.gap_limit_s
     return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)
 
 
 def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValue]:
-    """The median of area / exact area over the frames, and in what share of them the box is larger."""
+    """Compute the median of area / exact area over the frames, and how often the box is larger."""
     areas = {(each.estimator, each.case): each.area_m2 for each in found}
     metrics: dict[str, MetricValue] = {}
     for (name, of), area in areas.items():
@@ -129,7 +129,7 @@ def _section_v(runner: Runner, outcome: Outcome) -> Replayed:
 
 
 def _set_chart(replayed: Replayed, title: str) -> Chart:
-    """The first sets of the first run, and where the robot is."""
+    """Draw the first sets of the first run, and where the robot is."""
     series = []
     for topic, sets in replayed.outputs.items():
         if topic.endswith("/set"):
@@ -144,7 +144,7 @@ def _set_chart(replayed: Replayed, title: str) -> Chart:
 
 
 def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
-    """Containment and area, estimator by estimator."""
+    """Draw containment and area, estimator by estimator."""
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
     labels = {
         "containment_share": "share of sets that hold the truth",
@@ -158,7 +158,7 @@ def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
 
 
 def _value(metrics: Mapping[str, MetricValue], key: str) -> float:
-    """A metric that is one number; NaN where there is none."""
+    """Return a metric that is one number; NaN where there is none."""
     found = metrics.get(key)
     return float(found) if isinstance(found, int | float) else float("nan")
 

@@ -37,7 +37,16 @@ def errors_named(replayed: Replayed, estimator: str) -> Errors:
 
 
 def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
-    """Values (n, ...) of every estimate as (repetitions, runs, ...), NaN where a solution failed."""
+    """Arrange the values of estimates by repetition and run.
+
+    Args:
+        errors: of n estimates; says of which step and run each is.
+        values: (n, ...), of these.
+        runs: how many runs there are.
+
+    Returns:
+        (repetitions, runs, ...), NaN where a solution failed.
+    """
     repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
     repeated[errors.step, errors.run] = values
     return repeated
@@ -55,7 +64,7 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
-    """The mean of independent values, and its interval by Student's distribution; NaN for one value."""
+    """Compute the mean of independent values, and Student's interval of it; NaN for one value."""
     count, mean = len(values), float(np.mean(values))
     if count < 2:
         return Interval(mean, np.nan, np.nan)
@@ -64,7 +73,15 @@ def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interva
 
 
 def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
-    """Over one axis or several, leaving out what is NaN."""
+    """Compute the root mean square, leaving out what is NaN.
+
+    Args:
+        values: of any shape.
+        axis: the axis, or axes, over which the mean is taken.
+
+    Returns:
+        Of the shape of `values` without these axes.
+    """
     return np.sqrt(np.nanmean(values**2, axis=axis))
 
 
@@ -82,9 +99,15 @@ def rmse_of_runs(errors: Errors, runs: int) -> Floats:
 
 
 def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:
-    """How far printed RMSEs (k,) of `runs` runs are from ours, in standard errors, and what is allowed.
+    """Compute how far a paper's RMSEs are from ours, in standard errors.
 
-    `squared` (n, k) are our squared errors. The worst of k is allowed what it exceeds with 5 %.
+    Args:
+        printed: (k,), the paper's RMSEs.
+        squared: (n, k), our squared errors, NaN where a solution failed.
+        runs: how many runs the paper has.
+
+    Returns:
+        The largest of k deviations, and what it exceeds with 5 % where both are of one distribution.
     """
     mean = np.nanmean(squared, axis=0)
     error = np.nanstd(squared, axis=0) * np.sqrt(1.0 / runs + 1.0 / len(squared))
@@ -93,14 +116,14 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
 
 
 def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
-    """Whether a share of `independent` trials is, within two standard errors, at least as expected."""
+    """Tell whether a share of so many trials is, within two standard errors, at least as expected."""
     return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
 
 
 def groups(
     values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
 ) -> tuple[Axis, list[Series]]:
-    """Values side by side in named groups: an axis of groups, and a series per place in the group."""
+    """Draw values side by side in named groups: an axis of groups, and a series per place in them."""
     size = max(len(group) for group in values)
     series = []
     for place in range(size):

@@ -68,7 +68,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
 
 
 def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Chart:
-    """The share of every vessel's reports in its own track, and live tracks and vessels over time."""
+    """Draw how much of each vessel's reports is in its own track, and live tracks over time."""
     many = vessels[vessels["reports"] > MANY_REPORTS]
     shares = {
         str(estimator): np.sort(rows["share"])[::-1]

@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """The scenarios in the data's folder by the numbers in their names, or the folder itself."""
+    """Find the scenarios in the data's folder by the numbers in their names, or the folder itself."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []
@@ -99,7 +99,7 @@ def _late_table(
     in_order: Mapping[str, Ragged],
     runs: Mapping[str, Judged],
 ) -> pd.DataFrame:
-    """One row per estimator, way to take late scans, and scenario.
+    """Tabulate by estimator, way to take late scans, and scenario.
 
     `from_in_order_m` is how far the tracks after the last late scan are from those in order, at most;
     infinite where they are not the same tracks.
@@ -123,7 +123,7 @@ def _late_table(
 
 
 def _last_late_ns(source: MemorySource) -> int:
-    """When the last late scan of a run arrived; 0 where none is late."""
+    """Return when the last late scan of a run arrived; 0 where none is late."""
     arrivals = [
         stream.log_time_ns[stream.log_time_ns > stream.publish_time_ns]
         for topic, stream in source.streams.items()
@@ -135,7 +135,7 @@ def _last_late_ns(source: MemorySource) -> int:
 def _farthest(
     in_order: Mapping[str, Ragged], outputs: Mapping[str, Ragged], label: str, run: int, from_ns: int
 ) -> float:
-    """How far tracks of two replays are apart at most, from a time on."""
+    """Compute how far tracks of two replays are apart at most, from a time on."""
     sizes, tracks = sets_of(in_order, label, run)
     stamps = np.unique(sizes.publish_time_ns)
     stamps = stamps[stamps >= from_ns]
@@ -149,7 +149,7 @@ def _farthest(
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """GOSPA of every estimator by scenario."""
+    """Draw GOSPA of every estimator by scenario."""
     panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m)"))
     for label, rows in table.groupby("estimator", sort=False):
         panel.series.append(curve(str(label), rows["run"], rows["gospa_m"], "line+markers"))

@@ -63,7 +63,7 @@ def _case(clutter_per_scan: float, detection_probability: float) -> str:
 
 
 def _chart(every: pd.DataFrame) -> Chart:
-    """GOSPA over clutter, with 95 % intervals over the runs: a panel by probability of detection."""
+    """Draw GOSPA over clutter, with 95 % intervals over runs: a panel by detection probability."""
     panels = []
     for probability, of_panel in every.groupby("detection_probability", sort=False):
         panel = Panel(
@@ -82,7 +82,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
-    """By how much the differences in GOSPA grow from the least clutter to the most."""
+    """Measure by how much the differences in GOSPA grow from the least clutter to the most."""
     for probability, rows in every.groupby("detection_probability", sort=False):
         by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
         for label, other in pairs:

@@ -52,11 +52,18 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
 
 
 def figures_of(tracked: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
-    """Return what the tracks of a run are worth, tracked at the instants of the truths (targets, k, 2).
+    """Compute what the tracks of a run are worth.
 
     Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
-    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root
-    of the number of instants, so that it is as large as GOSPA.
+    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root of
+    the number of instants, so that it is as large as GOSPA.
+
+    Args:
+        tracked: the tracks at k instants.
+        truths: (targets, k, 2), where the targets are at these, in m; NaN where one is not there.
+
+    Returns:
+        The figures by name.
     """
     tracks = as_trajectories(tracked)
     away = np.linalg.norm(tracks[:, None] - truths[None], axis=3)
@@ -78,7 +85,7 @@ def table_of(
     runs: Mapping[str, Judged],
     delay_s: float = 0.0,
 ) -> pd.DataFrame:
-    """One row per estimator and run, by name; what was told later than `delay_s` before is not known."""
+    """Tabulate by estimator and run; what was told later than `delay_s` before is not known."""
     rows = []
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
@@ -105,7 +112,7 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
 def measure_changes(
     table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
 ) -> None:
-    """By how much the figures of one estimator are above those of another, of pairs that were run."""
+    """Measure by how much figures of one estimator exceed those of another, of pairs that were run."""
     for label, other in pairs:
         if {label, other} <= set(table["estimator"]):
             for quantity in [name for name in COMPARED if name in table]:
@@ -115,6 +122,6 @@ def measure_changes(
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
-    """By how much a quantity of one estimator is above that of another, over the runs."""
+    """Compute by how much a quantity of one estimator is above that of another, over the runs."""
     by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
     return mean_interval((by_run[label] - by_run[other]).tolist())

@@ -85,7 +85,7 @@ class Case(NamedTuple):
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
-    """The stamps (runs, steps) after the start, and the true places (runs, steps, vehicles, 2)."""
+    """Read the stamps (runs, steps) after the start, and true places (runs, steps, vehicles, 2)."""
     numbers = vehicle_numbers(sources[0].topics)
     topics = [f"/vehicle{number}/truth" for number in numbers]
     read = [source.read(topics) for source in sources]
@@ -94,7 +94,16 @@ def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
 
 
 def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np.int64]) -> Floats:
-    """The estimated places (runs, steps, vehicles, 2) at the truth's stamps, NaN where there is none."""
+    """Take an estimator's places of all vehicles at the truth's stamps.
+
+    Args:
+        outputs: by topic.
+        label: the estimator's.
+        times_ns: (runs, steps), the truth's stamps.
+
+    Returns:
+        (runs, steps, vehicles, 2), in m; NaN where there is none.
+    """
     topics = [topic for topic in outputs if topic.startswith(f"/estimates/{label}/vehicle")]
     states = [topic for topic in topics if topic.endswith("/state")]
     found = np.full((*times_ns.shape, len(states), 2), np.nan)
@@ -108,7 +117,12 @@ def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np
 
 
 def score(estimates: Floats, truths: Floats) -> Scores:
-    """Total errors of estimated places (runs, steps, vehicles, 2)."""
+    """Compute the total errors of estimated places.
+
+    Args:
+        estimates: (runs, steps, vehicles, 2), in m; NaN where there is none.
+        truths: (runs, steps, vehicles, 2), in m.
+    """
     return _scores(
         fixed_squared_error(estimates, truths),
         assigned_squared_error(estimates, truths),
@@ -117,13 +131,21 @@ def score(estimates: Floats, truths: Floats) -> Scores:
 
 
 def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
-    """Of squared errors and GOSPA by run and step."""
+    """Sum up squared errors and GOSPA by run and step."""
     failed = int(np.isnan(assigned).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
 
 
 def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
-    """Total errors of a set estimate; a vehicle without an element of its own takes the nearest."""
+    """Compute the total errors of a set estimate.
+
+    A vehicle without an element of its own takes the nearest.
+
+    Args:
+        outputs: by topic.
+        found: the judged set estimate, which has GOSPA.
+        truths: (runs, steps, vehicles, 2), in m.
+    """
     topic = f"/estimates/{found.estimator}/{found.case}"
     sizes, elements = outputs[f"{topic}/set"], outputs[f"{topic}/element"]
     assigned = np.full(truths.shape[:2], np.nan)

@@ -110,7 +110,7 @@ def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> 
 def _timed(
     sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
 ) -> tuple[float, float, int]:
-    """CPU ms of a run's step, the assigned RMSE of a vehicle's place in m, and how many runs failed."""
+    """Measure a step's CPU ms, the assigned RMSE of a vehicle's place in m, and how many runs fail."""
     chosen = {label: estimators[label]}
     replay_in_memory(sources[:1], chosen)  # compiles
     begin = time.process_time()
@@ -126,7 +126,7 @@ def _timed(
 
 
 def growth_of(table: pd.DataFrame) -> Growth:
-    """Fitted to the greater half of the numbers of vehicles, where the work hides what is constant."""
+    """Fit to the greater half of the numbers of vehicles, where the work hides what is constant."""
     own = table[table["vehicles"] >= table["vehicles"].median()]
     if len(own) < 2:
         return Growth(np.nan, np.nan)
@@ -142,7 +142,7 @@ def _table(growth: Mapping[Any, Growth], options: ScalingOptions) -> pd.DataFram
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Time of a step and error of a vehicle over the number of vehicles."""
+    """Draw time of a step and error of a vehicle over the number of vehicles."""
     ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
     x = Axis(label="vehicles", log=True, ticks=ticks)
     axes = {

@@ -63,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """The slow estimators' scores in the first runs of a case, and the others' in the same."""
+    """Return the slow estimators' scores in the first runs of a case, and the others' in the same."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]
@@ -73,7 +73,7 @@ def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Sc
 
 
 def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
-    """Means and medians over the runs of the total error."""
+    """Tabulate means and medians over the runs of the total error."""
     rows = [
         (
             case,
@@ -94,7 +94,7 @@ def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
 
 
 def _known(average: Callable[[Floats], Any], values: Floats) -> float:
-    """The average of what is known; NaN where nothing is."""
+    """Average what is known; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(average(known)) if len(known) else np.nan
 
@@ -118,7 +118,7 @@ def _metrics(case: str, scores: Mapping[str, Scores], reference: str) -> dict[st
 
 
 def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
-    """The Kalman filter's exact total error, and bounds of the settled filters, case by case."""
+    """Tabulate the Kalman filter's exact total error, and bounds of settled filters, by case."""
     rows = []
     for case in cases:
         given = case.parameters
@@ -132,7 +132,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_bytes(cases: list[Case]) -> pd.DataFrame:
-    """What each method sends per step, and what exchanging all tracks would."""
+    """Tabulate what each method sends per step, and what exchanging all tracks would."""
     rows = [(case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()]
     for case in cases:
         tracks = TRACK_BYTES * _vehicles(case)
@@ -145,7 +145,7 @@ def _vehicles(case: Case) -> int:
 
 
 def _steps(case: Case) -> pd.DataFrame:
-    """One row per estimator and step: all vehicles' error together, root mean square over the runs."""
+    """Tabulate by estimator and step the error of all vehicles together, RMS over the runs."""
     columns = [
         "case",
         "estimator",
@@ -172,7 +172,7 @@ def _steps(case: Case) -> pd.DataFrame:
 
 
 def _chart(case: Case) -> Chart:
-    """The median over the runs of all vehicles' error by step, best labels (the paper's Fig. 3)."""
+    """Draw the median over the runs of all vehicles' error by step, best labels (the paper's Fig. 3)."""
     series = []
     for label, scores in case.scores.items():
         median = np.sqrt(np.nanmedian(scores.assigned_by_step, axis=0))

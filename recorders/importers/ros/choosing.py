@@ -97,7 +97,7 @@ def stream_names(
 
 
 def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
-    """The mappings of messages of one's own, by type."""
+    """Return the mappings of messages of one's own, by type."""
     if parameters.mapping is None:
         return {}
     mappings = read_mapping(Path(parameters.mapping))
@@ -129,7 +129,7 @@ def _check_truth(bag: Bag, topic: str, readers: Mapping[Connection, Reader]) -> 
 def _reader(
     connection: Connection, mapping: MessageMapping | None, parameters: RosParameters
 ) -> Reader | str:
-    """How a connection is read, or why it is not taken."""
+    """Choose how a connection is read, or say why it is not taken."""
     name = connection.type_name
     where = f"{parameters.mapping}: the mapping of {name}"
     is_transforms = name in TRANSFORM_TYPES

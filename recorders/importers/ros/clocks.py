@@ -70,7 +70,7 @@ def _span(spans: Iterable[tuple[int, int]]) -> tuple[int, int]:
 
 
 def _date(stamp_ns: int) -> str:
-    """A stamp as a date, or in seconds where it is none of this century, as of a simulation."""
+    """Write a stamp as a date, or in seconds where it is none of this century, as of a simulation."""
     if stamp_ns < 946_684_800_000_000_000:
         return f"{stamp_ns * 1e-9:.3f} s"
     return f"{datetime.fromtimestamp(stamp_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -120,7 +120,7 @@ class _Import:
             raise BadInput(f"{self.path}: topic {topic}: {error}") from None
 
     def _named_chains(self) -> list[Chain]:
-        """The chains of the named pairs; all transforms of the bag are read once to find them."""
+        """Return the chains of the named pairs; all transforms of the bag are read once to find them."""
         pairs = []
         for text in self._parameters.transforms:
             parent, colon, child = text.partition(":")
@@ -224,7 +224,7 @@ class _Import:
 
 
 def _frames_of(messages: Messages, frame: str) -> Frames:
-    """The frames that messages (n,) name, the field `frame` and their child's."""
+    """Return the frames that messages (n,) name, the field `frame` and their child's."""
     stated = {
         name: messages.text(path)
         for name, path in (("frame_id", frame), ("child_frame_id", CHILD_FRAME))

@@ -36,7 +36,7 @@ class Undecodable(ValueError):
 
 
 def definitions_of(name: str, stated: MessageDefinition, distribution: str) -> Definitions:
-    """The type `name` and those within it, as the bag states them, else as a distribution of ROS does.
+    """Return the type `name` and those within it, as the bag states them, else a distribution of ROS.
 
     Raises Undecodable where neither has the type.
     """
@@ -105,7 +105,7 @@ class Messages:
         return len(self.rows)
 
     def numbers(self, path: str) -> NDArray:
-        """A field (n,), or (n, count) where it is an array; raises KeyError where there is none."""
+        """Read a field (n,), or (n, count) of an array; raises KeyError where there is none."""
         offset, dtype, count = self.layout.numbers[path]
         part = self.raw[:, offset : offset + dtype.itemsize * (1 if count is None else count)]
         if count == 0:
@@ -124,7 +124,16 @@ class Messages:
 def by_size(
     data: NDArray[np.uint8], begins: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """The bytes (k, size) of the messages (n,) within `data`, by size, and which of the n each is."""
+    """Yield the bytes of messages, those of one size together.
+
+    Args:
+        data: holds all of them.
+        begins: (n,), at which byte of `data` each message begins.
+        lengths: (n,), how many bytes each has.
+
+    Yields:
+        Which k of the n messages have a size (k,), and their bytes (k, size).
+    """
     for size in np.unique(lengths).tolist():
         which = np.flatnonzero(lengths == size)
         if size:
@@ -145,11 +154,11 @@ class MessageType:
         self._layouts: dict[int, list[Layout]] = {}
 
     def fields(self) -> dict[str, str]:
-        """The paths of all fields with one number each, or a fixed array of them, and their types."""
+        """Return the paths of all fields with one number each, or a fixed array, and their types."""
         return dict(self._flat("", (Nodetype.NAME, self.name)))
 
     def read(self, raw: NDArray[np.uint8], rows: NDArray[np.int64]) -> Iterator[Messages | Undecodable]:
-        """Messages of one size (n, size) and their rows (n,), by layout; an error for each without."""
+        """Yield messages of one size (n, size) and their rows (n,), by layout; an error for others."""
         while len(rows):
             try:
                 layout, same = self._next(raw)
@@ -164,7 +173,7 @@ class MessageType:
             raw, rows = raw[~same], rows[~same]
 
     def _next(self, raw: NDArray[np.uint8]) -> tuple[Layout, NDArray[np.bool_]]:
-        """The layout of the first of the messages (n, size), and which of all (n,) have it."""
+        """Find the layout of the first of the messages (n, size), and which of all (n,) have it."""
         known = self._layouts.setdefault(raw.shape[1], [])
         for layout in known:
             if layout.fits(raw[:1])[0]:
@@ -242,7 +251,7 @@ class _Walk:
             self._step(dtype.itemsize * (1 if count is None else count))
 
     def _length(self) -> int:
-        """The length of a text or a sequence, which is a part of the layout."""
+        """Read the length of a text or a sequence, which is a part of the layout."""
         self._align(4)
         place = self._position
         self._step(4)

@@ -73,7 +73,7 @@ class Taken(NamedTuple):
 
 
 def stamps_ns(messages: Messages, path: str = STAMP) -> NDArray[np.int64] | None:
-    """The stamps (n,) in ns of a field, a time or a whole number of ns; None where there is none."""
+    """Read stamps (n,) in ns of a field, a time or a whole number of ns; None where there is none."""
     numbers = messages.layout.numbers
     if path in numbers:
         return messages.numbers(path).astype(np.int64)
@@ -169,7 +169,7 @@ def _magnetic(messages: Messages) -> Iterator[Part]:
 
 
 def _odometry(messages: Messages) -> Iterator[Part]:
-    """The twist, as a body's in the plane and in full, and the pose that the robot made of it."""
+    """Yield the twist, as a body's in the plane and in full, and the pose that the robot made of it."""
     velocity, turn = vector(messages, "twist.twist.linear"), vector(messages, "twist.twist.angular")
     beside = np.abs(np.concatenate([velocity[:, 1:], turn[:, :2]], axis=1)).max(axis=1)
     spread = covariance(messages, "twist.covariance")
@@ -221,7 +221,7 @@ TRUTH: Mapping[str, str] = {
 
 
 def as_truth(part: Part) -> Part:
-    """Poses as the reference states that estimates are compared with, in the plane and in space."""
+    """Take poses as the reference that estimates are compared with, in the plane and in space."""
     orientation = part.columns["quaternion"]
     state = np.column_stack([part.columns["position_m"], heading(orientation), orientation])
     metadata = {"components": ",".join(TRUTH), "kinds": ",".join(TRUTH.values())}
@@ -250,7 +250,7 @@ def _orientation(messages: Messages) -> Iterator[Part]:
 
 
 def _range(messages: Messages) -> Iterator[Part]:
-    """Ranges as REP 117 has them: beyond the limits there is none."""
+    """Take ranges as REP 117 has them: beyond the limits there is none."""
     distance = messages.numbers("range").astype(float)
     least, most = messages.numbers("min_range"), messages.numbers("max_range")
     yield Part(
@@ -267,7 +267,7 @@ def _range(messages: Messages) -> Iterator[Part]:
 
 
 def _detections(names: str, unit: str) -> Taken:
-    """A scan for each message, and its detections: the centres of the boxes."""
+    """Take a scan for each message, and its detections: the centres of the boxes."""
 
     def parts(messages: Messages) -> Iterator[Part]:
         count, size = messages.layout.counts["detections"], len(messages)
@@ -300,7 +300,7 @@ def _detections(names: str, unit: str) -> Taken:
 
 
 def _measured(components: Mapping[str, str]) -> Taken:
-    """Numbers without a meaning that the type tells: fields by the components' names."""
+    """Take numbers without a meaning that the type tells: fields by the components' names."""
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * len(components))}
 
     def parts(messages: Messages) -> Iterator[Part]:

@@ -103,7 +103,7 @@ class StreamMaker:
         ]
 
     def _kept(self, sent: Sent, part: Part) -> NDArray[np.bool_]:
-        """Which (k,) of a part are kept; the others are counted by reason."""
+        """Return which (k,) of a part are kept; the others are counted by reason."""
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
@@ -119,7 +119,7 @@ class StreamMaker:
         return keep
 
     def _name(self, topic: str, kind: str, frame: Mapping[str, str]) -> str:
-        """The stream of a topic, a kind and its frames; a second frame of the topic has its own."""
+        """Name the stream of a topic, kind and frames; a second frame of the topic has its own."""
         key = (topic, kind, *frame.values())
         if key not in self._streams:
             name = self._names[topic, kind]
@@ -128,7 +128,7 @@ class StreamMaker:
         return self._streams[key]
 
     def _plane_of(self, topic: str, part: Part, metadata: Mapping[str, str]) -> dict[str, str]:
-        """The origin that a stream states: not one of transforms, nor of what an odometry adds up to."""
+        """Return the origin a stream states: none of transforms, nor of what an odometry adds up to."""
         is_own = part.kind == "odometry_pose" or (topic, part.kind) not in self._names
         if self._origin is None or is_own or not is_planar(part.schema.full_name, metadata):
             return {}
@@ -189,7 +189,7 @@ class StreamMaker:
             self.noise[f"{topic}: {name}"] = statement
 
     def _stream(self, topic: str, written: _Written) -> Stream:
-        """What waits for a stream, in the order in which the bag has it."""
+        """Return what waits for a stream, in the order in which the bag has it."""
         parts = written.pieces
         log_time_ns = np.concatenate([part.log_time_ns for part in parts])
         rows = np.concatenate([part.rows for part in parts])
@@ -224,5 +224,5 @@ class StreamMaker:
 
 
 def in_words(values: NDArray) -> str:
-    """Numbers (n,) with commas between them."""
+    """Write numbers (n,) with commas between them."""
     return ",".join(f"{value:.9g}" for value in values.tolist())

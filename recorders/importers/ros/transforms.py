@@ -51,7 +51,11 @@ class Transforms:
 def transforms_of(
     messages: Messages, log_time_ns: NDArray[np.int64]
 ) -> Iterator[tuple[Pair, Transforms]]:
-    """Yield the transforms in messages (n,), by parent and child.
+    """Yield the transforms in messages, by parent and child.
+
+    Args:
+        messages: n of them.
+        log_time_ns: (n,), the stamps of the recorder.
 
     Raises BadInput where a quaternion is not of unit length.
     """
@@ -79,7 +83,7 @@ def _frame(name: bytes) -> str:
 
 
 def join(parts: Sequence[Transforms]) -> Transforms:
-    """Parts in the order of their stamps."""
+    """Join parts in the order of their stamps."""
     joined = Transforms(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.log_time_ns for part in parts]),
@@ -153,7 +157,7 @@ class Chain:
         return self._product({}, Transforms(zero, zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
 
     def _product(self, moving: Mapping[Pair, Transforms], wanted: Transforms) -> Transforms:
-        """The chain's transforms one after another, at the wanted stamps."""
+        """Compose the chain's transforms one after another, at the wanted stamps."""
         position = np.zeros((len(wanted), 3))
         orientation = np.tile([1.0, 0.0, 0.0, 0.0], (len(wanted), 1))
         for link, is_forward in self._links:
@@ -169,7 +173,15 @@ class Chain:
 
 
 def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
-    """Transforms at other stamps (n,), which lie within those of the given ones."""
+    """Interpolate transforms at other stamps, linearly and along the shortest rotation.
+
+    Args:
+        given: transforms in the order of their stamps.
+        stamp_ns: (n,), within those of the given ones.
+
+    Returns:
+        n transforms; their other stamps and their rows have no meaning.
+    """
     last = len(given) - 1
     after = np.clip(np.searchsorted(given.stamp_ns, stamp_ns), 0, last)
     before = np.maximum(after - (given.stamp_ns[after] > stamp_ns), 0)
@@ -187,7 +199,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
 
 def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
-    """The links from one frame to the other, and whether each is gone along or against its direction."""
+    """Find the links from one frame to the other, and whether each is taken in its direction."""
     above = {child: parent for parent, child in links}
     parent, child = pair
     for frame in pair:
@@ -209,7 +221,7 @@ def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
 
 
 def _ancestors(frame: str, above: Mapping[str, str]) -> list[str]:
-    """The frame, its parent, and so on to the root."""
+    """List the frame, its parent, and so on to the root."""
     found = [frame]
     while (parent := above.get(found[-1])) is not None and parent not in found:
         found.append(parent)

@@ -9,7 +9,7 @@ COMMENTS = (b"%", b"#")
 
 
 def blocks_of(file: BinaryIO) -> Iterator[bytes]:
-    """Whole lines, as many as a block takes; raises ValueError where a line is longer than that.
+    """Yield whole lines, as many as a block takes; raises ValueError where a line is longer.
 
     Of the last line, which may have no end, there is no block by itself.
     """
@@ -59,7 +59,7 @@ class Utf8(io.RawIOBase):
 
 
 def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Lines whose cells stand between white space, as such with commas; comments are passed over."""
+    """Yield lines whose cells stand between white space, with commas; comments are passed over."""
     for block in blocks:
         yield b"".join(
             b",".join(line.split()) + b"\n"

@@ -145,7 +145,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
 
 
 def _target(table: GuessedTable) -> Iterator[str]:
-    """Ranges and bearings; one alone only with a target's number, since its name says too little."""
+    """Write ranges and bearings; one alone needs a target's number, as its name says too little."""
     columns = table.columns
     whole = list(columns)
     number = take(columns, _TARGET)
@@ -221,7 +221,7 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
 
 
 def _pose(table: GuessedTable) -> Iterator[str]:
-    """Positions with and without orientation, and orientations alone."""
+    """Write positions with and without orientation, and orientations alone."""
     columns = table.columns
     place, factors = _position(columns)
     turn = _quaternion(columns)
@@ -261,7 +261,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
 
 
 def _position(columns: list[GuessedColumn]) -> tuple[list[GuessedColumn], list[int]]:
-    """The columns of a position, and what they are multiplied by to be of east, north and up."""
+    """Find the columns of a position, and what they are multiplied by to be of east, north and up."""
     for up, sign in (("up", 1), ("down", -1)):
         if found := take(columns, _EAST, _NORTH, f"(z_)?{up}|{up[0]}"):
             return found, [1, 1, sign]
@@ -274,7 +274,7 @@ def _position(columns: list[GuessedColumn]) -> tuple[list[GuessedColumn], list[i
 
 
 def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
-    """The columns w, x, y, z of a quaternion, or those of its parts 0 to 3, if its length is one."""
+    """Find the columns w, x, y, z of a quaternion, or of its parts 0 to 3, if its length is one."""
     whole = list(columns)
     found = next(
         filter(
@@ -290,7 +290,7 @@ def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
 
 
 def _length(place: list[GuessedColumn]) -> str:
-    """The unit that a position's names state, else m."""
+    """Return the unit that a position's names state, else m."""
     return stated_unit(place[0], "m") or "m" if place else "m"
 
 
@@ -300,7 +300,7 @@ def _truth(
     turn: list[GuessedColumn],
     heading: list[GuessedColumn],
 ) -> list[str]:
-    """The lines of a TruthState of these columns."""
+    """Write the lines of a TruthState of these columns."""
     names = [f"{axis}_m" for axis, _ in zip("xyz", place, strict=False)]
     names += [f"orientation_{part}" for part, _ in zip("wxyz", turn, strict=False)]
     kinds = ["linear"] * len(place) + ["quaternion"] * len(turn)
@@ -331,7 +331,7 @@ def _truth(
 
 
 def _heading(table: GuessedTable) -> Iterator[str]:
-    """Headings beside fixes; a course over ground alone is none, it has no direction at rest."""
+    """Write headings beside fixes; a course alone is none, as it has no direction at rest."""
     if not table.places or not (found := take(table.columns, _HEADING_ALONE)):
         return
     direction = direction_of(found[0], table.places)

@@ -35,7 +35,7 @@ class GuessedTable(NamedTuple):
 
 
 def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
-    """The columns whose names fit the patterns, one each, taken out of the list; none unless all do."""
+    """Take the columns whose names fit the patterns, one each, out of the list; none unless all do."""
     found = []
     for pattern in patterns:
         match = next((each for each in columns if re.fullmatch(pattern, each.plain)), None)
@@ -116,7 +116,7 @@ _WRITTEN = {
 
 
 def parted(name: str) -> tuple[str, str]:
-    """A name without its unit, in lower case with underlines; and the unit, from brackets or its end.
+    """Split a name, in lower case with underlines, from its unit, in brackets or at its end.
 
     >>> parted("Höhe [ft]"), parted("speed_kmh")
     (('altitude', 'ft'), ('speed', 'km/h'))
@@ -153,7 +153,7 @@ class Direction(NamedTuple):
 
 
 def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Direction:
-    """A heading's unit and convention, by the course of places east and north, else by its numbers.
+    """Find a heading's unit and convention, by the course of places, else by its numbers.
 
     A heading may be unwrapped, so that its largest value says little.
     """
@@ -178,7 +178,7 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
 
 
 def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
-    """The standard deviation of a heading's white noise by its second differences, at least .5 deg."""
+    """Estimate the sigma of a heading's white noise by second differences, at least .5 deg."""
     angle = unit(in_unit).size * heading.values[np.isfinite(heading.values)]
     bend = np.angle(np.exp(1j * np.diff(angle, n=2)))
     sigma = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0) if len(bend) else 0.0
@@ -186,7 +186,7 @@ def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
 
 
 def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray] | None:
-    """Rows from which places move, in which direction (rad) and how far; None where they do not."""
+    """Find rows from which places move, in which direction (rad) and how far; None where none do."""
     east, north = (each.values for each in places[:2])
     rows = np.flatnonzero(np.isfinite(east) & np.isfinite(north))
     if len(rows) < 3:

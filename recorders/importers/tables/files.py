@@ -60,7 +60,7 @@ class Table:
         _check_width(self.path, len(self.columns))
 
     def column(self, name: str) -> str:
-        """A column by its name, or by its number from 1 on; raises BadInput where there is none."""
+        """Find a column by its name, or its number from 1 on; raises BadInput where there is none."""
         if name in self.columns:
             return name
         if name.isdecimal() and 0 < int(name) <= len(self.columns):
@@ -122,7 +122,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _reason(error: Exception, table: Table) -> str:
-    """What Arrow says of a cell, with the column's name and the mend."""
+    """Say what Arrow says of a cell, with the column's name and the mend."""
     found = re.search(r"In CSV column #(\d+):.*invalid value '(.*)'", str(error))
     if not found:
         return f"is damaged ({_first_line(error)})"
@@ -190,12 +190,12 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _is_value(cell: str) -> bool:
-    """Whether a cell is a number or a time, as no name of a column is."""
+    """Tell whether a cell is a number or a time, as no name of a column is."""
     return bool(re.match(r"[-+]?\.?\d", cell))
 
 
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
-    """Names of columns; such as are empty, come again or are lacking are numbers from 1 on."""
+    """Name columns; such as are empty, come again or are lacking are numbers from 1 on."""
     if len(names) > width:
         raise BadInput(
             f"{path}: `columns` names {len(names)} columns, and the rows have {width}; name each once"
@@ -246,7 +246,7 @@ def _text_batches(
 
 
 def _open_rtklib(path: Path) -> Table:
-    """A solution of RTKLIB: its header names two columns, date and time, by one word."""
+    """Open a solution of RTKLIB: its header names two columns, date and time, by one word."""
     named: list[str] = []
     with open_decompressed(path) as file:
         for line in lines_of(file):
@@ -316,7 +316,7 @@ def _open_npz(path: Path) -> Table:
 
 
 def _open_trajectory(path: Path) -> Table:
-    """TUM, KITTI or EuRoC: time_ns (not of KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
+    """Open TUM, KITTI or EuRoC: time_ns (not of KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
     found = read_trajectory(path)
     columns = dict(zip("xyz", found.position_m.T, strict=True))
     if found.rotation is not None:
@@ -335,7 +335,7 @@ def _by_name(batch: pa.RecordBatch) -> Batch:
 
 
 def _flat_batches(table: pa.Table) -> Iterator[Batch]:
-    """What a table has, with structures and lists taken apart: NAME.PART, NAME.0, NAME.1, ..."""
+    """Take structures and lists of a table apart: NAME.PART, NAME.0, NAME.1, ..."""
     while any(pa.types.is_struct(kind) for kind in table.schema.types):
         table = table.flatten()
     for batch in table.combine_chunks().to_batches():

@@ -81,7 +81,7 @@ def guess(paths: Sequence[Path]) -> str:
 
 
 def _warnings(text: str) -> Iterator[str]:
-    """What a person must still say of streams that belong together: their vehicle and their origin."""
+    """Say what a person must still say of streams that belong together: vehicle and origin."""
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
         yield f"# The topics lie in {len(namespaces)} namespaces, {', '.join(namespaces)}."
@@ -98,7 +98,7 @@ def _warnings(text: str) -> Iterator[str]:
 
 
 def _table(path: Path, name: str, *, is_alone: bool) -> str:
-    """One [[tables]] of a mapping, with its streams."""
+    """Write one [[tables]] of a mapping, with its streams."""
     table, batch, decimal = _first_rows(path)
     columns, texts = [], []
     for column in table.columns:
@@ -131,7 +131,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
 
 
 def _first_rows(path: Path) -> tuple[Table, Batch, str]:
-    """A table, its first rows as texts, and the mark before fractions: by the cells, if they are so."""
+    """Open a table; return it, its first rows as texts, and the mark before fractions."""
     decimal = "."
     table, batch = _opened(path, decimal)
     if any(_has_commas(cells) for cells in batch.values()):
@@ -149,7 +149,7 @@ def _opened(path: Path, decimal: str) -> tuple[Table, Batch]:
 
 
 def _has_commas(cells: pa.Array) -> bool:
-    """Whether all cells are numbers, and some have a fraction after a comma."""
+    """Tell whether all cells are numbers, and some have a fraction after a comma."""
     if not pa.types.is_string(cells.type):
         return False
     known = pc.utf8_trim_whitespace(cells).drop_null()
@@ -160,7 +160,7 @@ def _has_commas(cells: pa.Array) -> bool:
 
 
 def _numbers(cells: pa.Array) -> NDArray | None:
-    """A column's numbers, NaN for empty cells; None where it holds something else, or nothing."""
+    """Read a column's numbers, NaN for empty cells; None where it holds something else, or nothing."""
     if pa.types.is_string(cells.type):
         cells = pc.utf8_trim_whitespace(cells)
     try:
@@ -176,7 +176,7 @@ def _numbers(cells: pa.Array) -> NDArray | None:
 def _time(
     path: Path, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
 ) -> tuple[str, set[str], list[str]]:
-    """The time as TOML, the columns that it is of, and what was seen.
+    """Write the time as TOML; return also the columns that it is of, and what was seen.
 
     Raises BadInput where a column of texts holds times that cannot be read: no rate stands for them.
     """
@@ -228,7 +228,7 @@ def _first_cell(cells: pa.Array) -> str:
 
 
 def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]] | None:
-    """The time as TOML of columns of texts, these, and what was seen; None where they hold none."""
+    """Write the time of columns of texts as TOML, as `_time` does; None where they hold none."""
     cell = " ".join(_first_cell(batch[name]) for name in names)
     is_of_day = re.match(r"\d{1,2}:\d{2}", cell) is not None
     given: dict[str, Any] = {"column": list(names), "unit": "date"}
@@ -256,7 +256,7 @@ def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]
 
 
 def _zone(names: Sequence[str]) -> str:
-    """The zone that a column's name states in brackets."""
+    """Return the zone that a column's name states in brackets."""
     for text in re.findall(r"[\[(]\s*([^\])]+?)\s*[\])]", " ".join(names)):
         try:
             offset_of(text)
@@ -267,7 +267,7 @@ def _zone(names: Sequence[str]) -> str:
 
 
 def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
-    """The rate, gaps and repetitions of stamps; none where they cannot be read."""
+    """Say the rate, gaps and repetitions of stamps; nothing where they cannot be read."""
     try:
         stamps = stamps_ns(mapping, batch, 0, len(next(iter(batch.values()))), "")
     except BadInput:
@@ -296,7 +296,7 @@ def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
 
 
 def _rest(table: GuessedTable) -> list[str]:
-    """The columns that fit no message."""
+    """Say which columns fit no message."""
     if not table.columns:
         return []
     plain = [

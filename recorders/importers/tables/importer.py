@@ -126,7 +126,7 @@ def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:
 
 
 def _constant(own: ConstantStream, time_ns: int) -> Stream:
-    """The messages that stand in a mapping."""
+    """Make the messages that stand in a mapping."""
 
     def read_none(source: str, *_: object) -> NDArray:
         raise BadInput(
@@ -141,7 +141,7 @@ def _constant(own: ConstantStream, time_ns: int) -> Stream:
 
 
 def _notes(sources: list[Rows], plane: Plane | None, mapping: LogMapping) -> dict[str, str]:
-    """The clock, the plane, and what was read of each file."""
+    """Note the clock, the plane, and what was read of each file."""
     spans = [source.span_ns for source in sources if source.span_ns is not None]
     ends = min(low for low, _ in spans), max(high for _, high in spans)
     notes = {"clock": " to ".join(str(pd.Timestamp(stamp)) for stamp in ends)}

@@ -211,7 +211,7 @@ def shipped() -> list[str]:
 
 
 def read_mapping(name: str) -> LogMapping:
-    """A mapping by its name or file; raises BadInput where there is none, or what it names is none."""
+    """Read a mapping by name or file; raises BadInput where there is none, or it names none."""
     path = Path(name)
     if not name.endswith(".toml"):
         known = shipped()
@@ -266,7 +266,7 @@ def adapted(
 
 
 def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
-    """The folders at a place and below that have all files of a mapping; raises BadInput for none."""
+    """Find the folders at a place that have all files of a mapping; raises BadInput for none."""
     below = [each for each in place.rglob("*") if each.is_dir()] if place.is_dir() else []
     folders = []
     for folder in sorted([place, *below], key=lambda each: (len(each.name), each)):
@@ -290,7 +290,7 @@ class FileMatch(NamedTuple):
 
 
 def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch], list[Path]]:
-    """The files of a mapping among files and folders, and those of the folders that are none of them.
+    """Find the files of a mapping among files and folders, and those of the folders that are not.
 
     A file of a folder is that of the first table whose pattern it fits; what this import or another one
     is writing there is no file yet. Raises BadInput where a table
@@ -324,7 +324,7 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch],
 
 
 def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:
-    """The tables that a file is one of; the only file of the only table may have any name."""
+    """Yield the tables that a file is one of; the only file of the only table may have any name."""
     for table in mapping.tables:
         pattern = (
             table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]

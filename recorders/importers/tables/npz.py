@@ -106,7 +106,7 @@ def _source(column: _Column) -> _Column | _Array:
 
 
 def _block(source: _Column | _Array, file: IO[bytes], count: int) -> NDArray:
-    """The next rows (count, width) of an array, or of one of its columns."""
+    """Read the next rows (count, width) of an array, or of one of its columns."""
     array, width = (source.array, 1) if isinstance(source, _Column) else (source, source.width)
     content = file.read(count * width * array.kind.itemsize)
     if len(content) < count * width * array.kind.itemsize:
@@ -116,7 +116,7 @@ def _block(source: _Column | _Array, file: IO[bytes], count: int) -> NDArray:
 
 
 def _described(archive: zipfile.ZipFile, member: str) -> _Array:
-    """What an array says of itself."""
+    """Read what an array says of itself."""
     with archive.open(member) as file:
         version = npy.read_magic(file)
         if version not in _HEADERS:

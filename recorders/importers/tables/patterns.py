@@ -42,7 +42,7 @@ def fitted(pattern: str, name: str) -> dict[str, str] | None:
 
 
 def _before(part: str, *, is_wild: bool, name: str, after: int) -> int:
-    """Where a part may begin, of which there is an end in `after`."""
+    """Find where a part may begin, of which there is an end in `after`."""
     if not is_wild:
         return sum(1 << place for place in _places(part, name) if after >> (place + len(part)) & 1)
     # bit k: character k is no slash

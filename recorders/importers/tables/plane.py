@@ -34,7 +34,7 @@ class Plane(NamedTuple):
     def place(
         self, latitude_deg: Floats, longitude_deg: Floats, altitude_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """East, north and up (n,) in m of places on WGS 84.
+        """Compute east, north and up (n,) in m of places on WGS 84.
 
         Raises BadInput where pyproj is needed and not installed, or knows no such projection.
         """

@@ -67,11 +67,11 @@ class Rows:
 
     @property
     def tag_name(self) -> str:
-        """The name of the time tag that tells when the file was begun; empty where there is none."""
+        """Return the name of the time tag that tells when the file was begun; else an empty one."""
         return self.path.name + self._time.tag if self._time.tag else ""
 
     def _clock(self, given: TimeMapping) -> TimeMapping:
-        """The time mapping with columns as the file names them; a counter is read here."""
+        """Return the time mapping with columns as the file names them; a counter is read here."""
         columns = [self.table.column(name) for name in given.columns]
         week = columns.pop() if given.week else None
         own = given.model_copy(update={"column": columns, "week": week})
@@ -82,7 +82,7 @@ class Rows:
         return own
 
     def _wanted(self) -> tuple[set[str], set[str]]:
-        """The columns that are wanted as text, and as numbers."""
+        """Return the columns that are wanted as text, and as numbers."""
         own = self.mapping
         clocks = [self._time, *([] if self._arrival is None else [self._arrival])]
         texts = {name for clock in clocks for name in clock.columns}
@@ -102,7 +102,7 @@ class Rows:
         return texts, columns - texts
 
     def _is_given(self, source: str) -> bool:
-        """Whether a source is no column but a part of the file's name, such as {anchor}."""
+        """Tell whether a source is no column but a part of the file's name, such as {anchor}."""
         return source.startswith("{") and source[1:-1] in self._names
 
     def _filled(self, text: str) -> str:
@@ -111,7 +111,7 @@ class Rows:
         return text
 
     def _floats(self, batch: Batch, source: str) -> NDArray:
-        """The numbers (n,) of a source, NaN for empty cells."""
+        """Read the numbers (n,) of a source, NaN for empty cells."""
         if self._is_given(source):
             try:
                 return np.full(_size(batch), float(self._filled(source)))
@@ -202,7 +202,7 @@ class Rows:
         self.span_ns = min(low, int(stamps.min())), max(high, int(stamps.max()))
 
     def _made(self, batch: Batch, plane: Plane | None) -> dict[str, NDArray]:
-        """The columns that are made of others."""
+        """Make the columns that are made of others."""
         made: dict[str, NDArray] = {}
         if self.mapping.geodetic is not None:
             places = self._places(batch)
@@ -215,7 +215,7 @@ class Rows:
         return made
 
     def _places(self, batch: Batch) -> tuple[NDArray, NDArray, NDArray]:
-        """Latitude and longitude (deg) and altitude (m, 0 where no column has it) of the rows (n,)."""
+        """Read latitude and longitude (deg), altitude (m, 0 where no column has it) of rows (n,)."""
         own = self.mapping.geodetic
         assert own is not None
         factor = conversion(own.unit, "latitude_deg")
@@ -231,7 +231,7 @@ class Rows:
             checked(str(self.path), field, values[np.isfinite(values)])
 
     def _quaternion(self, batch: Batch, own: Attitude) -> NDArray:
-        """Orientations (n, 4), NaN where an angle is missing."""
+        """Compute orientations (n, 4), NaN where an angle is missing."""
         factor = conversion(own.unit, "angle_rad")
         names = (own.heading or own.yaw, own.pitch, own.roll)
         zero = np.zeros(_size(batch))
@@ -257,7 +257,7 @@ class Rows:
         return mapped(own, _size(batch), read, holds, f"{self.path}: {self._filled(own.topic)}")
 
     def _kept(self, own: TableStream, found: Mapped, timed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Which of the messages are taken; the others are counted by reason."""
+        """Choose which of the messages are taken; the others are counted by reason."""
         topic = self._filled(own.topic)
         lacking = not_finite(schema_of(own, topic), found.columns)
         keep = timed[found.rows] & ((self.count + found.rows) % own.every == 0)

@@ -183,7 +183,7 @@ def stamps_ns(
 
 
 def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
-    """Numbers as ns; texts are read to the last digit, where a double of today has 200 ns."""
+    """Read numbers as ns; texts are read to the last digit, where a double of today has 200 ns."""
     if pa.types.is_timestamp(cells.type):
         return cells.cast(pa.timestamp("ns")).cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
     if pa.types.is_integer(cells.type):
@@ -217,7 +217,7 @@ def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
 
 
 def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps:
-    """Dates as ns since 1970, as if their own offset were the mapping's."""
+    """Read dates as ns since 1970, as if their own offset were the mapping's."""
     if pa.types.is_timestamp(cells[0].type):
         return _counted_ns(cells[0], 0, label)
     texts = [pc.utf8_trim_whitespace(each.cast(pa.string())) for each in cells]
@@ -250,7 +250,7 @@ def _since_ns(dates: pd.Series) -> Stamps:
 
 
 def _from_zone(local_ns: Stamps, zone: float | ZoneInfo) -> Stamps:
-    """Stamps (n,) by the clocks of a zone as UTC; an hour that comes twice is taken for its first."""
+    """Change stamps (n,) by a zone's clocks to UTC; an hour that comes twice is taken for its first."""
     if not isinstance(zone, ZoneInfo):
         return local_ns - round(3600e9 * zone)
     local = pd.Series(local_ns.astype("datetime64[ns]"))

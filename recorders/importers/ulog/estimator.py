@@ -47,7 +47,7 @@ class _Sensor(NamedTuple):
 
 
 def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
-    """Of north, east, down: `fields` and `bits` are those of the horizontal and of the vertical."""
+    """Make a sensor of north, east, down: `fields` and `bits` are the horizontal's, the vertical's."""
     (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
     every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
@@ -55,7 +55,7 @@ def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -
 
 
 def _flu(name: str, unit: str, bits: tuple[int, ...], axes: str = "xyz") -> _Sensor:
-    """Of the body's forward, right, down, or the first of these."""
+    """Make a sensor of the body's forward, right, down, or the first of these."""
     fields = tuple(f"{name}[{index}]" for index in range(len(axes)))
     names = tuple(f"{name}_{axis}_{unit}" for axis in axes)
     return _Sensor(fields, names, (-1.0, 1.0, 1.0)[: len(axes)], (bits,) * len(axes))
@@ -183,7 +183,7 @@ class Autopilot:
         self._waiting[key] = self._waiting[key].then(table) if key in self._waiting else table
 
     def _joined(self, instance: int) -> Iterator[Part]:
-        """The innovations whose variances have come as well."""
+        """Join innovations with their variances, once these have come as well."""
         tables = [self._waiting.get((topic, instance)) for topic in _INNOVATIONS]
         innovations, variances, ratios = tables
         if innovations is None or variances is None:
@@ -206,7 +206,7 @@ class Autopilot:
     def _innovations(
         self, instance: int, innovations: _Table, variances: _Table, ratios: Floats | None
     ) -> Iterator[Part]:
-        """The innovations of every sensor that was fused: those that are new."""
+        """Yield the innovations of every sensor that was fused: those that are new."""
         for name, sensor in _SENSORS.items():
             columns = [_FIELDS.index(each) for each in sensor.fields]
             value, variance = innovations.values[:, columns], variances.values[:, columns]
@@ -241,7 +241,7 @@ class Autopilot:
     def _is_in_use(
         self, instance: int, sensor: _Sensor, time_us: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
-        """Whether the filter corrected itself by a sensor's components (n, m), as its status says."""
+        """Tell whether the filter's status says that it used a sensor's components (n, m)."""
         is_used = np.ones((len(time_us), len(sensor.fields)), bool)
         status = self._status.get(instance)
         if status is None:
@@ -254,7 +254,7 @@ class Autopilot:
         return is_used
 
     def _truth(self) -> Iterator[Part]:
-        """The simulator's truth: positions and velocities at the stamps of its attitudes."""
+        """Yield the simulator's truth: positions and velocities at the stamps of its attitudes."""
         attitude, local = self._waiting.get((_ATTITUDE, 0)), self._waiting.get((_LOCAL, 0))
         if attitude is None or local is None or not len(local.time_us) or not len(attitude.time_us):
             return
@@ -277,7 +277,7 @@ class Autopilot:
 
 
 def _table(fields: Fields, names: list[str] | tuple[str, ...]) -> _Table:
-    """Fields by name as numbers; NaN where there is none of the name."""
+    """Read fields by name as numbers; NaN where there is none of the name."""
     values = fields.vector(*names)
     key = "timestamp_sample" if fields.has("timestamp_sample") else "timestamp"
     key_us = fields.rows.data[key].astype(np.int64)
@@ -290,7 +290,7 @@ def _innovation(
     at: _Table,
     found: tuple[Floats, Floats, NDArray[np.bool_]],
 ) -> Part:
-    """Innovations (n, m) with their variances (n, m), and whether they were accepted (n,)."""
+    """Make innovations (n, m) with their variances (n, m), and whether they were accepted (n,)."""
     innovation, variance, accepted = found
     size, width = innovation.shape
     is_known = np.isfinite(innovation)
@@ -314,13 +314,13 @@ def _innovation(
 
 
 def _unit(quaternions: Floats) -> Floats:
-    """Quaternions (n, 4) at unit length; NaN where they are far from it."""
+    """Scale quaternions (n, 4) to unit length; NaN where they are far from it."""
     length = np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.where(np.abs(length - 1.0) < _UNIT_TOLERANCE, quaternions, np.nan) / length
 
 
 def _state(fields: Fields) -> Part:
-    """Position, velocity and orientation of the filter, by its states and their variances.
+    """Make the filter's position, velocity and orientation of its states and their variances.
 
     The biases are left out: of old firmware they are increments over a step of the filter.
     """
@@ -349,7 +349,7 @@ def _state(fields: Fields) -> Part:
 
 
 def _tilts(quaternion: Floats, logged: Floats, variances: Floats) -> Floats:
-    """The covariances (n, 3, 3) of rotations about the body's forward, left and up axes.
+    """Compute the covariances (n, 3, 3) of rotations about the body's forward, left and up axes.
 
     Args:
         quaternion: (n, 4) from that body to east, north, up.

@@ -165,7 +165,7 @@ class UlogFile:
     def _section(
         self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
     ) -> Iterator[list[Rows]]:
-        """The rows between two bytes of the file; the message that the end cuts is none."""
+        """Yield the rows between two bytes of the file; the message that the end cuts is none."""
         piece = min(_PIECE_BYTES, end - begin)
         held = bytearray(piece + BEYOND_BYTES)
         data, free = np.frombuffer(held, np.uint8), memoryview(held)[:piece]
@@ -202,14 +202,14 @@ class UlogFile:
     def _resumption(
         self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
     ) -> int:
-        """Where messages begin again: at a mark, which old firmware lacks, or at rows; or -1."""
+        """Find where messages begin again: at a mark, which old firmware lacks, or at rows; or -1."""
         found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
         return min((each for each in found if each >= 0), default=-1)
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
-        """Where the last message of a piece at `place` ends, whether one broke there, and the rows."""
+        """Return where the last message of a piece at `place` ends, if one broke there, and the rows."""
         found = walk(data, size)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:
@@ -259,7 +259,7 @@ class UlogFile:
     def _times(
         self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """The stamps (n,) of rows, of those without one between their neighbours' in the file."""
+        """Compute stamps (n,) of rows, of those without one between their neighbours' in the file."""
         last_us = self._last_us
         # Of a topic that stands still the stamp may be of long before.
         recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
@@ -314,14 +314,14 @@ class UlogFile:
 
 
 def _message(data: NDArray[np.uint8], position: int) -> tuple[str, bytes]:
-    """Type and content of a message."""
+    """Split a message into type and content."""
     size = int(data[position]) + (int(data[position + 1]) << 8)
     begin = position + HEAD_BYTES
     return chr(data[position + 2]), data[begin : begin + size].tobytes()
 
 
 def _gathered(data: NDArray[np.uint8], begins: NDArray[np.int64], dtype: np.dtype) -> NDArray:
-    """The rows (n,) of a layout that begin at these bytes."""
+    """Gather the rows (n,) of a layout that begin at these bytes."""
     count = len(data) - dtype.itemsize + 1
     # As bytes, which NumPy copies several times faster than fields.
     every = np.ndarray((count,), f"V{dtype.itemsize}", data.data, strides=(1,))
@@ -333,7 +333,7 @@ def _text(body: bytes) -> str:
 
 
 def _keyed(body: bytes) -> tuple[str, bytes]:
-    """Type and name of a value, with a blank between them, and its bytes; raises Damaged."""
+    """Read type and name of a value, with a blank between them, and its bytes; raises Damaged."""
     if not body or len(body) < 1 + body[0]:
         raise Damaged("value without a name")
     return _text(body[1 : 1 + body[0]]), body[1 + body[0] :]
@@ -350,7 +350,7 @@ def _parameter(body: bytes) -> tuple[str, float]:
 
 
 def _number(kind: str, value: bytes) -> float | None:
-    """A number of one of ULog's types; None where there is none."""
+    """Read a number of one of ULog's types; None where there is none."""
     dtype = np.dtype(TYPES[kind]) if kind in TYPES else None
     if dtype is None or len(value) != dtype.itemsize:
         return None

@@ -58,7 +58,7 @@ def _field(of: str, text: str) -> FormatField:
 
 
 def layout_of(name: str, formats: Mapping[str, list[FormatField]]) -> Layout:
-    """The layout of a topic; raises Damaged where its format is unknown, too long or within itself."""
+    """Return a topic's layout; raises Damaged where its format is unknown, too long or within itself."""
     entries: list[tuple[str, str]] = []
     size = 0
     for entry, kind in _flat(name, formats, ()):
@@ -81,7 +81,7 @@ def layout_of(name: str, formats: Mapping[str, list[FormatField]]) -> Layout:
 def _flat(
     name: str, formats: Mapping[str, list[FormatField]], within: tuple[str, ...], prefix: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Every number of a format, by name, and its type."""
+    """Yield every number of a format, by name, and its type."""
     if name in within:
         raise Damaged(f"format {name} refers to itself")
     if name not in formats:

@@ -13,15 +13,15 @@ _FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def to_enu(vectors: Floats) -> Floats:
-    """Vectors (n, 3) of north, east, down as east, north, up."""
+    """Turn vectors (n, 3) of north, east, down into east, north, up."""
     return vectors[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
 
 
 def to_flu(vectors: Floats) -> Floats:
-    """Vectors (n, 3) of forward, right, down as forward, left, up."""
+    """Turn vectors (n, 3) of forward, right, down into forward, left, up."""
     return vectors * [1.0, -1.0, -1.0]
 
 
 def orientations(quaternions: Floats) -> Floats:
-    """Rotations (n, 4; w, x, y, z) from a body's FRD to NED as those from its FLU to ENU."""
+    """Turn rotations (n, 4; w, x, y, z) from a body's FRD to NED into those from its FLU to ENU."""
     return compose(compose(np.broadcast_to(_TO_ENU, quaternions.shape), quaternions), _FROM_FLU)

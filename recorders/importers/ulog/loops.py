@@ -59,13 +59,29 @@ class Sorted(NamedTuple):
 
 
 def walk(data: NDArray[np.uint8], size: int) -> Walk:
-    """Walk the first `size` bytes of `data`, which has BEYOND_BYTES more."""
+    """Find where the messages of a piece of a file begin.
+
+    Args:
+        data: the piece, and at least `BEYOND_BYTES` more.
+        size: how many bytes the piece has.
+    """
     found, others, end, is_broken = loop_for(_walk, size)(words_of(data), size)
     return Walk(found, others, int(end), bool(is_broken))
 
 
 def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
-    """Where after bytes that are no messages rows begin again: several, of lengths that fit; or -1."""
+    """Find where rows begin again after bytes that are no messages: several, of lengths that fit.
+
+    Args:
+        data: a piece of the file, and at least `BEYOND_BYTES` more.
+        begin: from which byte of the piece on.
+        size: how many bytes the piece has.
+        place: where the piece begins in the file.
+        known: what rows there are.
+
+    Returns:
+        The byte of the piece; -1 where there is none.
+    """
     return int(loop_for(_resume, size)(words_of(data), begin, size, place, known))
 
 
@@ -76,9 +92,15 @@ def sort(
     known: Known,
     times: tuple[int, int, int],
 ) -> Sorted:
-    """Sort the rows that begin at these bytes of a piece, which is at `place` in the file.
+    """Sort the rows of a piece of a file by their topic's number.
 
-    `times` are those between which, and not at which, a stamp is one, and the latest so far.
+    Args:
+        data: the piece, and at least `BEYOND_BYTES` more.
+        at: (n,), where the rows begin, in bytes of the piece, as `Walk.data`.
+        place: where the piece begins in the file.
+        known: what rows there are.
+        times: in us: a stamp lies between the first two, and not at them; the third is the latest so
+            far.
     """
     words = words_of(data)
     return Sorted(*loop_for(_sort, 64 * len(at))(words, words.view("<i8"), at, place, known, times))

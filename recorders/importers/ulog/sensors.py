@@ -60,13 +60,13 @@ class Fields(NamedTuple):
         return self.rows.data[name].astype(float)
 
     def vector(self, *names: str, width: int = 0) -> Floats:
-        """Fields as (n, width): those of these names, or the `width` of an array."""
+        """Return fields as (n, width): those of these names, or the `width` of an array."""
         every = [f"{names[0]}[{index}]" for index in range(width)] if width else names
         return np.stack([self.of(name) for name in every], axis=1)
 
     @property
     def measured_us(self) -> NDArray[np.int64]:
-        """When the rows were measured: by the sample's stamp where there is one, else by the row's."""
+        """Return when rows were measured: by the sample's stamp if there is one, else by the row's."""
         if not self.has("timestamp_sample"):
             return self.rows.time_us
         sample = self.rows.data["timestamp_sample"].astype(np.int64)
@@ -82,7 +82,7 @@ class Fields(NamedTuple):
         )
 
     def values(self, topic: str, components: Mapping[str, str]) -> Part:
-        """Fields as they are, under names that say their units."""
+        """Return fields as they are, under names that say their units."""
         there = {name: of for name, of in components.items() if self.has(of)}
         metadata = {"components": ",".join(there), "kinds": ",".join(["linear"] * len(there))}
         value = self.vector(*there.values())
@@ -120,7 +120,7 @@ def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
 
 
 def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
-    """The messages of a sensor whose time is stated relative to the row's, each of them once."""
+    """Return a sensor's messages whose time is stated relative to the row's, each of them once."""
     relative_us = fields.rows.data[f"{sensor}_timestamp_relative"].astype(np.int64)
     is_valid = relative_us != _INVALID_US
     time_us = part.time_us + np.where(is_valid, relative_us, 0)
@@ -223,7 +223,7 @@ def airspeed(fields: Fields) -> Iterator[Part]:
 
 
 def flow(fields: Fields) -> Iterator[Part]:
-    """The angle by which a camera saw the ground move, about the body's x and y, and over how long."""
+    """Yield by what angle about the body's x and y, and in what time, a camera saw the ground move."""
     old = fields.has("pixel_flow_x_integral")
     x, y = (
         ("pixel_flow_x_integral", "pixel_flow_y_integral") if old else ("pixel_flow[0]", "pixel_flow[1]")

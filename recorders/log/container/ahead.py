@@ -18,7 +18,7 @@ THREADS = min(4, os.cpu_count() or 1)
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Like `map`, in the same order, but a few items ahead; no more, so that memory stays bounded."""
+    """Map in the same order, but a few items ahead; no more, so that memory stays bounded."""
     rest = iter(items)
     yield from map(work, islice(rest, 1))  # a log of one chunk needs no threads
     with ThreadPoolExecutor(THREADS) as pool:

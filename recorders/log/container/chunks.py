@@ -91,7 +91,7 @@ class Contents(NamedTuple):
 
 
 def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[bytes, bytes]:
-    """The Chunk record that holds `data`: all that stands before the compressed bytes, and these."""
+    """Return the Chunk record of `data`: all that stands before the compressed bytes, and these."""
     packed = _COMPRESS[compression](data)
     name = b"" if compression == "none" else compression.encode()
     head = _CHUNK_HEAD.pack(*log_time, len(data), zlib.crc32(data), len(name))
@@ -128,7 +128,7 @@ def open_region(raw: bytes, offset: int) -> Contents:
 
 
 def _uncompressed(chunk: bytes) -> bytes | memoryview:
-    """The records inside a Chunk record."""
+    """Uncompress the records inside a Chunk record."""
     _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(chunk, HEAD_BYTES)
     place = HEAD_BYTES + _CHUNK_HEAD.size
     compression = str(chunk[place : place + name_length], "utf-8")
@@ -159,7 +159,7 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
 
 
 def _stated_size(region: bytes) -> int:
-    """How many bytes a region has when it is open, as it says itself."""
+    """Return how many bytes a region has when it is open, as it says itself."""
     if region[0] != Opcode.CHUNK:
         return len(region)
     return int(_CHUNK_HEAD.unpack_from(region, HEAD_BYTES)[2])

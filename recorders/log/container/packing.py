@@ -22,10 +22,12 @@ class Chunk(NamedTuple):
 
 
 def chunks_of(parts: Sequence[NDArray[np.void]], chunk_bytes: int) -> Iterator[Chunk]:
-    """Merge the message records of several channels into chunks of about `chunk_bytes`.
+    """Merge the message records of several channels into chunks.
 
-    Each part holds one channel's records as of `Layout.build`, in log-time order; ties keep the order
-    given.
+    Args:
+        parts: one channel's records each, as of `Layout.build`, in log-time order; ties keep the order
+            given.
+        chunk_bytes: about how large a chunk is.
     """
     lengths = [len(part) for part in parts]
     log_times = np.concatenate([part["mcap log_time"] for part in parts])
@@ -62,7 +64,7 @@ def chunks_of(parts: Sequence[NDArray[np.void]], chunk_bytes: int) -> Iterator[C
 def _merged(
     parts: Sequence[NDArray[np.void]], offsets: Sequence[NDArray[np.int64]]
 ) -> NDArray[np.uint8]:
-    """The parts' bytes, every record at its offset."""
+    """Put the parts' bytes together, every record at its offset."""
     data = np.empty(sum(part.nbytes for part in parts), np.uint8)
     for part, each in zip(parts, offsets, strict=True):
         places = windows(data, part.dtype.itemsize)
@@ -73,7 +75,7 @@ def _merged(
 def _indexes(
     parts: Sequence[NDArray[np.void]], offsets: Sequence[NDArray[np.int64]], borders: NDArray[np.int64]
 ) -> list[dict[int, bytes]]:
-    """Log time and offset inside its chunk of every message, by chunk and channel."""
+    """Write log time and offset inside its chunk of every message, by chunk and channel."""
     found: list[dict[int, bytes]] = [{} for _ in borders[1:]]
     for part, each in zip(parts, offsets, strict=True):
         cuts = np.searchsorted(each, borders)

@@ -176,7 +176,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
 
 
 def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
-    """What is left out behind the data section; nothing where nothing is, or the summary is damaged."""
+    """Say what is left out behind the data section; empty for nothing, or a damaged summary."""
     position = data_end
     while (place := _record_at(file, size, position)) is not None:
         position = place.end
@@ -195,7 +195,7 @@ def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
 
 
 def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
-    """What the summary tells of and the data section has not: `chunks`, metadata; and the reverse."""
+    """Say what the summary tells of and the data section lacks (`chunks`, metadata), and the reverse."""
     for offset in sorted(chunks):
         yield f"there is no chunk at byte {offset}, where its index states one"
     for entry in summary.records:
@@ -208,7 +208,7 @@ def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iter
 
 
 def _summary(file: BinaryIO, size: int) -> _Summary:
-    """The summary, without records where the file has none. Raises Damaged."""
+    """Read the summary, without records where the file has none. Raises Damaged."""
     file.seek(max(size - _FOOTER.size, 0))
     footer = file.read(_FOOTER.size)
     if len(footer) < _FOOTER.size:
@@ -226,7 +226,7 @@ def _summary(file: BinaryIO, size: int) -> _Summary:
 
 
 def _index(summary: Sequence[Any]) -> _Index:
-    """What a summary says; nothing where a part of it is missing, so that every chunk is opened."""
+    """Read what a summary says; if a part is missing nothing, so that every chunk is opened."""
     by_kind: dict[type, list[Any]] = {}
     for record in summary:
         by_kind.setdefault(type(record), []).append(record)
@@ -246,7 +246,7 @@ def _index(summary: Sequence[Any]) -> _Index:
 
 
 def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Place]:
-    """Every whole record up to the end of the data section, and what is lost between two of them."""
+    """Yield every whole record of the data section, and what is lost between two of them."""
     known = _stated_places(summary)
     run = position = len(MAGIC)
     kind = Opcode.SCHEMA
@@ -268,7 +268,7 @@ def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Pla
 
 
 def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place]) -> _Place | None:
-    """The record at `position`, or what is lost up to the next of the known ones; None at the end.
+    """Return the record at `position`, or what is lost until the next known one; None at the end.
 
     No record is whole that goes on where another one begins.
     """
@@ -283,7 +283,7 @@ def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place
 
 
 def _record_at(file: BinaryIO, size: int, position: int) -> _Place | None:
-    """The record that stands at `position`; None where there is no whole one."""
+    """Read the record that stands at `position`; None where there is no whole one."""
     if position + RECORD_HEAD.size > size:
         return None
     opcode, length = RECORD_HEAD.unpack(read_bytes(file, position, RECORD_HEAD.size))
@@ -292,7 +292,7 @@ def _record_at(file: BinaryIO, size: int, position: int) -> _Place | None:
 
 
 def _stated_places(summary: _Summary) -> list[_Place]:
-    """Where the records of the data section are of which a summary states the place."""
+    """Find where the records of the data section are of which a summary states the place."""
     places = []
     for record in summary.records:
         if isinstance(record, records.ChunkIndex):
@@ -333,7 +333,7 @@ def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> Non
 
 
 def _attachment_name(file: BinaryIO, place: _Place) -> str:
-    """The name of an attachment, whose data, which may be large, are not read. Raises Damaged."""
+    """Read the name of an attachment, whose data, which may be large, are not read. Raises Damaged."""
     start = RECORD_HEAD.size + _ATTACHMENT_HEAD.size
     if place.length >= start:
         head = read_bytes(file, place.offset + RECORD_HEAD.size, _ATTACHMENT_HEAD.size)
@@ -353,7 +353,7 @@ def _declare(found: Container, declarations: Iterable[Any]) -> None:
 
 
 def _checksum(file: BinaryIO, end: int) -> int:
-    """The checksum of the file up to `end`."""
+    """Compute the checksum of the file up to `end`."""
     file.seek(0)
     checksum = 0
     for begin in range(0, end, _LOOSE_BYTES):

@@ -179,7 +179,7 @@ class ContainerWriter:
             self._file.close()
 
     def _summary_section(self) -> bytes:
-        """The summary, the offsets of its groups, and the footer."""
+        """Write the summary, the offsets of its groups, and the footer."""
         groups: dict[Opcode, Sequence[records.McapRecord]] = {
             Opcode.SCHEMA: list(self._schemas.values()),
             Opcode.CHANNEL: self._channels,

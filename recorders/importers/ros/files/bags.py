@@ -114,7 +114,7 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
 
 
 def _unpacked(batch: Batch) -> Batch:
-    """The same messages, uncompressed; one that cannot be is empty."""
+    """Uncompress messages; one that cannot be is empty."""
     parts = []
     for begin, length in zip(batch.begins.tolist(), batch.lengths.tolist(), strict=True):
         try:
@@ -125,7 +125,7 @@ def _unpacked(batch: Batch) -> Batch:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """What metadata.yaml says of a bag of ROS 2; nothing where there is none."""
+    """Read metadata.yaml of a bag of ROS 2; nothing where there is none."""
     place = folder / "metadata.yaml"
     if not place.exists():
         return {}
@@ -143,7 +143,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _members(folder: Path, about: dict[str, Any]) -> list[Path]:
-    """The files of a folder, as its metadata lists them, else by their names, numbers in order."""
+    """List the files of a folder, as its metadata does, else by their names, numbers in order."""
     stated = [folder / PurePath(str(name)).name for name in about.get("relative_file_paths") or []]
     if stated:
         return stated

@@ -73,7 +73,7 @@ class McapFile:
 
 
 def _opened(path: Path, read: tuple[Region, bytes]) -> Contents | str:
-    """What a region holds, or why it cannot be read."""
+    """Open a region, or say why it cannot be read."""
     region, raw = read
     try:
         return open_region(raw, region.offset)

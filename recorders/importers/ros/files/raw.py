@@ -59,12 +59,27 @@ class BagFile(Protocol):
 
 
 def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[np.int64]) -> Batch:
-    """Messages (n,) that are apart in memory, laid end to end."""
+    """Lay messages that are apart in memory end to end.
+
+    Args:
+        connection: the publisher.
+        parts: n messages.
+        log_time_ns: (n,), the stamps of the recorder.
+    """
     lengths = np.array([len(part) for part in parts], np.int64)
     data = np.frombuffer(b"".join(parts), np.uint8)
     return Batch(connection, data, np.cumsum(lengths) - lengths, lengths, log_time_ns)
 
 
 def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDArray:
-    """Return the numbers (n,) of a type that stand at `places` (n,) of `data`."""
+    """Read numbers of one type out of bytes.
+
+    Args:
+        data: the bytes.
+        places: (n,), at which byte each number begins.
+        dtype: their type, such as "<i8".
+
+    Returns:
+        (n,).
+    """
     return windows(data, np.dtype(dtype).itemsize)[places].view(dtype)

@@ -166,7 +166,7 @@ class Ros1File:
 
 
 def _record_at(file: BinaryIO, position: int, size: int) -> _Record | None:
-    """The record at a place; None where its header is not whole. A chunk's data may be cut off."""
+    """Read the record at a place, whose data may be cut off; None where its header is not whole."""
     file.seek(position)
     head = file.read(_LENGTH.size)
     length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else size
@@ -184,7 +184,7 @@ def _read(file: BinaryIO, record: _Record) -> bytes:
 
 
 def _fields(raw: bytes) -> dict[str, bytes]:
-    """The fields of a header by name, as far as they are whole."""
+    """Read the fields of a header by name, as far as they are whole."""
     found, position = {}, 0
     while position + _LENGTH.size <= len(raw):
         end = position + _LENGTH.size + _LENGTH.unpack_from(raw, position)[0]
@@ -197,7 +197,7 @@ def _fields(raw: bytes) -> dict[str, bytes]:
 
 
 def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] | str:
-    """A chunk's records, or why they cannot be read."""
+    """Open a chunk's records, or say why they cannot be read."""
     record, raw = read
     compression = record.header.get("compression", b"")
     if compression not in _DECOMPRESS:

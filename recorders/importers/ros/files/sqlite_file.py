@@ -50,7 +50,7 @@ class SqliteFile:
             )
 
     def _counts(self, database: sqlite3.Connection) -> Counter[int]:
-        """How many messages each topic has."""
+        """Count the messages that each topic has."""
         if self._missing_bytes:
             return Counter(row[0] for row in whole_rows(self.path))
         try:
@@ -74,7 +74,7 @@ class SqliteFile:
                     yield self._batch(number, [row for row in found if row[0] == number])
 
     def _rows(self, database: sqlite3.Connection, chosen: Sequence[int]) -> Iterator[_Row]:
-        """The rows of some topics, in file order, as far as they can be read."""
+        """Yield the rows of some topics, in file order, as far as they can be read."""
         if self._missing_bytes:
             yield from (row for row in whole_rows(self.path) if row[0] in chosen)
             return
@@ -101,7 +101,7 @@ def _some_at_a_time(rows: Iterator[_Row]) -> Iterator[list[_Row]]:
 
 
 def _connections(database: sqlite3.Connection, counts: Counter[int]) -> Iterator[tuple[int, Connection]]:
-    """The topics by their numbers, with the definitions of their types where the file has them."""
+    """Yield the topics by their numbers, with the definitions of their types where the file has them."""
     definitions = {}
     if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
         stated = database.execute(

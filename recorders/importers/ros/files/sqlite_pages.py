@@ -22,7 +22,7 @@ def missing_bytes(path: Path) -> int:
 
 
 def whole_rows(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Topic, stamp in ns and message of every row of `messages` that is whole."""
+    """Yield topic, stamp in ns and message of every row of `messages` that is whole."""
     with path.open("rb") as file:
         head = file.read(100)
         size = _page_size(head)
@@ -47,7 +47,7 @@ def _page_size(head: bytes) -> int:
 
 
 def _payload(file: BinaryIO, page: bytes, place: int, usable: int, size: int) -> bytes:
-    """The bytes of a cell, those on further pages included. Raises EOFError where these are missing."""
+    """Read the bytes of a cell, also on further pages. Raises EOFError where these are missing."""
     place = int.from_bytes(page[place : place + 2], "big")
     length, place = _varint(page, place)
     _, place = _varint(page, place)
@@ -69,7 +69,7 @@ def _payload(file: BinaryIO, page: bytes, place: int, usable: int, size: int) ->
 
 
 def _row(payload: bytes) -> tuple[int, int, bytes] | None:
-    """A row of `messages`: (id), topic, stamp, message; None where it is one of another table."""
+    """Read a row of `messages`: (id), topic, stamp, message; None where it is another table's."""
     end, place = _varint(payload, 0)
     kinds = []
     while place < end:
@@ -89,7 +89,7 @@ def _row(payload: bytes) -> tuple[int, int, bytes] | None:
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:
-    """A number of one to nine bytes, the ninth of which counts whole, and the place behind it."""
+    """Read a number of one to nine bytes, the ninth of which counts whole, and the place behind it."""
     value = 0
     for byte in data[place : place + 8]:
         place += 1
