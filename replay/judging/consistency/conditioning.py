@@ -61,11 +61,15 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
     if not count:
         return Conditioning()
     at = _sampled(count)
-    flat = rows["covariance"][at]
-    size = round(flat.shape[1] ** 0.5)
+    flat = rows["covariance"].take(at, axis=0)
+    size = math.isqrt(flat.shape[1])
     if size < 2 or size * size != flat.shape[1]:
         return Conditioning()
-    least = least_pivots(flat.reshape(-1, size, size))
+    covariances = flat.reshape(-1, size, size)
+    smallest = _least_of_all(covariances)
+    if smallest >= LOST:
+        return Conditioning(len(at), least=smallest)
+    least = least_pivots(covariances)
     worst = int(least.argmin())
     smallest = float(least[worst])
     if smallest >= LOST:
@@ -83,6 +87,21 @@ def _sampled(count: int) -> NDArray[np.int64]:
     return np.arange(most) * (count - 1) // max(1, most - 1)
 
 
+def _least_of_all(covariances: NDArray[np.float64]) -> float:
+    """Return the least pivot of covariances (count, n, n), or NaN where one has no factor.
+
+    Every replay pays for it, and nearly always nothing is lost: it is in few calls of NumPy.
+    """
+    count, size, _ = covariances.shape
+    try:
+        factors = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        return math.nan
+    diagonals = factors.reshape(count, -1)[:, :: size + 1]
+    pivots = diagonals * diagonals / covariances.reshape(count, -1)[:, :: size + 1]
+    return float(pivots.item(pivots.argmin()))  # which is that of a NaN, where there is one
+
+
 def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the least pivot (count,) of covariances (count, n, n), as shares of variances.
 
@@ -90,13 +109,6 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     a pivot is not positive there is no factor, and it is the least one.
     """
     variances = np.einsum("rii->ri", covariances)
-    try:  # as nearly always all are positive
-        factors = np.einsum("rii->ri", np.linalg.cholesky(covariances))
-        least = np.asarray((factors * factors / variances).min(axis=1), np.float64)
-        if not math.isnan(least.min(initial=1.0)):
-            return least
-    except np.linalg.LinAlgError:  # which one is not remains to be found
-        pass
     is_in = np.isfinite(variances) & (variances != 0.0)
     scale = np.where(is_in, 1.0 / np.sqrt(np.where(is_in, np.abs(variances), 1.0)), 0.0)
     known = np.nan_to_num(covariances, posinf=0.0, neginf=0.0)
