@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import kurtosis
 
 from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
@@ -141,12 +140,18 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
                     "mean_high": mean + 1.96 * error,
                     "mean_square": tested.mean_square if tested.size else np.nan,
                     "beyond_3_sigma": float(np.mean(np.abs(known) > TAIL)),
-                    "kurtosis": float(kurtosis(known)) if known.std() > 0.0 else np.nan,
+                    "kurtosis": _kurtosis(known) if known.std() > 0.0 else np.nan,
                     "next_correlation": tested.correlation[0],
                     "probability_white": tested.probability,
                 }
             )
     return pd.DataFrame(rows)
+
+
+def _kurtosis(values: Floats) -> float:
+    """Compute that beyond a normal distribution's, of values that are not all one (n,)."""
+    deviations = values - values.mean()
+    return float(np.mean(deviations**4) / np.mean(deviations**2) ** 2) - 3.0
 
 
 def of_innovations(

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from pipeline.sensing.terms import Terms
+from replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

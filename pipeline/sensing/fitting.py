@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize, minimize_scalar
-from scipy.stats import chi2
 
 from pipeline.sensing.likelihood import Likelihood, Samples, likelihood
 from pipeline.sensing.terms import Terms
+from replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 Objective = Callable[[Floats], float]
