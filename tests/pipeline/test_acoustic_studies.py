@@ -66,6 +66,7 @@ def test_runs_are_judged_by_the_shots_that_were_located():
     assert (row["nees"], row["located"]) == (2.0, pytest.approx(2 / 3))
 
 
+@pytest.mark.paper
 def test_the_real_array_is_held_to_what_was_published(acoustic):
     given = {"band_hz": [5000.0, 10000.0]}
     table = differences_of(memory_source(*import_run("sound-recordings", acoustic, given)))

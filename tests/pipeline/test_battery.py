@@ -85,6 +85,7 @@ def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: t
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
 
 
+@pytest.mark.paper
 def test_a_delay_on_equal_laps_is_not_determined() -> None:
     """On laps of 20 s fixes 7 s late, or all else early, may as well be 27 s, the start unknown."""
     clean = drive(SEED)
@@ -180,6 +181,7 @@ def test_a_start_without_a_prior_knows_of_the_antenna_and_of_the_delay() -> None
     assert nis == pytest.approx([nis[0]] * 3, abs=0.05)
 
 
+@pytest.mark.paper
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)

@@ -73,6 +73,7 @@ def test_estimates_are_equal_to_the_last_bit(
                 np.testing.assert_array_equal(ours[name], theirs[name], err_msg=f"{topic} {name}")
 
 
+@pytest.mark.paper
 @needs_compiler
 @pytest.mark.parametrize("label", ["ekf", pytest.param("sqrt:ukf", marks=pytest.mark.paper)])
 def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path, label: str) -> None:

@@ -72,6 +72,7 @@ def test_what_is_planted_into_a_walk_is_found_without_a_filter(navigation: Path)
         assert [f"{each.key}={each.setting}" for each in findings_in(blocks)] == wanted
 
 
+@pytest.mark.paper
 def test_a_walk_that_no_filter_follows_is_diagnosed(
     navigation: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

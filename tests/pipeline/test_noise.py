@@ -240,6 +240,7 @@ def test_the_command_writes_what_others_read(
     assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
 
 
+@pytest.mark.paper
 def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: Path) -> None:
     """An ADIS16405 at rest, 10,000 s; read where it lies, and left there: its licence is CC BY-NC-SA."""
     archive = real_data / "sensors" / "sensors-data.tar.xz"

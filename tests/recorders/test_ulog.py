@@ -174,6 +174,7 @@ def rows_in(path: Path, content: bytes) -> bytes:
     return b"" if rows is None else rows.tobytes()
 
 
+@pytest.mark.paper
 def test_a_log_that_is_cut_at_any_thousandth_gives_what_is_whole(tmp_path: Path):
     whole = by_hand()
     every = rows_in(tmp_path / "cut.ulg", whole)

@@ -562,6 +562,7 @@ def test_pmbm_follows_targets_in_clutter():
     assert false / 12.5 < 0.1
 
 
+@pytest.mark.paper
 def test_the_sheets_reference_trackers(autoferry: Path):
     """Radar and lidar over all scenarios, within the sheet's tolerances of its row, or better."""
     sources = [

@@ -55,6 +55,7 @@ def test_sums_begin_anew_below_zero():
     np.testing.assert_allclose(page_sums(np.array([-1.0, 2.0, -0.5, -3.0, 1.0])), [0, 2, 1.5, 0, 1])
 
 
+@pytest.mark.paper
 def test_false_alarms_are_no_more_frequent_than_stated_and_a_change_is_noticed():
     """For a shift of one sigma the delay is near the threshold over the divergence, 1/2 a probe."""
     score = np.random.default_rng(1).normal(size=(400, 20_000))
