@@ -1,5 +1,6 @@
 """Checks that a model is what it declares: sizes, kinds, variances and rates, before any method runs."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
+@lru_cache(maxsize=64)  # it is the same whatever the parameters, of which a search tries hundreds
 def check_correction(where: str, model: Model) -> None:
     """Call the functions of how a model is corrected once, uncompiled; see `check_motion`."""
     if model.correct is not None:
