@@ -6,7 +6,7 @@ that has them, name the outputs, and tell of a run that failed while the others 
 """
 
 import copy
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -15,21 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Topic, schemas
+from recorders.log import Schema
 from recorders.parameters import Parameters, ParametersType
+from replay.engine.api.binding import (
+    Find,
+    bindings_by_name,
+    estimator_of,
+    priors_of,
+    requirements_of,
+    topics_of,
+)
 from replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
 from replay.engine.api.outputs import Estimates, Outputs, Solved
 from replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
 from replay.engine.renamed import renamed
 from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.channels import bindings, resolved
+from replay.engine.streams.channels import resolved
 from replay.engine.streams.failures import Failure, reason_of
 from replay.engine.streams.measurements import Vectors
 from replay.engine.vectors.components import Components
 
 Generators = tuple[np.random.Generator | None, ...]
-Find = Callable[[str, Mapping[str, Topic], Any], Iterable[Binding]]
 
 
 @renamed(whole="static")
@@ -98,6 +105,7 @@ def recursive(
 
     The shortest range so far, of everything that was seen:
 
+    >>> from recorders.log import RunMetadata, make_stream, schemas
     >>> class Shortest(NamedTuple):
     ...     range_m: np.ndarray
     >>> def start(given):
@@ -115,7 +123,6 @@ def recursive(
     ...     follow=follow,
     ...     compiled=False,
     ... )
-    >>> from recorders.log import RunMetadata, make_stream
     >>> from recorders.recording import Recording
     >>> from replay.engine.replaying.replaying import collect, replay
     >>> from replay.engine.streams.sources import memory_source
@@ -184,11 +191,11 @@ def recursive(
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
             return _Carried(settings, state, reported, generators), [*outcome, *made.of_skipped(skipped)]
 
-        return Recursive(name, *_topics(bound), begin, run, _priors(bound))
+        return Recursive(name, *topics_of(bound), begin, run, priors_of(bound))
 
-    where = find or partial(_named, streams, static, optional, components)
-    needs = requirements or _needs({**streams, **static}, optional)
-    return _estimator(summary, needs, parameters, variant, where, bind)
+    where = find or partial(bindings_by_name, streams, static, optional, components)
+    needs = requirements or requirements_of({**streams, **static}, optional)
+    return estimator_of(summary, needs, parameters, variant, where, bind)
 
 
 def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
@@ -257,6 +264,7 @@ def batch(
 
     The mean of all ranges:
 
+    >>> from recorders.log import RunMetadata, make_stream, schemas
     >>> def mean_range(streams, parameters):
     ...     ranges = streams["/range"]
     ...     mean, covariance = ranges["range_m"].mean().reshape(1, 1), np.full((1, 1, 1), 0.01)
@@ -267,7 +275,6 @@ def batch(
     ...     components={"range_m": "linear"},
     ...     solve=each_run(mean_range),
     ... )
-    >>> from recorders.log import RunMetadata, make_stream
     >>> from recorders.recording import Recording
     >>> from replay.engine.replaying.replaying import collect, replay
     >>> from replay.engine.streams.sources import memory_source
@@ -295,11 +302,11 @@ def batch(
             solved = solve(Given(values, found, streams_of, runs, name, bound.setup))
             return made.of_solved(solved, runs) if isinstance(solved, Solved) else solved
 
-        return Batch(name, *_topics(bound), solve_all, _priors(bound))
+        return Batch(name, *topics_of(bound), solve_all, priors_of(bound))
 
-    where = find or partial(_named, streams, static, optional, components)
-    needs = requirements or _needs({**streams, **static}, optional)
-    return _estimator(summary, needs, parameters, variant, where, bind)
+    where = find or partial(bindings_by_name, streams, static, optional, components)
+    needs = requirements or requirements_of({**streams, **static}, optional)
+    return estimator_of(summary, needs, parameters, variant, where, bind)
 
 
 def each_run(
@@ -336,56 +343,6 @@ def each_run(
         return Solved(solved, failures)
 
     return solve_all
-
-
-def _named(
-    streams: Mapping[str, Schema],
-    static: Mapping[str, Schema],
-    optional: Collection[str],
-    components: Components,
-    _name: str,
-    topics: Mapping[str, Topic],
-    _values: Parameters,
-) -> Iterator[Binding]:
-    """Find topics by their names, under every prefix that has them."""
-    for prefix, found in bindings(topics, {**streams, **static}, optional):
-        followed, needed = (
-            {name: found[name] for name in names if name in found} for names in (streams, static)
-        )
-        priors = [name for name in needed if static[name] is schemas.GAUSSIAN_ESTIMATE]
-        yield Binding(followed, needed, prefix, dict.fromkeys(priors, components))
-
-
-def _needs(asked: Mapping[str, Schema], optional: Collection[str]) -> str:
-    return ", ".join(
-        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
-        for name, schema in asked.items()
-    )
-
-
-def _topics(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    streams, static = (
-        tuple(topic.name for topic in each.values()) for each in (bound.streams, bound.static)
-    )
-    return streams, static
-
-
-def _priors(bound: Binding) -> dict[str, Components]:
-    return {bound.static[name].name: components for name, components in bound.priors.items()}
-
-
-def _estimator(
-    summary: str,
-    requirements: str,
-    parameters: type[ParametersType],
-    variant: str | None,
-    find: Find,
-    bind_one: Callable[[str, Binding, ParametersType], Bound],
-) -> Estimator[ParametersType]:
-    def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
-        return [bind_one(f"{label}{each.suffix}", each, values) for each in find(label, topics, values)]
-
-    return Estimator(summary, requirements, parameters, bind, variant)
 
 
 class _Carried(NamedTuple):

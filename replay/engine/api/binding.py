@@ -1,0 +1,68 @@
+"""Binds estimators from functions to the topics of a log, and says in words what they need of one."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import Any
+
+from recorders.log import Schema, Topic, schemas
+from recorders.parameters import Parameters, ParametersType
+from replay.engine.api.inputs import Binding
+from replay.engine.replaying.estimator import Bound, Estimator
+from replay.engine.streams.channels import bindings, resolved
+from replay.engine.vectors.components import Components
+
+Find = Callable[[str, Mapping[str, Topic], Any], Iterable[Binding]]
+
+
+def bindings_by_name(
+    streams: Mapping[str, Schema],
+    static: Mapping[str, Schema],
+    optional: Collection[str],
+    components: Components,
+    _name: str,
+    topics: Mapping[str, Topic],
+    _values: Parameters,
+) -> Iterator[Binding]:
+    """Find topics by their names, under every prefix that has them."""
+    for prefix, found in bindings(topics, {**streams, **static}, optional):
+        followed, needed = (
+            {name: found[name] for name in names if name in found} for names in (streams, static)
+        )
+        priors = [name for name in needed if static[name] is schemas.GAUSSIAN_ESTIMATE]
+        yield Binding(followed, needed, prefix, dict.fromkeys(priors, components))
+
+
+def requirements_of(asked: Mapping[str, Schema], optional: Collection[str]) -> str:
+    """Say what a log needs: the topics that are asked for, with their schemas."""
+    return ", ".join(
+        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
+        for name, schema in asked.items()
+    )
+
+
+def topics_of(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the topics that are followed, and of those that are static."""
+    streams, static = (
+        tuple(topic.name for topic in each.values()) for each in (bound.streams, bound.static)
+    )
+    return streams, static
+
+
+def priors_of(bound: Binding) -> dict[str, Components]:
+    """Return by topic the components that are wanted of each prior."""
+    return {bound.static[name].name: components for name, components in bound.priors.items()}
+
+
+def estimator_of(
+    summary: str,
+    requirements: str,
+    parameters: type[ParametersType],
+    variant: str | None,
+    find: Find,
+    bind_one: Callable[[str, Binding, ParametersType], Bound],
+) -> Estimator[ParametersType]:
+    """Make the estimator that binds, one by one, what `find` finds."""
+
+    def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
+        return [bind_one(f"{label}{each.suffix}", each, values) for each in find(label, topics, values)]
+
+    return Estimator(summary, requirements, parameters, bind, variant)
