@@ -7,6 +7,7 @@ that has them, name the outputs, and tell of a run that failed while the others 
 
 import copy
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -37,6 +38,7 @@ from replay.engine.streams.measurements import Vectors
 from replay.engine.vectors.components import Components
 
 Generators = tuple[np.random.Generator | None, ...]
+Advance = Callable[[Any, Any, Block], tuple[Any, list[Ragged]]]
 
 
 @renamed(whole="static")
@@ -59,7 +61,9 @@ def recursive(
     start: Callable[[Given[ParametersType]], tuple[Any, Any]],
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
-    advance: Callable[[Any, Any, Block], tuple[Any, list[Ragged]]] | None = None,
+    advance: Advance | None = None,
+    out_of_sequence: Callable[[ParametersType, int], Advance] | None = None,
+    finish: Callable[[Any, Any], list[Ragged]] | None = None,
     compiled: bool = True,
     allocates: bool = True,
 ) -> Estimator[ParametersType]:
@@ -96,6 +100,12 @@ def recursive(
             advance(settings, state, block) -> the state after a block, and the output streams, whose
             topics are /estimates/ + `Given.name` and more. There are no `components` then; the state is
             of any type, and is not changed.
+        out_of_sequence: with `advance`, for an estimator that goes back for late messages:
+            out_of_sequence(parameters, back_ns) gives what takes the place of `advance` where messages
+            come in the order of their arrival, and their stamps go back by up to so many nanoseconds.
+            Raises BadInput where the parameters do not let it go back.
+        finish: with `advance`: finish(settings, state) -> the output streams that waited for messages
+            which did not come any more, such as those that are smoothed.
         compiled: whether `follow` is compiled; plain Python is a hundred times slower.
         allocates: whether `follow` makes arrays, see
             `replay.engine.compiling.compile.compile_over_runs`.
@@ -135,6 +145,8 @@ def recursive(
     """
     if sum(each is not None for each in (follow, follow_all, advance)) != 1:
         raise BadInput(f"estimator '{summary}': give one of follow, follow_all and advance")
+    if advance is None and (out_of_sequence or finish):
+        raise BadInput(f"estimator '{summary}': out_of_sequence and finish need advance; give that too")
     for leaf, schema in outputs.items():
         _require_numbers(summary, leaf, schema)
 
@@ -172,13 +184,17 @@ def recursive(
             maps = {each: given[topic.name] for each, topic in bound.static.items()}
             return started(maps, next(iter(maps.values())).runs) if maps else None
 
-        def run(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+        def begun(carried: _Carried | None, block: Block) -> _Carried:
             # without static topics, the first block is what tells how many runs there are
-            carried = carried or started({}, len(block.events.offsets) - 1)
-            settings, before, reported, generators = carried
-            if advance is not None:
-                state, outcome = advance(settings, before, block)
-                return carried._replace(state=state), outcome
+            return carried or started({}, len(block.events.offsets) - 1)
+
+        def by(step: Advance, carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+            before = begun(carried, block)
+            state, outcome = step(before.settings, before.state, block)
+            return before._replace(state=state), outcome
+
+        def run(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+            settings, before, reported, generators = begun(carried, block)
             state = type(before)(*(array.copy() for array in before))
             messages, skipped = messages_of(block, wanted, values)
             messages = messages._replace(topic=numbers[messages.topic])
@@ -191,7 +207,23 @@ def recursive(
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
             return _Carried(settings, state, reported, generators), [*outcome, *made.of_skipped(skipped)]
 
-        return Recursive(name, *topics_of(bound), begin, run, priors_of(bound))
+        def ended(carried: _Carried | None) -> list[Ragged]:
+            assert finish is not None
+            return finish(carried.settings, carried.state) if carried else []
+
+        def going_back(back_ns: int) -> Recursive:
+            assert out_of_sequence is not None
+            return replace(in_order, run=partial(by, out_of_sequence(values, back_ns)))
+
+        in_order = Recursive(
+            name,
+            *topics_of(bound),
+            begin,
+            partial(by, advance) if advance else run,
+            priors_of(bound),
+            finish=ended if finish else None,
+        )
+        return replace(in_order, out_of_sequence=going_back) if out_of_sequence else in_order
 
     where = find or partial(bindings_by_name, streams, static, optional, components)
     needs = requirements or requirements_of({**streams, **static}, optional)

@@ -16,7 +16,7 @@ Places begin tracks, bearings only sharpen those that are confirmed.
 `replay.inference.association.tracking` does the work.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -27,15 +27,22 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters
 from replay.distributions import chi2
+from replay.engine.api.functions import Advance, recursive
+from replay.engine.api.inputs import Binding
 from replay.engine.arrays import Floats
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.channels import stated
 from replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.tracking.scans import ORIGIN, SensorTopics
 from replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.tracking.targets import Targets, targets_of
-from replay.estimators.tracking.track_smoother import smoothing_tracks
-from replay.estimators.tracking.tracker_run import TrackerSetup, run, run_out_of_sequence, start
+from replay.estimators.tracking.track_smoother import check_smoothing
+from replay.estimators.tracking.tracker_run import (
+    TrackerSetup,
+    advance,
+    advance_out_of_sequence,
+    finish,
+    start,
+)
 from replay.inference.association.scanning import measuring
 from replay.inference.association.tracker import Tracker
 from replay.inference.model.parameters import number_fields
@@ -329,43 +336,44 @@ def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Tracke
     )
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
-    """Bind one tracker of all sensors."""
+def _find(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> Iterator[Binding]:
+    """Find all sensors, for one tracker."""
     found = find_sensors(topics, parameters.sensors)
     if not found.scans:
-        return []
+        return
     scans = [topics[scan] for scan in found.scans]
     targets = targets_of(f"estimator {name}", parameters, scans)
     settings = settings_of(topics, found, parameters, targets)
     targets = with_errors(f"estimator {name}", targets, settings.errors)
     tracker = tracker_of(parameters, targets, settings)
-    setup = TrackerSetup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
-    seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
-    read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
-
-    def out_of_sequence(back_ns: int) -> Recursive:
-        return Recursive(
-            name, read, (), start, partial(run_out_of_sequence, setup=setup, back_ns=back_ns)
-        )
-
-    tracking = Recursive(
-        name, read, (), start, partial(run, setup=setup), out_of_sequence=out_of_sequence
+    if parameters.smoothed:
+        check_smoothing(name, targets, settings.errors.names)
+    setup = TrackerSetup(
+        name, found, tracker, settings.numbers, targets, parameters.most_tracks, parameters.smoothed
     )
-    if not parameters.smoothed:
-        return [tracking]
-    if settings.errors.names:
+    seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
+    read = [*seen, *filter(None, found.origins)]
+    yield Binding({topic: topics[topic] for topic in read}, setup=setup)
+
+
+def _out_of_sequence(parameters: TrackerParameters, back_ns: int) -> Advance:
+    if parameters.smoothed:
         raise BadInput(
-            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
-            "of sensors"
+            "smoothed tracks use later detections in any case; replay them in the order of the stamps, "
+            "or with --late wait:SECONDS"
         )
-    return [smoothing_tracks(tracking, targets)]
+    return partial(advance_out_of_sequence, back_ns=back_ns)
 
 
-TRACKER = Estimator(
+TRACKER = recursive(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (positions) or .../range_bearing, or .../bearing beside "
-    "those",
-    TrackerParameters,
-    _bind,
+    parameters=TrackerParameters,
+    find=_find,
+    requirements="per sensor .../scan and .../detection (positions) or .../range_bearing, or "
+    ".../bearing beside those",
     variant="association",
+    start=start,
+    advance=advance,
+    out_of_sequence=_out_of_sequence,
+    finish=finish,
 )

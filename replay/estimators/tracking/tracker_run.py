@@ -1,90 +1,61 @@
-"""Runs a tracker over its scans, in order or going back for scans that come late."""
+"""Runs a tracker over its scans, in order or going back for late ones, and smooths tracks at the end."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from replay.engine.api.inputs import Given
 from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, gather, join
+from replay.engine.streams.blocks import Block, Ragged, gather, join, of_runs
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Fixes, SensorTopics, latest_fixes, scans_of
+from replay.estimators.tracking.targets import Targets
 from replay.estimators.tracking.track_outputs import track_outputs
+from replay.estimators.tracking.track_smoother import smoothed
 from replay.inference.association.outputs import TrackOutputs, of_last
 from replay.inference.association.scans import Scans, in_time, take_scans
-from replay.inference.association.tracker import Newborn, Tracker
+from replay.inference.association.tracker import Tracker
 from replay.inference.association.tracking import track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 
 
 class TrackerSetup(NamedTuple):
-    """Holds a tracker as bound to a log: its name, the sensors, their settings, room for tracks."""
+    """Holds a tracker as bound to a log.
+
+    Attributes:
+        name: the estimator's.
+        found: its sensors.
+        tracker: what it is made of.
+        settings: (sensors, names), the parameters for each sensor.
+        targets: how they move, and what one is like of which only the position is known.
+        most_tracks: room for so many.
+        smoothed: whether tracks are smoothed at the end.
+    """
 
     name: str
     found: SensorTopics
     tracker: Tracker
     settings: Floats
-    newborn: Newborn
+    targets: Targets
     most_tracks: int
+    smoothed: bool
 
     def no_tracks(self, runs: int) -> Tracks:
         """Return the tracks of runs in which nothing was met yet."""
         first, count = self.tracker.shared
-        shared = self.newborn.covariance[first : first + count, first : first + count]
+        shared = self.targets.newborn.covariance[first : first + count, first : first + count]
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
     def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
         """Return the tracks after some scans, and what is said of them."""
-        return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
+        return track_scans(self.tracker, scans, self.settings, self.targets.newborn, tracks)
 
     def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
         """Return the streams of what is said of these scans; see `track_outputs`."""
         return track_outputs(
             self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
         )
-
-
-class TrackerState(NamedTuple):
-    """Carries the last own positions and the tracks from block to block.
-
-    Attributes:
-        fixes: by topic and run.
-        tracks: of all runs; where scans may come late those of one run each, see `OutOfSequenceState`.
-    """
-
-    fixes: Fixes
-    tracks: Any
-
-
-def start(_: Mapping[str, Ragged]) -> None:
-    """Start with nothing: before the first scan not even the number of runs is known."""
-
-
-def run(
-    state: TrackerState | None, block: Block, *, setup: TrackerSetup
-) -> tuple[TrackerState, list[Ragged]]:
-    """Track a block; see `replay.engine.replaying.estimator.Recursive`."""
-    before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
-    scans, fixes = _scans(before, block, setup)
-    after, batches = setup.track(before.tracks, scans)
-    outputs = [setup.outputs(batch, tracked) for batch, tracked in batches]
-    return TrackerState(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
-
-
-def _runs(block: Block) -> int:
-    return next(iter(block.streams.values())).runs
-
-
-def _begin(block: Block, setup: TrackerSetup, tracks: Any) -> TrackerState:
-    unknown: list[Any] = [None] * _runs(block)
-    return TrackerState({topic: unknown for topic in setup.found.origins if topic}, tracks)
-
-
-def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
-    """Return a block's scans, and the last own positions after it."""
-    scans = scans_of(block, setup.found, KINDS, state.fixes)
-    fixes = state.fixes.items()
-    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
 
 
 class OutOfSequenceState(NamedTuple):
@@ -101,30 +72,92 @@ class OutOfSequenceState(NamedTuple):
     head: Tracks
 
 
-def run_out_of_sequence(
-    state: TrackerState | None, block: Block, *, setup: TrackerSetup, back_ns: int
+class TrackerState(NamedTuple):
+    """Carries the last own positions and the tracks from block to block.
+
+    Attributes:
+        fixes: by topic and run.
+        tracks: of all runs, after all scans; where scans may come late as before all of them.
+        late: where scans may come late, what each run carries.
+        outputs: where tracks are smoothed, what is said at the end, by block.
+    """
+
+    fixes: Fixes
+    tracks: Tracks
+    late: tuple[OutOfSequenceState, ...] = ()
+    outputs: tuple[list[Ragged], ...] = ()
+
+
+def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
+    """Start where nothing was met yet."""
+    setup, runs = given.setup, given.runs
+    unknown: list[Any] = [None] * runs
+    fixes: Fixes = {topic: unknown for topic in setup.found.origins if topic}
+    return setup, TrackerState(fixes, setup.no_tracks(runs))
+
+
+def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[TrackerState, list[Ragged]]:
+    """Track a block; see `replay.engine.api.functions.recursive`."""
+    scans, fixes = _scans(state, block, setup)
+    tracks, batches = setup.track(state.tracks, scans)
+    outputs = _joined([setup.outputs(batch, tracked) for batch, tracked in batches])
+    after = state._replace(fixes=fixes, tracks=tracks)
+    if setup.smoothed:
+        return after._replace(outputs=(*state.outputs, outputs)), []
+    return after, outputs
+
+
+def finish(setup: TrackerSetup, state: TrackerState) -> list[Ragged]:
+    """Return what was kept until the end, with the tracks smoothed."""
+    outputs = _joined([each for each in state.outputs if each])
+    return [
+        smoothed(each, setup.targets) if each.stream.topic.endswith("/track") else each
+        for each in outputs
+    ]
+
+
+def _joined(outputs: Sequence[Sequence[Ragged]]) -> list[Ragged]:
+    """Join the topics of one part after the other."""
+    return [join(parts) for parts in zip(*outputs, strict=True)]
+
+
+def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
+    """Return a block's scans, and the last own positions after it."""
+    scans = scans_of(block, setup.found, KINDS, state.fixes)
+    fixes = state.fixes.items()
+    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
+
+
+def advance_out_of_sequence(
+    setup: TrackerSetup, state: TrackerState, block: Block, *, back_ns: int
 ) -> tuple[TrackerState, list[Ragged]]:
     """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
 
     A late scan is put in its place and those after it are used again; what was said stays, and is said
     again at the latest stamp.
     """
-    nothing = setup.no_tracks(1)
-    scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
-    none = take_scans(scans, np.empty(0, np.int64))
-    runs = [OutOfSequenceState(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
+    scans, fixes = _scans(state, block, setup)
     after, outputs = [], []
-    for number, before in enumerate(runs):
-        out_of_sequence, batches = before, list[list[Ragged]]()
-        for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
-            out_of_sequence, tracked = _take(out_of_sequence, take_scans(scans, rows), setup, back_ns)
+    for number, late in enumerate(state.late or _before_all(state.tracks, scans)):
+        batches = list[list[Ragged]]()
+        for rows in _stretches(late, scans, *scans.offsets[number : number + 2]):
+            late, tracked = _take(late, take_scans(scans, rows), setup, back_ns)
             batches += tracked
-        after.append(out_of_sequence)
-        outputs.append([join(parts) for parts in zip(*batches, strict=True)])
+        after.append(late)
+        outputs.append(_joined(batches))
     filled = next((each for each in outputs if each), [])
     empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
     by_topic = zip(*(each or empty for each in outputs), strict=True)
-    return TrackerState(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
+    said = [gather([each.stream for each in parts]) for parts in by_topic]
+    return state._replace(fixes=fixes, late=tuple(after)), said
+
+
+def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
+    """Yield every run as it is before its first scan."""
+    none = take_scans(scans, np.empty(0, np.int64))
+    for run in range(len(tracks.used)):
+        own = of_runs(tracks, slice(run, run + 1))
+        yield OutOfSequenceState(own, none, own)
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
