@@ -8,12 +8,17 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import fuselog as fl
 from pipeline.command_line import main
-from recorders.log import open_log, read_streams
+from recorders.log import Clock, open_log, read_streams
+from replay.engine.replaying.late import parse_late
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
 
 PAGE = (Path(__file__).parents[2] / "docs" / "your-estimator.md").read_text()
 
@@ -88,6 +93,42 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _late_log(schema: fl.Schema) -> MemorySource:
+    """Two of six messages come after the next one, whose stamp is a second newer."""
+    stamps_s, arrived_s = np.array([1, 2, 3, 4, 5, 6]), np.array([1, 2, 4.1, 4, 6.9, 6])
+    order = np.argsort(arrived_s)
+    heard = fl.make_stream(
+        "/walker/signal_strength",
+        schema,
+        (stamps_s[order] * 1e9).astype(int),
+        log_time_ns=(arrived_s[order] * 1e9).astype(int),
+        beacon_id=np.zeros(6, int),
+        power_dbm=-50.0 - 7.0 * stamps_s[order] ** 2,
+    )
+    return memory_source(fl.Recording([heard]), fl.RunMetadata("late"))
+
+
+def test_the_page_goes_back_for_late_messages() -> None:
+    """What its recursion says last is what it says in order, unless a message was later than that."""
+    code: dict[str, Any] = {}
+    exec("\n\n".join(_blocks("python")), code)
+    sources = [_late_log(code["SIGNAL_STRENGTH"])] * 2
+
+    def last(late: str | None) -> list[float]:
+        bound = code["LOUDNESS"].bind("own", sources[0].topics, fl.Parameters())
+        policy = None if late is None else parse_late(late, arrival_order=True)
+        order: Clock = "publish_time" if late is None else "log_time"
+        said = collect(replay(sources, bound, order=order, late=policy, block_messages=2))
+        loudness = said["/estimates/own/walker/loudness"]
+        assert len(loudness) == 12 - len(said.get("/estimates/own/walker/skipped", ()))
+        return loudness["power_dbm"][loudness.offsets[1:] - 1].tolist()
+
+    in_order = last(None)
+    assert last("rewind:2") == in_order == last("wait:2")
+    assert last("rewind:1") == in_order
+    assert last("rewind:0.5") != in_order
+
+
 def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
     """Run commands in one process that has the package: exit code, output and errors of each.
 
@@ -107,7 +148,7 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
         capture_output=True,
         text=True,
         cwd=package,
-        env={**os.environ, "PYTHONPATH": str(package)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(package), *sys.path])},
     )
     assert process.stderr == ""
     return [json.loads(line) for line in process.stdout.splitlines()]

@@ -310,6 +310,8 @@ def test_all_runs_at_once_are_one_call() -> None:
     assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(BadInput, match="give one of follow, follow_all and advance"):
         recursive("none", **given)
+    with pytest.raises(BadInput, match="out_of_sequence and finish need advance"):
+        recursive("late", follow_all=settle, finish=told, **given)
 
 
 def find_ranges(
@@ -331,9 +333,13 @@ def count(
     """How many ranges came so far, after every block: a state of any type, and an output of any kind."""
     seen = block.streams[given.topics["seen"].name]
     after = [known + int(new) for known, new in zip(before, np.diff(seen.offsets), strict=True)]
-    topic, last_ns = f"/estimates/{given.name}/size", [int(block.events.time_ns.max())]
-    sizes = [make_stream(topic, schemas.ESTIMATE_SIZE, last_ns, elements=[each]) for each in after]
-    return after, [gather(sizes)]
+    return after, told(given, after)
+
+
+def told(given: Given[SeededParameters], counts: list[int]) -> list[Ragged]:
+    topic = f"/estimates/{given.name}/size"
+    sizes = [make_stream(topic, schemas.ESTIMATE_SIZE, [100], elements=[each]) for each in counts]
+    return [gather(sizes)]
 
 
 def test_topics_and_outputs_may_be_any() -> None:
@@ -350,6 +356,16 @@ def test_topics_and_outputs_may_be_any() -> None:
     assert (counting.requirements, counting.variant) == ("ranges", "seed")
     out = run(counting, [make_run([1.0] * 4), make_run([2.0] * 4)], seed=10)
     assert out["/estimates/m/found/size"]["elements"].tolist() == [15, 15]
+    at_the_end = recursive(
+        "counts",
+        parameters=SeededParameters,
+        find=find_ranges,
+        start=start_counting,
+        advance=lambda given, before, block: (count(given, before, block)[0], []),
+        finish=told,
+    )
+    out = run(at_the_end, [make_run([1.0] * 4), make_run([2.0])], block_messages=2)
+    assert out["/estimates/m/found/size"]["elements"].tolist() == [5, 2]
 
     def solve(given: Given[SeededParameters]) -> list[Ragged]:
         return count(given, [given.setup] * given.runs, all_of(given))[1]
