@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from recorders.parameters import merge
+from recorders.recording import Simulator
+from recorders.registry import load
+from tests.pipeline.moves import switched_on
 
 
 class Situation(NamedTuple):
@@ -34,20 +37,17 @@ class Case:
     nothing: Mapping[str, str] = field(default_factory=dict)
 
 
-SEEN = {
-    "duration_s": 8.0,
-    "bearing": {"rate_hz": 2.0},
-    "range": {"rate_hz": 2.0},
-    "fix": {"rate_hz": 1.0, "sigma_m": 0.2},
-}
+def all_sensors(scenario: str) -> dict[str, Any]:
+    """A scenario's settings under which every sensor measures that has a rate."""
+    return switched_on(load("recorders", scenario, Simulator).parameters, endings=["rate_hz"])
+
+
+SEEN = merge(all_sensors("landmarks"), {"duration_s": 8.0, "fix": {"sigma_m": 0.2}})
 ADVERSE = merge(SEEN, {"range_bearing": {"outlier_probability": 0.4, "bias_bearing_rad": 0.3}})
-DRIVE = {
-    "duration_s": 15.0,
-    "rest_s": 1.0,
-    "leg_s": 2.0,
-    "unit": {"rate_hz": 50.0},
-    "carried": {"wheel_rate_hz": 5.0, "compass_rate_hz": 5.0, "barometer_rate_hz": 5.0},
-}
+DRIVE = merge(
+    all_sensors("navigation"),
+    {"duration_s": 15.0, "rest_s": 1.0, "leg_s": 2.0, "unit": {"rate_hz": 50.0}},
+)
 WITHOUT_PRIOR = merge(DRIVE, {"carried": {"compass_rate_hz": 0.0}, "prior": {"is_told": False}})
 WITHOUT_SPEEDS = merge(WITHOUT_PRIOR, {"gnss": {"velocity_rate_hz": 0.0}})
 LINEAR = "the vehicles' motion and fixes are linear, so that every filter is the same one"

@@ -1,12 +1,14 @@
 """Moves parameters: to another value that they accept, to the bounds that they declare, and beyond."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from recorders.errors import BadInput
 from recorders.parameters import Described, Parameters, build, describe, merge, nested
 
+# Numbers of what happens so often, by how their names end, and one under which other parameters count.
+OFTEN = {"rate_hz": 2.0, "_per_minute": 20.0, "_per_scan": 2.0, "_probability": 0.5}
 BOUND = re.compile(r"(?:number|integer)((?: [<>]=? \S+)+)")
 
 
@@ -23,6 +25,16 @@ def settable(kind: type[Parameters]) -> list[Described]:
         for each in found
         if not each.name.startswith(wholes) and "[]" not in each.name and ".NAME" not in each.name
     ]
+
+
+def switched_on(kind: type[Parameters], *, endings: Collection[str] = OFTEN) -> dict[str, Any]:
+    """The settings under which all that by default never happens does: sensors, outages, clutter."""
+    settings: dict[str, Any] = {}
+    for each in settable(kind):
+        for ending in endings:
+            if each.default == 0 and each.name.endswith(ending):
+                settings = merge(settings, nested(each.name, OFTEN[ending]))
+    return settings
 
 
 def value_of(values: Mapping[str, Any], name: str) -> Any:

@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.parameters import build, merge, nested
 from recorders.recording import Recorder, Simulator, record_run
 from recorders.registry import available, load
-from tests.pipeline.moves import bounds_of, moved, settable, value_of
+from tests.pipeline.moves import bounds_of, moved, settable, switched_on, value_of
 
 SCENARIOS = {
     name: each
@@ -29,7 +29,7 @@ class Case:
     """How a scenario is recorded in milliseconds so that nearly all of its parameters count.
 
     Attributes:
-        base: its settings.
+        base: its settings, over those that switch on what by default never happens.
         values: of parameters for which a number beside the base's is not enough.
         under: other settings over the base's, under which a parameter counts.
         nothing: parameters that change nothing here, and why.
@@ -41,16 +41,6 @@ class Case:
     under: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     nothing: Mapping[str, str] = field(default_factory=dict)
     slow: frozenset[str] = frozenset()
-
-
-SEEING = {
-    "rate_hz": 4.0,
-    "maximum_range_m": 5.0,
-    "outlier_probability": 0.2,
-    "dropout_probability": 0.1,
-    "outages_per_minute": 20.0,
-    "outage_s": 0.5,
-}
 
 
 def _without_noise(size: int) -> dict[str, dict[str, Any]]:
@@ -74,13 +64,7 @@ CASES = {
         {"random_chords": {"random_nodes": 8}},
     ),
     "landmarks": Case(
-        {
-            "duration_s": 10.0,
-            "robots": 2,
-            "robots_see_each_other": True,
-            "fix": {"rate_hz": 2.0, "outages_per_minute": 20.0, "outage_s": 0.5},
-            **dict.fromkeys(("range_bearing", "range", "bearing", "relative_bearing"), SEEING),
-        },
+        {"duration_s": 10.0, "robots": 2, "robots_see_each_other": True},
         {"fix.origin_deg": [48.0, 11.0]},
         nothing={
             "range.bias_bearing_rad": "it measures no bearing",
@@ -96,12 +80,7 @@ CASES = {
             "leg_s": 2.0,
             "unit": {"rate_hz": 50.0},
             "gnss": {"floats_s": [[4, 6]], "multipath_s": [[7, 8]], "outages_s": [[9, 10]]},
-            "carried": {
-                "wheel_rate_hz": 5.0,
-                "wheel_scale_sigma": 0.01,
-                "compass_rate_hz": 5.0,
-                "barometer_rate_hz": 5.0,
-            },
+            "carried": {"wheel_scale_sigma": 0.01},
         },
         {"way_points_m": [[0, 0, 0], [50, 0, 0], [50, 50, 0]]},
     ),
@@ -114,18 +93,23 @@ CASES = {
         },
     ),
     "orientation": Case({"steps": 5}, {"start": [0.0, 0.6, 0.8, 0.0]}, _without_noise(4)),
-    "ranging": Case({"duration_s": 20.0, "error_sigma_m": 0.1, "blocked": {"times_per_minute": 30.0}}),
+    "ranging": Case({"duration_s": 20.0, "error_sigma_m": 0.1}),
     "relative-bearings": Case(
-        {"scene": "random", "looks": 3, "misidentified_probability": 0.5},
+        {"scene": "random", "looks": 3},
         under={"paper_pairs": {"scene": "section-v"}},
     ),
-    "shot-sequence": Case({"shots": 5, "echo_probability": 0.5, "wrong_association_probability": 0.5}),
+    "shot-sequence": Case({"shots": 5}),
     "vehicles": Case(
-        {"duration_s": 20.0, "network": {"clutter_per_scan": 2.0}},
+        {"duration_s": 20.0},
         {"turn_rate_radps": [0.1] * 5},
         {"speed_mps": {"vehicles": 6}},
     ),
 }
+
+
+def base_of(name: str) -> dict[str, Any]:
+    """The settings of its case, with all on that by default never happens."""
+    return merge(switched_on(SCENARIOS[name].parameters), CASES.get(name, Case()).base)
 
 
 def fingerprint(name: str, settings: Mapping[str, Any]) -> str:
@@ -142,8 +126,9 @@ def fingerprint(name: str, settings: Mapping[str, Any]) -> str:
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_parameter_changes_what_is_recorded(name: str):
     case, kind, same = CASES.get(name, Case()), SCENARIOS[name].parameters, set()
+    usual = base_of(name)
     for each in settable(kind):
-        base = merge(case.base, case.under.get(each.name, {}))
+        base = merge(usual, case.under.get(each.name, {}))
         if each.name in case.values:
             other = merge(base, nested(each.name, case.values[each.name]))
         else:
@@ -155,27 +140,27 @@ def test_every_parameter_changes_what_is_recorded(name: str):
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_bounds_of_parameters_are_kept(name: str):
-    case, kind = CASES.get(name, Case()), SCENARIOS[name].parameters
+    slow, base, kind = CASES.get(name, Case()).slow, base_of(name), SCENARIOS[name].parameters
     for each in settable(kind):
         accepted, refused = bounds_of(each)
-        for value in () if each.name in case.slow else accepted:
-            fingerprint(name, merge(case.base, nested(each.name, value)))
+        for value in () if each.name in slow else accepted:
+            fingerprint(name, merge(base, nested(each.name, value)))
         for value in refused:
             with pytest.raises(BadInput, match=f"^scenario: parameter '{each.name}' is .*; it should"):
-                build(kind, merge(case.base, nested(each.name, value)), "scenario")
+                build(kind, merge(base, nested(each.name, value)), "scenario")
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_one_entry_more_is_refused_or_recorded(name: str):
     """What has too many entries would be taken for something that was meant."""
-    case, kind, ignored = CASES.get(name, Case()), SCENARIOS[name].parameters, []
-    values = build(kind, case.base, "base").model_dump()
+    base, kind, ignored = base_of(name), SCENARIOS[name].parameters, []
+    values = build(kind, base, "base").model_dump()
     for each in settable(kind):
         value = value_of(values, each.name)
         if isinstance(value, list | tuple) and value and isinstance(value[0], float):
-            longer = merge(case.base, nested(each.name, [*value, value[-1]]))
+            longer = merge(base, nested(each.name, [*value, value[-1]]))
             try:
-                if fingerprint(name, longer) == fingerprint(name, case.base):
+                if fingerprint(name, longer) == fingerprint(name, base):
                     ignored.append(each.name)
             except BadInput:
                 continue
