@@ -184,7 +184,6 @@ METHODS = {
         "ekf",
         robot(ADVERSE),
         {
-            "every_s": 0.03,
             "mode": "drive",
             "estimate": ["bias_range_m"],
             "estimate_sigma": {"bias_range_m": 0.3},
@@ -193,7 +192,6 @@ METHODS = {
             "topics": {"range_bearing": ""},
         },
         {
-            "gate_reopens_s": robot(ADVERSE, gate_probability=0.9),
             "mode": drive(mode="manoeuvre"),
             **dict.fromkeys(("estimate_sigma", "estimate_drift", "estimate_time_s"), AUGMENTED),
         },
@@ -204,7 +202,7 @@ METHODS = {
     ),
     "ukf": Case("ukf", robot()),
     "lrkf": Case("lrkf", robot(), {"sampling": "gf-25"}, {"seed": robot(sampling="rukf-10")}),
-    "sqrt": Case("sqrt", robot(), under={"kappa": robot(filter="ukf")}),
+    "sqrt:ukf": Case("sqrt:ukf", robot()),
     "smoother": Case(
         "smoother",
         robot(),
@@ -213,6 +211,16 @@ METHODS = {
             "kappa": robot(forward="ukf"),
             "sampling": robot(forward="lrkf"),
             "seed": robot(forward="lrkf", sampling="rukf-10"),
+        },
+    ),
+    "smoother:iterated": Case(
+        "smoother:iterated",
+        robot(),
+        {"iterations": 1},
+        {"loss_scale": robot(loss="huber")},
+        {
+            "forward": "the name says it",
+            **dict.fromkeys(("kappa", "sampling", "seed"), "it samples nothing"),
         },
     ),
     "imm": Case(
@@ -267,7 +275,7 @@ OWN = {
     "network": Case(
         "network",
         nodes(),
-        {"rule": "naive", "liar": 1, "send_interval_s": 0.5},
+        {"liar": 1},
         dict.fromkeys(("lie_m", "lie_after_s"), nodes(liar=1)),
     ),
     "score-classifier": Case(
@@ -288,7 +296,6 @@ OWN = {
             "logarithmic": ["finger"],
             "impostor_limit": 100,
             "components_of": {"finger": 1},
-            "tolerance": 1e3,
         },
         {
             "impostor_limit": scores(**FINGERS, pairs="all"),
@@ -344,9 +351,8 @@ OWN = {
                 ("false_confirmation", "missed_confirmation"),
                 targets(association="jpda", management="score"),
             ),
-            "same_within_mps": targets(same_within_m=500.0),
             **dict.fromkeys(
-                ("near_range_m", "far_range_m", "far_detection_probability", "far_clutter_factor"),
+                ("far_range_m", "far_detection_probability", "far_clutter_factor"),
                 targets(
                     near_range_m=50.0,
                     far_range_m=600.0,
@@ -368,9 +374,6 @@ OWN = {
             ),
             **dict.fromkeys(
                 ("blind_from_rad", "blind_to_rad"), targets(blind_from_rad=-2.0, blind_to_rad=1.0)
-            ),
-            "silence_s": HITS._replace(
-                recorded={"duration_s": 20.0, "detection_probability": 0.6, "clutter_per_scan": 1.0}
             ),
             "correlation_s": targets(correlated_sigma_m=5.0),
         },

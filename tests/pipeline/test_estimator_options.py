@@ -59,11 +59,27 @@ def all_tried() -> Iterator[Tried]:
         own = registered_models()[name].parameters.model_fields.keys() - COMMON
         yield Tried(f"model {name}", cases.MODELS[name], frozenset(own), name)
     yield Tried("common", cases.METHODS["common"], frozenset(COMMON))
-    for name, method in METHODS.items():
-        if own := method.parameters.model_fields.keys() - COMMON:
-            yield Tried(f"method {name}", cases.METHODS[name], frozenset(own))
+    for name, case in cases.METHODS.items():
+        if name != "common":
+            yield Tried(f"method {name}", case, frozenset(own_of(name)))
     for name, case in cases.OWN.items():
         yield Tried(name, case)
+
+
+def own_of(name: str) -> set[str]:
+    """The parameters that a method has beside those that all have, with any variant."""
+    return METHODS[name.partition(":")[0]].parameters.model_fields.keys() - COMMON
+
+
+def parameters_of(tried: Tried) -> tuple[type[Parameters], dict[str, Described]]:
+    """The type of the parameters, and those of them that are tried."""
+    estimator, variant = find_estimator(tried.case.kind)
+    by_model = estimator.parameters_by_model(tried.case.kind, variant)
+    kind = by_model.get(tried.model) or estimator.parameters_with(tried.case.kind, variant)
+    found = {each.name: each for each in settable(kind)}
+    if tried.names is not None:
+        found = {name: each for name, each in found.items() if name.partition(".")[0] in tried.names}
+    return kind, found
 
 
 TRIED = sorted(all_tried(), key=lambda each: each.label)
@@ -111,21 +127,27 @@ def counts(tried: Tried, kind: type[Parameters], parameter: Described) -> bool:
 @pytest.mark.parametrize("tried", TRIED, ids=lambda tried: tried.label)
 @pytest.mark.paper
 def test_every_parameter_changes_the_estimates(tried: Tried):
-    estimator, variant = find_estimator(tried.case.kind)
-    by_model = estimator.parameters_by_model(tried.case.kind, variant)
-    kind = by_model.get(tried.model) or estimator.parameters_with(tried.case.kind, variant)
-    nothing = {
-        each.name
-        for each in settable(kind)
-        if tried.names is None or each.name.partition(".")[0] in tried.names
-        if not counts(tried, kind, each)
-    }
+    kind, parameters = parameters_of(tried)
+    nothing = {name for name, each in parameters.items() if not counts(tried, kind, each)}
     assert nothing == set(tried.case.nothing)
+    assert {*tried.case.values, *tried.case.under} <= parameters.keys()
 
 
 def test_no_estimator_is_left_out():
-    assert {*cases.OWN, *cases.METHODS, *ELSEWHERE} - {"common"} == set(available("estimators"))
+    methods = {name.partition(":")[0] for name in cases.METHODS}
+    assert {*cases.OWN, *methods, *ELSEWHERE} - {"common"} == set(available("estimators"))
     assert {*cases.MODELS, *MODELS_ELSEWHERE} == set(available("models"))
+
+
+def test_no_parameter_of_a_method_is_left_out():
+    """Some count only with a variant, which has a case of its own."""
+    found: dict[str, set[str]] = {}
+    for tried in TRIED:
+        if tried.label.startswith("method "):
+            name = tried.label.removeprefix("method ").partition(":")[0]
+            found.setdefault(name, set()).update(parameters_of(tried)[1])
+    for name, method in METHODS.items():
+        assert own_of(name) - {method.variant} <= found.get(name, set())
 
 
 def test_a_start_without_a_prior_is_of_the_models_own_states_and_parameters():

@@ -72,7 +72,7 @@ CASES = {
             "relative_bearing.bias_range_m": "it measures no range",
         },
     ),
-    "moving-los": Case({"duration_s": 10.0, "weave_m": [100.0, 50.0, 20.0]}, {"known_sigma_m": 1.0}),
+    "moving-los": Case({"duration_s": 10.0, "weave_m": [100.0, 50.0, 20.0]}),
     "navigation": Case(
         {
             "duration_s": 15.0,
