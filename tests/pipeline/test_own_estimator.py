@@ -16,6 +16,7 @@ import pytest
 import fuselog as fl
 from pipeline.command_line import main
 from recorders.log import Clock, open_log, read_streams
+from recorders.registry import available, load
 from replay.engine.replaying.late import parse_late
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
@@ -127,6 +128,15 @@ def test_the_page_goes_back_for_late_messages() -> None:
     assert last("rewind:2") == in_order == last("wait:2")
     assert last("rewind:1") == in_order
     assert last("rewind:0.5") != in_order
+
+
+def test_ours_are_made_as_those_of_others() -> None:
+    """By `recursive`, `batch`, or a model and a method; not so are libraries and programs."""
+    makers = set()
+    for name in set(available("estimators")) - {"exec", "lib"}:
+        bind = load("estimators", name, fl.Estimator).bind
+        makers.add(getattr(bind, "func", bind).__module__)
+    assert makers == {"replay.engine.api.binding", "replay.inference.estimators"}
 
 
 def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
