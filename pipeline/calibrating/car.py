@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.diagnosing.battery.car import Floats, Truth, arcs, philox, stamps_ns
+from recorders.common_streams import fix_stream
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
@@ -148,13 +149,7 @@ def recorded(car: Measured, sigmas: tuple[float, float, float] = (10.0, 10.0, 0.
             forward_mps=car.odometry[:, 0],
             turn_radps=car.odometry[:, 1],
         ),
-        make_stream(
-            "/car/fix",
-            schemas.POSITION_FIX,
-            stamps_ns(car.fix_s),
-            position_m=car.fix_m,
-            covariance_m2=np.tile([0.09, 0.0, 0.0, 0.09], (len(car.fix_s), 1)),
-        ),
+        fix_stream("/car/fix", stamps_ns(car.fix_s), car.fix_m, 0.09),
         make_stream(
             "/car/heading",
             schemas.ORIENTATION,

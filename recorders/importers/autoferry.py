@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.states import state_metadata
@@ -155,14 +156,7 @@ def read(folder: Path, parameters: AutoferryParameters) -> Recording:
             streams += _sensor_streams(f"/{name}", rows, scans, stated)
             _tell(notes, name, rows, scans)
     for target, (time_ns, place) in truths.items():
-        truth = make_stream(
-            f"/target{target}/truth",
-            schemas.TRUTH_STATE,
-            time_ns,
-            metadata=state_metadata(PLANE),
-            state=place,
-        )
-        streams.append(truth)
+        streams.append(truth_stream(f"/target{target}/truth", time_ns, PLANE, place))
     return Recording(streams, int(scans.time_ns.min()), notes)
 
 

@@ -11,17 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
+from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
 from recorders.extras import extra
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import require_unit
+from recorders.models.states import ORIENTATION
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording, simulation_stamps_ns
 
-ORIENTATION = {
-    "components": "orientation_w,orientation_x,orientation_y,orientation_z",
-    "kinds": "quaternion,quaternion,quaternion,quaternion",
-}
 # Dataset and width; None for a plain column.
 DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement": None}
 
@@ -70,9 +68,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
     _tell_gaps(notes, f"{name}, truth", time_ns, seen, parameters.gap_s)
     samples = inertial[sampled]
     return [
-        make_stream(
-            f"/{name}/truth", schemas.TRUTH_STATE, time_ns[seen], metadata=ORIENTATION, state=truth
-        ),
+        truth_stream(f"/{name}/truth", time_ns[seen], ORIENTATION, truth),
         make_stream(
             f"/{name}/inertial",
             schemas.INERTIAL_SAMPLE,

@@ -13,12 +13,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
+from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import Importer, Recording
 
-POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
+POSE = ("x_m", "y_m", "heading_rad")
 
 
 class MrclamParameters(Parameters):
@@ -103,23 +104,13 @@ def _robot_streams(
     start_ns = max(odometry_ns[0], truth_ns[0])
     row = min(int(np.searchsorted(truth_ns, start_ns)), len(truth_ns) - 1)
     return [
-        make_stream(
-            f"{prefix}/prior",
-            schemas.GAUSSIAN_ESTIMATE,
-            truth_ns[row : row + 1],
-            metadata=POSE,
-            mean=poses[row : row + 1],
-            covariance=np.diag(sigma**2).reshape(1, 9),
-        ),
-        make_stream(f"{prefix}/truth", schemas.TRUTH_STATE, truth_ns, metadata=POSE, state=poses),
+        prior_stream(f"{prefix}/prior", truth_ns[row], POSE, poses[row], np.diag(sigma**2)),
+        truth_stream(f"{prefix}/truth", truth_ns, POSE, poses),
         make_stream(
             f"{prefix}/odometry",
             schemas.ODOMETRY,
             odometry_ns,
-            metadata={
-                "forward_noise_density": repr(parameters.forward_noise_density),
-                "turn_noise_density": repr(parameters.turn_noise_density),
-            },
+            metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
             forward_mps=odometry[:, 0],
             turn_radps=odometry[:, 1],
         ),
@@ -127,10 +118,7 @@ def _robot_streams(
             f"{prefix}/range_bearing",
             schemas.RANGE_BEARING,
             seen_ns[known],
-            metadata={
-                "sigma_range_m": repr(parameters.sigma_range_m),
-                "sigma_bearing_rad": repr(parameters.sigma_bearing_rad),
-            },
+            metadata=stated_numbers(parameters, "sigma_range_m", "sigma_bearing_rad"),
             target_id=targets,
             range_m=seen[known, 1],
             bearing_rad=seen[known, 2],

@@ -22,10 +22,10 @@ from pydantic import Field, PositiveFloat
 from scipy.io import wavfile
 
 from recorders.arrivals import HeardSound, difference_stream, microphone_stream
+from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
+from recorders.log import Stream
 from recorders.models.arrivals import Weighting
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
 
@@ -339,13 +339,7 @@ def _streams(
     truth = parameters.truth_m.get(name)
     if truth is not None:
         components = [f"{axis}_m" for axis in AXES[: len(truth)]]
-        yield make_stream(
-            f"/{name}/truth",
-            schemas.TRUTH_STATE,
-            [sound.begin_ns],
-            metadata=state_metadata(components),
-            state=[truth],
-        )
+        yield truth_stream(f"/{name}/truth", [sound.begin_ns], components, [truth])
 
 
 SOUND_RECORDINGS = Importer(

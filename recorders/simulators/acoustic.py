@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from recorders.common_streams import fix_stream, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.acoustic import (
@@ -21,7 +22,6 @@ from recorders.models.acoustic import (
     stated_metadata,
 )
 from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -114,13 +114,8 @@ def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> S
     components = [*SHOT_COMPONENTS, *(name for s in numbers for name in sensor_components(s))]
     shot = [*parameters.shooter_position_m, wrap_angle(np.radians(parameters.trajectory_deg))]
     times_ns = np.unique(simulation_stamps_ns(shots_s[:, None] + np.append(0.0, travel_s)))
-    return make_stream(
-        "/shooter/truth",
-        schemas.TRUTH_STATE,
-        times_ns,
-        metadata=state_metadata(components),
-        state=np.tile(np.concatenate([shot, places]), (len(times_ns), 1)),
-    )
+    state = np.tile(np.concatenate([shot, places]), (len(times_ns), 1))
+    return truth_stream("/shooter/truth", times_ns, components, state)
 
 
 def _fixes(
@@ -132,13 +127,8 @@ def _fixes(
 ) -> Stream:
     """State where a sensor believes itself to be, a message for each shot."""
     sigma = parameters.sigma_position_m
-    return make_stream(
-        f"/sensor{number}/position",
-        schemas.POSITION_FIX,
-        simulation_stamps_ns(shots_s),
-        position_m=place + sigma * rng.normal(size=(len(shots_s), 2)),
-        covariance_m2=np.tile(sigma**2 * np.eye(2).ravel(), (len(shots_s), 1)),
-    )
+    measured = place + sigma * rng.normal(size=(len(shots_s), 2))
+    return fix_stream(f"/sensor{number}/position", simulation_stamps_ns(shots_s), measured, sigma**2)
 
 
 def _detections(

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from recorders.common_streams import truth_stream
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.planar import drive
-from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -59,11 +60,8 @@ def simulate(parameters: CrossingParameters, rng: np.random.Generator) -> Record
     times_s = parameters.period_s * np.arange(scans + 1, dtype=float)
     states = _states(parameters, times_s, scene_rng.uniform(-np.pi, np.pi))
     stamps_ns = simulation_stamps_ns(times_s)
-    motion = state_metadata(PLANE_MOTION)
     truths = [
-        make_stream(
-            f"/target{number}/truth", schemas.TRUTH_STATE, stamps_ns, metadata=motion, state=state
-        )
+        truth_stream(f"/target{number}/truth", stamps_ns, PLANE_MOTION, state)
         for number, state in enumerate(states, start=1)
     ]
     return Recording([*_radar(parameters, stamps_ns, states[:, :, 0::2], radar_rng), *truths])

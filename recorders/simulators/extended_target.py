@@ -9,15 +9,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.log import make_stream, schemas
 from recorders.models.extended_target import surface_point
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
-COMPONENTS = {
-    "components": "half_x_m,half_y_m,x_m,y_m",
-    "kinds": "linear,linear,linear,linear",
-}
+COMPONENTS = ("half_x_m", "half_y_m", "x_m", "y_m")
 Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
@@ -55,31 +53,20 @@ def simulate(parameters: ExtendedTargetParameters, rng: np.random.Generator) -> 
     stamps_ns = simulation_stamps_ns(parameters.step_s * np.arange(parameters.points + 1))
     return Recording(
         [
-            make_stream(
+            prior_stream(
                 "/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                stamps_ns[:1],
-                metadata=COMPONENTS,
-                mean=np.array([parameters.prior_mean]),
-                covariance=(parameters.prior_variance_m2 * np.eye(4)).reshape(1, 16),
+                stamps_ns[0],
+                COMPONENTS,
+                parameters.prior_mean,
+                parameters.prior_variance_m2 * np.eye(4),
             ),
-            make_stream(
-                "/truth",
-                schemas.TRUTH_STATE,
-                stamps_ns,
-                metadata=COMPONENTS,
-                state=np.tile(target, (len(stamps_ns), 1)),
-            ),
+            truth_stream("/truth", stamps_ns, COMPONENTS, np.tile(target, (len(stamps_ns), 1))),
             make_stream(
                 "/surface_point",
                 schemas.POSITION_FIX,
                 stamps_ns[1:],
-                metadata={
-                    "system": "extended-target",
-                    "size_drift_m2": repr(parameters.size_drift_m2),
-                    "position_drift_m2": repr(parameters.position_drift_m2),
-                    "point_variance_m2": repr(parameters.point_variance_m2),
-                },
+                metadata={"system": "extended-target"}
+                | stated_numbers(parameters, "size_drift_m2", "position_drift_m2", "point_variance_m2"),
                 position_m=seen,
                 covariance_m2=np.tile(parameters.point_variance_m2 * np.eye(2).ravel(), (len(seen), 1)),
             ),

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
+from recorders.common_streams import prior_stream, truth_stream
 from recorders.log import make_stream, schemas
 from recorders.models.headings import Correlation, equal_sigmas, turn_together
 from recorders.models.planar import wrap_angle
+from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
-HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
+HEADINGS = ("heading1_rad", "heading2_rad")
 
 
 class HeadingsParameters(Parameters):
@@ -68,25 +70,19 @@ def simulate(parameters: HeadingsParameters, rng: np.random.Generator) -> Record
         truth[step] = x = np.array(moved) + each
     elapsed_s = parameters.step_s * np.arange(parameters.steps + 1)
     time_ns = simulation_stamps_ns(elapsed_s)
-    stated = parameters.model_dump(exclude={"steps", "step_s", "prior_sigma_rad"})
+    numbers = parameters.model_dump(exclude={"steps", "step_s", "prior_sigma_rad"})
+    stated = state_metadata(HEADINGS) | {name: repr(value) for name, value in numbers.items()}
     return Recording(
         [
-            make_stream(
-                "/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                time_ns[:1],
-                metadata=HEADINGS,
-                mean=np.zeros((1, 2)),
-                covariance=parameters.prior_sigma_rad**2 * np.eye(2).reshape(1, 4),
+            prior_stream(
+                "/prior", time_ns[0], HEADINGS, np.zeros(2), parameters.prior_sigma_rad**2 * np.eye(2)
             ),
-            make_stream(
-                "/truth", schemas.TRUTH_STATE, time_ns[1:], metadata=HEADINGS, state=wrap_angle(truth)
-            ),
+            truth_stream("/truth", time_ns[1:], HEADINGS, wrap_angle(truth)),
             make_stream(
                 "/headings",
                 schemas.VECTOR_MEASUREMENT,
                 time_ns[1:],
-                metadata={**HEADINGS, **{name: repr(value) for name, value in stated.items()}},
+                metadata=stated,
                 value=(truth + noise) % (2.0 * np.pi),
             ),
         ]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.common_streams import outage_stream, prior_stream, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
@@ -18,7 +19,6 @@ from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = ("x_m", "y_m", "vx_mps", "vy_mps")
-STATE = {"components": ",".join(COMPONENTS), "kinds": ",".join(["linear"] * 4)}
 Probability = Annotated[float, Field(ge=0, le=1)]
 Index = Annotated[int, Field(ge=1)]
 
@@ -107,17 +107,14 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
     times_s: NDArray[np.float64] = np.arange(parameters.steps + 1, dtype=float) * parameters.step_s
     truth = _truth(parameters, truth_rng)
     streams = [
-        make_stream(
+        prior_stream(
             "/prior",
-            schemas.GAUSSIAN_ESTIMATE,
             simulation_stamps_ns(times_s[:1]),
-            metadata=STATE,
-            mean=[parameters.start],
-            covariance=np.diag(np.square(parameters.start_sigma)).reshape(1, 16),
+            COMPONENTS,
+            parameters.start,
+            np.diag(np.square(parameters.start_sigma)),
         ),
-        make_stream(
-            "/truth", schemas.TRUTH_STATE, simulation_stamps_ns(times_s), metadata=STATE, state=truth
-        ),
+        truth_stream("/truth", simulation_stamps_ns(times_s), COMPONENTS, truth),
         _link_events(parameters, links, times_s[1:], link_rng),
     ]
     for number, node in enumerate(nodes, start=1):
@@ -226,11 +223,9 @@ def _outage_streams(parameters: IspaceParameters) -> list[Stream]:
     for span in parameters.outages:
         spans.setdefault(span.node, []).append(span)
     return [
-        make_stream(
+        outage_stream(
             f"/node{node}/outages",
-            schemas.OUTAGE,
-            simulation_stamps_ns(np.array([span.start_s for span in found])),
-            end_time_ns=simulation_stamps_ns(np.array([span.end_s for span in found])),
+            simulation_stamps_ns([(span.start_s, span.end_s) for span in found]),
         )
         for node, found in spans.items()
     ]

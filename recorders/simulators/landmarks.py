@@ -11,6 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.common_streams import (
+    fix_stream,
+    outage_stream,
+    prior_stream,
+    stated_numbers,
+    truth_stream,
+)
 from recorders.log import Schema, Stream, make_stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.planar import drive, range_bearing, wrap_angle
@@ -39,7 +46,7 @@ NUMBERS = {
     "relative_bearing": 5,
     "fix": 6,
 }
-POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
+POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Drive(NamedTuple):
@@ -138,24 +145,14 @@ def _robot_streams(
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
     prior = truth[0] + rng_of("prior").normal(size=3) * sigma
     streams = [
-        make_stream(
-            f"{prefix}/prior",
-            schemas.GAUSSIAN_ESTIMATE,
-            stamps_ns[:1],
-            metadata=POSE,
-            mean=prior[None],
-            covariance=np.diag(sigma**2).reshape(1, 9),
-        ),
-        make_stream(f"{prefix}/truth", schemas.TRUTH_STATE, stamps_ns, metadata=POSE, state=truth),
+        prior_stream(f"{prefix}/prior", stamps_ns[0], POSE, prior, np.diag(sigma**2)),
+        truth_stream(f"{prefix}/truth", stamps_ns, POSE, truth),
         make_stream(
             f"{prefix}/odometry",
             schemas.ODOMETRY,
             stamps_ns[:-1],
             log_time_ns=simulation_stamps_ns(robot.times_s[:-1] + parameters.odometry_latency_s),
-            metadata={
-                "forward_noise_density": repr(parameters.forward_noise_density),
-                "turn_noise_density": repr(parameters.turn_noise_density),
-            },
+            metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
             forward_mps=robot.odometry[:, 0],
             turn_radps=robot.odometry[:, 1],
         ),
@@ -168,18 +165,19 @@ def _robot_streams(
         sensor_rng = rng_of(name)
         seen = _look(sensor, robot, targets, sensor_rng)
         look, columns = _measure(schema, sensor, seen, sensor_rng)
-        stated = {key: repr(getattr(sensor, key)) for key in ("sigma_range_m", "sigma_bearing_rad")}
         streams.append(
             make_stream(
                 f"{prefix}/{name}",
                 schema,
                 **_clocks(sensor, seen.times_s, look, sensor_rng),
-                metadata=stated,
+                metadata=stated_numbers(sensor, "sigma_range_m", "sigma_bearing_rad"),
                 **columns,
             )
         )
         if sensor.outages_per_minute > 0:
-            streams.append(_outages(f"{prefix}/{name}/outages", seen.outages_s))
+            streams.append(
+                outage_stream(f"{prefix}/{name}/outages", simulation_stamps_ns(seen.outages_s))
+            )
     return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rng_of("fix"))
 
 
@@ -191,27 +189,22 @@ def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Gener
     outages_s, is_dead = _dead(receiver, times_s, robot.times_s[-1], rng)
     places = robot.pose_at(times_s)[:, :2] + receiver.sigma_m * rng.normal(size=(len(times_s), 2))
     times_s, places = times_s[~is_dead], places[~is_dead]
-    stamps_ns, covariance = simulation_stamps_ns(times_s), receiver.sigma_m**2 * np.eye(2)
-    spread = np.tile(covariance.ravel(), (len(times_s), 1))
-    if receiver.origin_deg is None:
-        fixes = make_stream(
-            topic, schemas.POSITION_FIX, stamps_ns, position_m=places, covariance_m2=spread
-        )
-    else:
+    fixes = fix_stream(topic, simulation_stamps_ns(times_s), places, receiver.sigma_m**2)
+    if receiver.origin_deg is not None:
         latitude, longitude, altitude = out_of_tangent_plane(places.T, receiver.origin_deg)
         names = "origin_latitude_deg", "origin_longitude_deg"
         fixes = make_stream(
             topic,
             schemas.GEODETIC_FIX,
-            stamps_ns,
+            fixes.publish_time_ns,
             metadata=dict(zip(names, map(repr, receiver.origin_deg), strict=True)),
             latitude_deg=latitude,
             longitude_deg=longitude,
             altitude_m=altitude,
-            covariance_m2=spread,
+            covariance_m2=fixes["covariance_m2"],
         )
-    outages = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
-    return [fixes, *outages]
+    outages = outage_stream(f"{topic}/outages", simulation_stamps_ns(outages_s))
+    return [fixes, outages] if receiver.outages_per_minute > 0 else [fixes]
 
 
 def _targets(
@@ -328,11 +321,6 @@ def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     start = np.cumsum(count) - count
     look, pair = np.nonzero(second < count[:, None])
     return start[look] + first[pair], start[look] + second[pair]
-
-
-def _outages(topic: str, outages_s: NDArray[np.float64]) -> Stream:
-    spans_ns = simulation_stamps_ns(outages_s)
-    return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
 
 
 LANDMARKS = Simulator(

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.log import make_stream, schemas
+from recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
 from recorders.models.planar import drive
-from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -71,32 +71,15 @@ def simulate(parameters: ManoeuvresParameters, rng: np.random.Generator) -> Reco
     stamps_ns = simulation_stamps_ns(times_s)
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_mps] * 2)
     fixes = states[1:, 0::2] + parameters.fix_sigma_m * fix_rng.normal(size=(count, 2))
-    covariance = parameters.fix_sigma_m**2 * np.eye(2).reshape(1, 4)
-    motion = {
-        "turn_rate_radps": "0.0",
-        "acceleration_sigma_mps2": repr(parameters.acceleration_sigma_mps2),
-    }
-    metadata = state_metadata(PLANE_MOTION)
+    motion = {"turn_rate_radps": "0.0", **stated_numbers(parameters, "acceleration_sigma_mps2")}
+    prior = states[0] + sigma * prior_rng.normal(size=4)
     return Recording(
         [
-            make_stream(
-                "/vehicle1/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                stamps_ns[:1],
-                metadata=metadata | motion,
-                mean=states[:1] + sigma * prior_rng.normal(size=4),
-                covariance=np.diag(sigma**2).reshape(1, 16),
+            prior_stream(
+                "/vehicle1/prior", stamps_ns[0], PLANE_MOTION, prior, np.diag(sigma**2), motion
             ),
-            make_stream(
-                "/vehicle1/truth", schemas.TRUTH_STATE, stamps_ns, metadata=metadata, state=states
-            ),
-            make_stream(
-                "/vehicle1/fix",
-                schemas.POSITION_FIX,
-                stamps_ns[1:],
-                position_m=fixes,
-                covariance_m2=np.repeat(covariance, count, axis=0),
-            ),
+            truth_stream("/vehicle1/truth", stamps_ns, PLANE_MOTION, states),
+            fix_stream("/vehicle1/fix", stamps_ns[1:], fixes, parameters.fix_sigma_m**2),
         ]
     )
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
+from recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
@@ -25,7 +26,6 @@ from recorders.models.optical import (
     rotate,
 )
 from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -113,7 +113,9 @@ def simulate(parameters: MovingOpticalParameters, rng: np.random.Generator) -> R
         parameters.bias_sigma_rad * start_rng.normal(size=(sensors, 3)),
         course_rng,
     )
-    streams = [_prior(mean, np.tile(sigma, TARGETS)), _truth(course, truth_s, clocks_s)]
+    start_ns, covariance = simulation_stamps_ns(0.0), np.diag(np.tile(sigma, TARGETS) ** 2)
+    prior = prior_stream("/prior", start_ns, _target_names(), mean, covariance)
+    streams = [prior, _truth(course, truth_s, clocks_s)]
     streams.append(_fixes(course, truth_s[10:-10:10], parameters.known_sigma_m, noise_rng))
     for number, times_s in enumerate(seen_s):
         streams.append(_sightings(parameters, number, times_s, clocks_s[number], course, noise_rng))
@@ -147,17 +149,6 @@ def _course(
     return Course(times_s, states, bias_rad + parameters.bias_drift * walks)
 
 
-def _prior(mean: Floats, sigma: Floats) -> Stream:
-    return make_stream(
-        "/prior",
-        schemas.GAUSSIAN_ESTIMATE,
-        simulation_stamps_ns([0.0]),
-        metadata=state_metadata(_target_names()),
-        mean=mean.reshape(1, -1),
-        covariance=np.diag(sigma**2).reshape(1, -1),
-    )
-
-
 def _target_names() -> list[str]:
     return [name for target in range(1, TARGETS + 1) for name in moving_target_components(target)]
 
@@ -173,25 +164,15 @@ def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
     targets, bias_rad = course.targets[rows], course.bias_rad[rows]
     count = len(rows)
     clocks = np.tile(clocks_s, (count, 1))
-    return make_stream(
-        "/truth",
-        schemas.TRUTH_STATE,
-        simulation_stamps_ns(times_s),
-        metadata=state_metadata(names),
-        state=np.concatenate([targets.reshape(count, -1), bias_rad.reshape(count, -1), clocks], axis=1),
-    )
+    state = np.concatenate([targets.reshape(count, -1), bias_rad.reshape(count, -1), clocks], axis=1)
+    return truth_stream("/truth", simulation_stamps_ns(times_s), names, state)
 
 
 def _fixes(course: Course, times_s: Floats, sigma_m: float | None, rng: np.random.Generator) -> Stream:
     """Simulate where the first target says that it is: a topic without messages where it does not."""
     rows, known_m = (course.rows(times_s), sigma_m) if sigma_m else (np.empty(0, np.int64), 1.0)
-    return make_stream(
-        "/target1/fix",
-        schemas.POSITION_FIX,
-        simulation_stamps_ns(course.times_s[rows]),
-        position_m=course.targets[rows, 0, :3] + known_m * rng.normal(size=(len(rows), 3)),
-        covariance_m2=np.tile((known_m**2 * np.eye(3)).ravel(), (len(rows), 1)),
-    )
+    measured = course.targets[rows, 0, :3] + known_m * rng.normal(size=(len(rows), 3))
+    return fix_stream("/target1/fix", simulation_stamps_ns(course.times_s[rows]), measured, known_m**2)
 
 
 def _sightings(
@@ -209,7 +190,7 @@ def _sightings(
     ahead = to_world.inv().apply(offset)
     angles = np.stack(azimuth_elevation(rotate(course.bias_rad[rows, number].T, ahead.T)), axis=1)
     measured = wrap_angle(angles + parameters.sigma_rad * rng.normal(size=angles.shape))
-    stated = {"acceleration_density": repr(parameters.acceleration_density)}
+    stated = stated_numbers(parameters, "acceleration_density")
     stated |= {f"sigma_{angle}_rad": repr(parameters.sigma_rad) for angle in ("azimuth", "elevation")}
     return make_stream(
         f"/sensor{number + 1}/moving_line_of_sight",

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from recorders.common_streams import outage_stream, prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.inertial import earth_rate, gravity
-from recorders.models.states import NAVIGATION, state_metadata
+from recorders.models.states import NAVIGATION
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 from recorders.simulators.navigation_parameters import NavigationParameters, Span, Unit
 
@@ -64,21 +65,14 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
             force_bias,
         ]
     )
-    metadata = state_metadata(NAVIGATION)
     streams = [
         inertial,
         *_gnss(parameters, path, gnss_rng),
         *_carried(parameters, path, carried_rng),
-        make_stream(
-            "/body/truth",
-            schemas.TRUTH_STATE,
-            simulation_stamps_ns(times_s),
-            metadata=metadata,
-            state=truth,
-        ),
+        truth_stream("/body/truth", simulation_stamps_ns(times_s), NAVIGATION, truth),
     ]
     if parameters.prior.is_told:
-        streams.append(_prior(parameters, truth[0], metadata, prior_rng))
+        streams.append(_prior(parameters, truth[0], prior_rng))
     return Recording(streams)
 
 
@@ -174,7 +168,7 @@ def _inertial(
         "/body/inertial",
         schemas.INERTIAL_SAMPLE,
         simulation_stamps_ns(times_s + unit.delay_s),
-        metadata={name: repr(getattr(unit, name)) for name in densities} | _origin(parameters),
+        metadata=stated_numbers(unit, *densities) | _origin(parameters),
         specific_force_mps2=_rounded(forces, unit.force_quantum_mps2),
         turn_rate_radps=_rounded(rates, unit.gyro_quantum_radps),
         magnetic_field_ut=np.full_like(force, np.nan),
@@ -250,11 +244,7 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
             )
         )
     if gnss.outages_s:
-        spans_ns = simulation_stamps_ns(np.array(gnss.outages_s))
-        outages = make_stream(
-            "/body/fix/outages", schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1]
-        )
-        streams.append(outages)
+        streams.append(outage_stream("/body/fix/outages", simulation_stamps_ns(gnss.outages_s)))
     return streams
 
 
@@ -319,9 +309,7 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
     return np.any(inside, axis=1, keepdims=True)[:, 0]
 
 
-def _prior(
-    parameters: NavigationParameters, truth: Floats, metadata: dict[str, str], rng: np.random.Generator
-) -> Stream:
+def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
     """Draw the first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
 
     The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
@@ -351,20 +339,13 @@ def _prior(
     up = (turned * tilt).inv().apply([0.0, 0.0, 1.0])
     level = prior.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
     covariance[6:9, 6:9] = level + prior.heading_sigma_rad**2 * np.outer(up, up)
-    return make_stream(
-        "/body/prior",
-        schemas.GAUSSIAN_ESTIMATE,
-        simulation_stamps_ns([0.0]),
-        metadata=metadata | _origin(parameters),
-        mean=mean[None],
-        covariance=covariance.reshape(1, -1),
-    )
+    start_ns = simulation_stamps_ns(0.0)
+    return prior_stream("/body/prior", start_ns, NAVIGATION, mean, covariance, _origin(parameters))
 
 
 def _origin(parameters: NavigationParameters) -> dict[str, str]:
     """Return where on earth the plane lies, as channels state it."""
-    names = ("origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
-    return {name: repr(getattr(parameters, name)) for name in names}
+    return stated_numbers(parameters, "origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
 
 
 NAVIGATING = Simulator(

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 from scipy.spatial.transform import Rotation
 
+from recorders.common_streams import fix_stream, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.optical import bias_components, line_of_sight, target_components
 from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
 
@@ -101,13 +101,7 @@ def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
     ]
     times_ns = np.unique(looks_ns)
     state = np.concatenate([targets.ravel(), bias.ravel()])
-    return make_stream(
-        "/truth",
-        schemas.TRUTH_STATE,
-        times_ns,
-        metadata=state_metadata(components),
-        state=np.tile(state, (len(times_ns), 1)),
-    )
+    return truth_stream("/truth", times_ns, components, np.tile(state, (len(times_ns), 1)))
 
 
 def _mounting(number: int, place: Array, attitude: Array) -> list[Stream]:
@@ -115,13 +109,7 @@ def _mounting(number: int, place: Array, attitude: Array) -> list[Stream]:
     to_sensor = Rotation.from_euler("ZYX", attitude)
     start_ns = [SIMULATION_EPOCH_NS]
     return [
-        make_stream(
-            f"/sensor{number}/position",
-            schemas.POSITION_FIX,
-            start_ns,
-            position_m=place[None],
-            covariance_m2=np.zeros((1, 9)),
-        ),
+        fix_stream(f"/sensor{number}/position", start_ns, place[None], 0.0),
         make_stream(
             f"/sensor{number}/attitude",
             schemas.ORIENTATION,

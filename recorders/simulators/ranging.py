@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -121,7 +121,7 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
     error += _excess(parameters.blocked, times_s, len(anchors), blocked_rng)
     noise = parameters.sigma_range_m * noise_rng.normal(size=ranges.shape)
     ranges += parameters.bias_range_m + error[:, :, None] + noise
-    shape, metadata = ranges.shape, state_metadata(POSE)
+    shape = ranges.shape
     stated = ("height_m", "acceleration_density", "turn_acceleration_density", "sigma_range_m")
     anchor_id, tag_id = (np.broadcast_to(each, shape).ravel() for each in np.indices(shape)[1:])
     start_ns = simulation_stamps_ns([0.0])
@@ -141,26 +141,13 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
                 point_id=np.arange(len(tags)),
                 position_m=tags,
             ),
-            make_stream(
-                "/trolley/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                start_ns,
-                metadata=metadata,
-                mean=np.zeros((1, 6)),
-                covariance=np.diag(sigma**2).reshape(1, 36),
-            ),
-            make_stream(
-                "/trolley/truth",
-                schemas.TRUTH_STATE,
-                simulation_stamps_ns(times_s),
-                metadata=metadata,
-                state=truth,
-            ),
+            prior_stream("/trolley/prior", start_ns, POSE, np.zeros(6), np.diag(sigma**2)),
+            truth_stream("/trolley/truth", simulation_stamps_ns(times_s), POSE, truth),
             make_stream(
                 "/trolley/ranges",
                 schemas.ANCHOR_RANGE,
                 simulation_stamps_ns(np.repeat(times_s, shape[1] * shape[2])),
-                metadata={name: repr(getattr(parameters, name)) for name in stated},
+                metadata=stated_numbers(parameters, *stated),
                 anchor_id=anchor_id,
                 tag_id=tag_id,
                 range_m=ranges.ravel(),

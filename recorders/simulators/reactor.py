@@ -9,13 +9,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.reactor import react, total_pressure
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
-COMPONENTS = {"components": "pressure_a,pressure_b", "kinds": "linear,linear"}
+COMPONENTS = ("pressure_a", "pressure_b")
 Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
@@ -58,29 +59,22 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
     (total,) = total_pressure(state[1:].T)
     read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)
     stamps_ns = simulation_stamps_ns(parameters.step_s * np.arange(parameters.steps + 1))
-    prior_covariance = parameters.prior_variance * np.eye(2)
     return Recording(
         [
-            make_stream(
+            prior_stream(
                 "/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                stamps_ns[:1],
-                metadata=COMPONENTS,
-                mean=np.array([parameters.prior_mean]),
-                covariance=prior_covariance.reshape(1, 4),
+                stamps_ns[0],
+                COMPONENTS,
+                parameters.prior_mean,
+                parameters.prior_variance * np.eye(2),
             ),
-            make_stream("/truth", schemas.TRUTH_STATE, stamps_ns, metadata=COMPONENTS, state=state),
+            truth_stream("/truth", stamps_ns, COMPONENTS, state),
             make_stream(
                 "/pressure",
                 schemas.VECTOR_MEASUREMENT,
                 stamps_ns[1:],
-                metadata={
-                    "system": "batch-reactor",
-                    "components": "total_pressure",
-                    "step_s": repr(parameters.step_s),
-                    "process_variance": repr(parameters.process_variance),
-                    "pressure_variance": repr(parameters.pressure_variance),
-                },
+                metadata={"system": "batch-reactor", "components": "total_pressure"}
+                | stated_numbers(parameters, "step_s", "process_variance", "pressure_variance"),
                 value=read[:, None],
             ),
         ]

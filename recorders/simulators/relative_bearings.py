@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.planar import wrap_angle
@@ -90,13 +91,7 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
                 landmark_id=np.arange(1, len(places) + 1),
                 position_m=places,
             ),
-            make_stream(
-                "/robot1/truth",
-                schemas.TRUTH_STATE,
-                stamps,
-                metadata={"components": "x_m,y_m", "kinds": "linear,linear"},
-                state=np.tile(robot, (parameters.looks, 1)),
-            ),
+            truth_stream("/robot1/truth", stamps, ("x_m", "y_m"), np.tile(robot, (parameters.looks, 1))),
             make_stream(
                 "/robot1/relative_bearing",
                 schemas.RELATIVE_BEARING,

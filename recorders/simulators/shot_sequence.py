@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.common_streams import fix_stream, stated_numbers, truth_stream
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.acoustic import (
     SHOT_COMPONENTS,
@@ -24,7 +25,6 @@ from recorders.models.acoustic import (
 )
 from recorders.models.constant_velocity import noise_moments
 from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 from recorders.simulators.acoustic import AcousticParameters, require_time_to_hear
 
@@ -100,20 +100,19 @@ def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Re
     places = np.tile(sensors.ravel(), (len(times_s), 1))
     numbers = range(1, len(sensors) + 1)
     named = [*STATE, *(name for number in numbers for name in sensor_components(number))]
-    truth = make_stream(
-        "/shooter/truth",
-        schemas.TRUTH_STATE,
-        simulation_stamps_ns(times_s),
-        metadata=state_metadata(named),
-        state=np.concatenate([state_at(times_s), places], axis=1),
-    )
+    states = np.concatenate([state_at(times_s), places], axis=1)
+    truth = truth_stream("/shooter/truth", simulation_stamps_ns(times_s), named, states)
     start_ns = simulation_stamps_ns(np.zeros(len(sensors)))
     surveyed = make_stream(
         "/sensors", schemas.LANDMARK, start_ns, landmark_id=np.array(numbers), position_m=sensors
     )
     streams = [truth, surveyed, _reports(parameters, heard)]
+    variance_m2 = parameters.sigma_position_m**2
     for number, place in enumerate(sensors, start=1):
-        streams += [_fix(parameters, number, place), _detections(parameters, number, heard)]
+        streams += [
+            fix_stream(f"/sensor{number}/position", start_ns[:1], place[None], variance_m2),
+            _detections(parameters, number, heard),
+        ]
     return Recording(streams)
 
 
@@ -182,9 +181,7 @@ def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
     blast, shockwave = heard.muzzle_blast_rad[chosen], heard.shockwave_rad[chosen]
     side, lead = clear_side(blast, shockwave, noise), heard.time_difference_s[chosen]
     trajectory = trajectory_from_shockwave(shockwave, side, medium)
-    motion = {
-        name: repr(getattr(parameters, name)) for name in ("acceleration_density", "trajectory_density")
-    }
+    motion = stated_numbers(parameters, "acceleration_density", "trajectory_density")
     return make_stream(
         "/shooter/reports",
         schemas.SHOT_REPORT,
@@ -211,17 +208,6 @@ def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -
         muzzle_blast_azimuth_rad=heard.muzzle_blast_rad[of_sensor],
         shockwave_azimuth_rad=heard.shockwave_rad[of_sensor],
         time_difference_s=heard.time_difference_s[of_sensor],
-    )
-
-
-def _fix(parameters: ShotSequenceParameters, number: int, place: Floats) -> Stream:
-    """State where a sensor was surveyed to be."""
-    return make_stream(
-        f"/sensor{number}/position",
-        schemas.POSITION_FIX,
-        simulation_stamps_ns([0.0]),
-        position_m=place[None],
-        covariance_m2=parameters.sigma_position_m**2 * np.eye(2).reshape(1, 4),
     )
 
 

@@ -12,9 +12,8 @@ from pydantic import Field, PositiveFloat
 from scipy import fft
 
 from recorders.arrivals import HeardSound, difference_stream, microphone_stream
+from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -67,13 +66,7 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
         source[2] = places[0, 2]
         components.pop()
     time_ns = int(simulation_stamps_ns(0.0))
-    truth = make_stream(
-        "/sound/truth",
-        schemas.TRUTH_STATE,
-        [time_ns],
-        metadata=state_metadata(components),
-        state=source[None, : len(components)],
-    )
+    truth = truth_stream("/sound/truth", [time_ns], components, source[None, : len(components)])
     recordings, numbers = _recordings(parameters, places, source, rng), np.arange(1, len(places) + 1)
     differences = difference_stream(
         "/sound",

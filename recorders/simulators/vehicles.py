@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
-from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import into_frame, turn
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
@@ -196,12 +197,11 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
         *_scan_streams(
             "/infrastructure", parameters, parameters.infrastructure, scan_s, sensor, delay_rng
         ),
-        make_stream(
+        truth_stream(
             "/infrastructure/truth",
-            schemas.TRUTH_STATE,
             simulation_stamps_ns(truth_s),
-            metadata=state_metadata(POSE),
-            state=np.tile(parameters.infrastructure.pose, (len(truth_s), 1)),
+            POSE,
+            np.tile(parameters.infrastructure.pose, (len(truth_s), 1)),
         ),
     ]
     return Recording(streams)
@@ -264,30 +264,16 @@ def _scan(
 
 def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floats) -> list[Stream]:
     """Make prior and truth of every vehicle; the prior's channel states how the vehicle moves."""
-    states = drive.states_at(truth_s)
-    covariance = np.diag(parameters.prior_variance).reshape(1, 16)
+    states, stamps_ns = drive.states_at(truth_s), simulation_stamps_ns(truth_s)
+    covariance = np.diag(parameters.prior_variance)
     streams = []
     for index, rate in enumerate(drive.turn_rate_radps.tolist()):
-        motion = {
-            "turn_rate_radps": repr(rate),
-            "acceleration_sigma_mps2": repr(parameters.acceleration_sigma_mps2),
-        }
+        name, start = f"/vehicle{index + 1}", drive.nominal[index]
+        motion = {"turn_rate_radps": repr(rate)}
+        motion |= stated_numbers(parameters, "acceleration_sigma_mps2")
         streams += [
-            make_stream(
-                f"/vehicle{index + 1}/prior",
-                schemas.GAUSSIAN_ESTIMATE,
-                simulation_stamps_ns(truth_s[:1]),
-                metadata=state_metadata(PLANE_MOTION) | motion,
-                mean=drive.nominal[None, index],
-                covariance=covariance,
-            ),
-            make_stream(
-                f"/vehicle{index + 1}/truth",
-                schemas.TRUTH_STATE,
-                simulation_stamps_ns(truth_s),
-                metadata=state_metadata(PLANE_MOTION),
-                state=states[:, index],
-            ),
+            prior_stream(f"{name}/prior", stamps_ns[0], PLANE_MOTION, start, covariance, motion),
+            truth_stream(f"{name}/truth", stamps_ns, PLANE_MOTION, states[:, index]),
         ]
     return streams
 

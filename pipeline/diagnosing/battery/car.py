@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.common_streams import fix_stream, prior_stream
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from replay.engine.streams.sources import MemorySource
 
@@ -177,7 +178,7 @@ def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
 
 def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
     """Return the car as a log, which `fl.write` writes; a prior is about the true start."""
-    n, half = len(car.fix_s), 0.5 * car.compass_rad
+    half = 0.5 * car.compass_rad
     zero = np.zeros_like(half)
     wheels = make_stream(
         "/car/odometry",
@@ -190,13 +191,7 @@ def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> 
         forward_mps=car.speed_mps,
         turn_radps=car.turn_radps,
     )
-    fixes = make_stream(
-        "/car/fix",
-        schemas.POSITION_FIX,
-        stamps_ns(car.fix_s),
-        position_m=car.fix_m,
-        covariance_m2=np.tile(car.fix_variance_m2 * np.eye(2).ravel(), (n, 1)),
-    )
+    fixes = fix_stream("/car/fix", stamps_ns(car.fix_s), car.fix_m, car.fix_variance_m2)
     compass = make_stream(
         "/car/heading",
         schemas.ORIENTATION,
@@ -204,14 +199,8 @@ def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> 
         metadata={"covariance_rad2": ",".join(3 * [repr(COMPASS_SIGMA_RAD**2)])},
         quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
     )
-    prior = make_stream(
-        "/car/prior",
-        schemas.GAUSSIAN_ESTIMATE,
-        np.zeros(1, np.int64),
-        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
-        mean=car.truth.pose[:1],
-        covariance=np.diag(START_SIGMAS**2).ravel()[None],
-    )
+    pose = ("x_m", "y_m", "heading_rad")
+    prior = prior_stream("/car/prior", 0, pose, car.truth.pose[0], np.diag(START_SIGMAS**2))
     return source([wheels, fixes, *[compass] * has_compass, *[prior] * has_prior])
 
 

@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
+from recorders.common_streams import outage_stream
 from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
+from recorders.log import Stream
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource
@@ -110,16 +111,9 @@ def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> Mem
     for topic in (FIX, VELOCITY):
         stream = streams[topic]
         streams[topic] = stream.take(~np.isin(stream.log_time_ns, gone_ns))
-    start_s, length_s = (
-        np.array([getattr(each, name) for each in windows]) for name in ("start_s", "length_s")
-    )
-    begin_ns = rows.time_ns[0] + np.rint(1e9 * start_s).astype(np.int64)
-    streams[f"{FIX}/outages"] = make_stream(
-        f"{FIX}/outages",
-        schemas.OUTAGE,
-        begin_ns,
-        end_time_ns=begin_ns + np.rint(1e9 * length_s).astype(np.int64),
-    )
+    spans_s = np.array([(each.start_s, each.length_s) for each in windows]).reshape(-1, 2)
+    spans_ns = rows.time_ns[0] + np.cumsum(np.rint(1e9 * spans_s).astype(np.int64), axis=1)
+    streams[f"{FIX}/outages"] = outage_stream(f"{FIX}/outages", spans_ns)
     return replace(source, streams=streams)
 
 

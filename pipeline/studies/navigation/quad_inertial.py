@@ -23,12 +23,13 @@ from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import rms_length
+from recorders.common_streams import prior_stream, truth_stream
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import read_mapping, recordings_in
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose, heading
 from recorders.models.planar import wrap_angle
-from recorders.models.states import NAVIGATION, state_metadata
+from recorders.models.states import NAVIGATION
 from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.arrays import Floats, Integers
@@ -177,23 +178,10 @@ def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None 
     mean = np.concatenate([fix["position_m"][0], flight.state[row, 3:], np.zeros(6)])
     inertial = replace(samples, topic="/inertial", publish_time_ns=unit_ns, log_time_ns=unit_ns)
     streams = [
-        make_stream(
-            "/prior",
-            schemas.GAUSSIAN_ESTIMATE,
-            fix.publish_time_ns[:1],
-            metadata=state_metadata(NAVIGATION),
-            mean=mean[None],
-            covariance=np.diag(PRIOR_SIGMA**2).reshape(1, -1),
-        ),
+        prior_stream("/prior", fix.publish_time_ns[0], NAVIGATION, mean, np.diag(PRIOR_SIGMA**2)),
         inertial,
         fix,
-        make_stream(
-            "/truth",
-            schemas.TRUTH_STATE,
-            flight.time_ns,
-            metadata=state_metadata(NAVIGATION[:POSE]),
-            state=flight.state,
-        ),
+        truth_stream("/truth", flight.time_ns, NAVIGATION[:POSE], flight.state),
     ]
     return MemorySource(
         {stream.topic: stream for stream in streams}, flight.source.run, flight.source.name
