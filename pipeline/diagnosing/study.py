@@ -64,7 +64,7 @@ class Fault(NamedTuple):
         value: of its number, which its 95 % interval should hold; None where there is none.
         record: the recorder's parameters that make it.
         settings: those of the estimator.
-        alteration: of the topic `altered`, by `by`.
+        alteration: of `altered`, which is `topic` where that is not said, by `by`, or else by `value`.
         exchanged: two topics whose messages stand for each other.
     """
 
@@ -75,7 +75,7 @@ class Fault(NamedTuple):
     settings: Mapping[str, Any] = {}
     altered: str = ""
     alteration: Callable[[MemorySource, int], alter.Alteration] | None = None
-    by: float = 0.0
+    by: float | None = None
     exchanged: tuple[str, str] | None = None
 
 
@@ -102,7 +102,17 @@ def _landmark_numbers(source: MemorySource, seed: int) -> alter.Alteration:
     return alter.renumbered("landmark_id", first, second)
 
 
+def _loss(_: MemorySource, seed: int) -> alter.Alteration:
+    return alter.thinned(seed)
+
+
+def _outliers(_: MemorySource, seed: int) -> alter.Alteration:
+    return alter.strayed(seed, "position_m")
+
+
+TOO_SURE = _plain(alter.spread("covariance_m2"))
 SEEN, FIX, VELOCITY = "/robot1/range_bearing", "/body/fix", "/body/velocity"
+OF_VEHICLE = "/vehicle2/fix"
 NOISE: Kind = "measurement noise"
 BIAS: Kind = "bias or turned frame"
 LOST: Kind = "lost messages"
@@ -125,22 +135,14 @@ SCENARIOS = {
             "delay": Fault("delay", SEEN, 0.05, record={"range_bearing": {"stamp_offset_s": 0.05}}),
             "outliers": Fault("outliers", record={"range_bearing": {"outlier_probability": 0.02}}),
             "drift": Fault("clock drift", altered=SEEN, alteration=_drift, by=1e-4),
-            "numbers": Fault(
-                "exchanged numbers", "/landmarks", altered="/landmarks", alteration=_landmark_numbers
-            ),
+            "numbers": Fault("exchanged numbers", "/landmarks", alteration=_landmark_numbers),
             "heading": Fault(
-                "start",
-                "/robot1/prior",
-                altered="/robot1/prior",
-                alteration=_plain(alter.shifted("mean", 2)),
-                by=0.5,
+                "start", "/robot1/prior", alteration=_plain(alter.shifted("mean", 2)), by=0.5
             ),
             "frame": Fault(
                 BIAS, SEEN, 2.0 * DEGREE, record={"range_bearing": {"bias_bearing_rad": 2.0 * DEGREE}}
             ),
-            "loss": Fault(
-                LOST, SEEN, altered=SEEN, alteration=lambda _, seed: alter.thinned(seed), by=0.2
-            ),
+            "loss": Fault(LOST, SEEN, alteration=_loss, by=0.2),
         },
     ),
     "navigation": Scenario(
@@ -148,54 +150,22 @@ SCENARIOS = {
         {"duration_s": 40.0, "unit": {"rate_hz": 50.0, "force_noise_density": 0.02}},
         "ekf",
         {
-            "R": Fault(
-                NOISE,
-                FIX,
-                np.log(3.0),
-                altered=FIX,
-                alteration=_plain(alter.spread("covariance_m2")),
-                by=-np.log(3.0),
-            ),
+            "R": Fault(NOISE, FIX, np.log(3.0), alteration=TOO_SURE, by=-np.log(3.0)),
             "Q": Fault(
                 "process noise",
                 "force_noise_density",
                 np.log(10.0),
                 settings={"force_noise_density": 0.02 / 10.0},
             ),
-            "bias": Fault(
-                BIAS,
-                VELOCITY,
-                0.3,
-                altered=VELOCITY,
-                alteration=_plain(alter.shifted("velocity_mps", 0)),
-                by=0.3,
-            ),
+            "bias": Fault(BIAS, VELOCITY, 0.3, alteration=_plain(alter.shifted("velocity_mps", 0))),
             "delay": Fault("delay", FIX, 0.05, record={"gnss": {"delay_s": 0.05}}),
-            "outliers": Fault(
-                "outliers",
-                altered=FIX,
-                alteration=lambda _, seed: alter.strayed(seed, "position_m"),
-                by=0.02,
-            ),
+            "outliers": Fault("outliers", altered=FIX, alteration=_outliers, by=0.02),
             "drift": Fault("clock drift", altered=FIX, alteration=_drift, by=1e-4),
-            "heading": Fault(
-                "start",
-                "/body/prior",
-                altered="/body/prior",
-                alteration=_plain(alter.heading_turned),
-                by=0.5,
-            ),
+            "heading": Fault("start", "/body/prior", alteration=_plain(alter.heading_turned), by=0.5),
             "frame": Fault(
-                BIAS,
-                "",
-                None,
-                altered=VELOCITY,
-                alteration=_plain(alter.turned("velocity_mps")),
-                by=2.0 * DEGREE,
+                BIAS, altered=VELOCITY, alteration=_plain(alter.turned("velocity_mps")), by=2.0 * DEGREE
             ),
-            "loss": Fault(
-                LOST, FIX, altered=FIX, alteration=lambda _, seed: alter.thinned(seed), by=0.2
-            ),
+            "loss": Fault(LOST, FIX, alteration=_loss, by=0.2),
         },
     ),
     "vehicles": Scenario(
@@ -203,66 +173,25 @@ SCENARIOS = {
         {"stochastic": True},
         "vehicle-kalman",
         {
-            "R": Fault(
-                NOISE,
-                "/vehicle2/fix",
-                np.log(3.0),
-                altered="/vehicle2/fix",
-                alteration=_plain(alter.spread("covariance_m2")),
-                by=-np.log(3.0),
-            ),
+            "R": Fault(NOISE, OF_VEHICLE, np.log(3.0), alteration=TOO_SURE, by=-np.log(3.0)),
             "Q": Fault(
                 "process noise",
                 "acceleration_sigma_mps2",
                 np.log(4.0),
                 settings={"acceleration_sigma_mps2": 0.5 / 4.0},
             ),
-            "bias": Fault(
-                BIAS,
-                "/vehicle2/fix",
-                3.0,
-                altered="/vehicle2/fix",
-                alteration=_plain(alter.shifted("position_m", 0)),
-                by=3.0,
-            ),
-            "delay": Fault(
-                "delay",
-                "/vehicle2/fix",
-                0.05,
-                altered="/vehicle2/fix",
-                alteration=_plain(alter.delayed),
-                by=0.05,
-            ),
-            "outliers": Fault(
-                "outliers",
-                altered="/vehicle2/fix",
-                alteration=lambda _, seed: alter.strayed(seed, "position_m"),
-                by=0.02,
-            ),
-            "drift": Fault("clock drift", altered="/vehicle2/fix", alteration=_drift, by=1e-4),
-            "numbers": Fault("exchanged numbers", exchanged=("/vehicle1/fix", "/vehicle2/fix")),
+            "bias": Fault(BIAS, OF_VEHICLE, 3.0, alteration=_plain(alter.shifted("position_m", 0))),
+            "delay": Fault("delay", OF_VEHICLE, 0.05, alteration=_plain(alter.delayed)),
+            "outliers": Fault("outliers", altered=OF_VEHICLE, alteration=_outliers, by=0.02),
+            "drift": Fault("clock drift", altered=OF_VEHICLE, alteration=_drift, by=1e-4),
+            "numbers": Fault("exchanged numbers", exchanged=("/vehicle1/fix", OF_VEHICLE)),
             "heading": Fault(
-                "start",
-                "/vehicle3/prior",
-                altered="/vehicle3/prior",
-                alteration=_plain(alter.shifted("mean", 3)),
-                by=-6.0,
+                "start", "/vehicle3/prior", alteration=_plain(alter.shifted("mean", 3)), by=-6.0
             ),
             "frame": Fault(
-                BIAS,
-                "/vehicle2/fix",
-                2.0 * DEGREE,
-                altered="/vehicle2/fix",
-                alteration=_plain(alter.turned("position_m")),
-                by=2.0 * DEGREE,
+                BIAS, OF_VEHICLE, 2.0 * DEGREE, alteration=_plain(alter.turned("position_m"))
             ),
-            "loss": Fault(
-                LOST,
-                "/vehicle2/fix",
-                altered="/vehicle2/fix",
-                alteration=lambda _, seed: alter.thinned(seed),
-                by=0.2,
-            ),
+            "loss": Fault(LOST, OF_VEHICLE, alteration=_loss, by=0.2),
         },
     ),
 }
@@ -310,8 +239,8 @@ def _recorded(
     source = memory_source(*record_run(scenario.recorder, scenario.parameters, seed, run))
     faulty = memory_source(*record_run(scenario.recorder, parameters, seed, run))
     if fault.alteration is not None:
-        alteration = fault.alteration(faulty, run)
-        faulty = alter.altered(faulty, fault.altered, alteration, fault.by)
+        alteration, by = fault.alteration(faulty, run), fault.value if fault.by is None else fault.by
+        faulty = alter.altered(faulty, fault.altered or fault.topic, alteration, by or 0.0)
     if fault.exchanged is not None:
         faulty = alter.exchanged(faulty, *fault.exchanged)
     return source, faulty

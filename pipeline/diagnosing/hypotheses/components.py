@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import AXES, bare, entry_of
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
-from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, Kind, in_sense, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind, in_sense, in_topic, supposed
 from recorders.importers.units import unit_of
 from recorders.log import Stream
 from recorders.parameters import Parameters
@@ -203,16 +203,13 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
 
 def _sign(topic: str, entry: Entry) -> Hypothesis:
     turned = alter.scaled(entry.field, entry.place)
-    return Hypothesis(
+    return supposed(
         "factor or sign",
         topic,
         entry.name,
-        (),
-        1.0,
         in_topic(topic, lambda stream, _: turned(stream, -1.0)),
-        lambda *_: f"{topic}: {entry.name} has the wrong sign",
-        lambda _: Advice(f"{topic}.{bare(entry.name)}_scale", -1),
-        IS_SO,
+        f"{topic}: {entry.name} has the wrong sign",
+        Advice(f"{topic}.{bare(entry.name)}_scale", -1),
         reported=lambda _: -1.0,
     )
 
@@ -288,16 +285,13 @@ def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:
     order[first], order[second] = second, first
     axes = "".join(AXES[each] for each in order)
     names = f"{AXES[first]} and {AXES[second]}"
-    return Hypothesis(
+    return supposed(
         "exchanged axes",
         topic,
         field,
-        (),
-        1.0,
         in_topic(topic, alter.permuted(field, order)),
-        lambda *_: f"{topic}: {names} of {field} are exchanged",
-        lambda _: Advice(f"{topic}.{bare(field)}_axes", axes),
-        IS_SO,
+        f"{topic}: {names} of {field} are exchanged",
+        Advice(f"{topic}.{bare(field)}_axes", axes),
     )
 
 
@@ -326,26 +320,20 @@ def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis
     )
     rates = tuple(share / span_s for share in SHARES)
     yield _growing(topic, "heading_rad", rates, alter.heading_ramped(first_ns))
-    yield Hypothesis(
+    yield supposed(
         "factor or sign",
         topic,
         "heading_rad",
-        (),
-        1.0,
         in_topic(topic, lambda stream, _: alter.heading_multiplied(stream, -1.0)),
-        lambda *_: f"{topic}: the heading has the wrong sign",
-        lambda _: Advice(f"{topic}.heading_scale", -1),
-        IS_SO,
+        f"{topic}: the heading has the wrong sign",
+        Advice(f"{topic}.heading_scale", -1),
         reported=lambda _: -1.0,
     )
-    yield Hypothesis(
+    yield supposed(
         "convention",
         topic,
         "heading_rad",
-        (),
-        1.0,
         in_topic(topic, alter.heading_from_north),
-        lambda *_: f"{topic}: the heading is clockwise from north, not anticlockwise from east",
-        lambda _: Advice(f"{topic}.heading_convention", "north"),
-        IS_SO,
+        f"{topic}: the heading is clockwise from north, not anticlockwise from east",
+        Advice(f"{topic}.heading_convention", "north"),
     )

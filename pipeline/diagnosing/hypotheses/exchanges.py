@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice
-from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic, supposed
 from pipeline.diagnosing.likelihood import Trial
 from recorders.log import Stream
 from replay.engine.replaying.estimator import Bound
@@ -42,7 +42,7 @@ def of_numbers(
             without = in_topic(topic, alter.renumbered(field, first, second))
             words = f"{topic}: {field} {first} and {second} are exchanged"
             advice = Advice(f"{topic}.exchanged", f"{first},{second}")
-            yield _exchange(topic, f"{first} {second}", words, advice, without)
+            yield supposed("exchanged numbers", topic, f"{first} {second}", without, words, advice)
     of_case = {split_topic(each.name + "/_")[1]: each.streams for each in bound}
     cases = _suspects((split_topic(topic)[1], stream) for topic, stream in innovations.items())
     for one, other in combinations(sorted(each for each in cases if each in of_case), 2):
@@ -50,7 +50,8 @@ def of_numbers(
             if source.topics[here].schema_name == source.topics[there].schema_name:
                 words = f"{here} and {there} are exchanged"
                 advice = Advice(f"{here}.exchanged", there)
-                yield _exchange(here, there, words, advice, _back(here, there))
+                without = _back(here, there)
+                yield supposed("exchanged numbers", here, there, without, words, advice)
 
 
 def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
@@ -68,19 +69,3 @@ def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
             means[name] = max(means.get(name, 0.0), float(nis))
     worst = sorted(means, key=lambda name: -means[name])[:SUSPECTS]
     return worst if worst and means[worst[0]] > SUSPECT else []
-
-
-def _exchange(
-    topic: str, part: str, words: str, advice: Advice, without: Callable[[Trial, float], Trial]
-) -> Hypothesis:
-    return Hypothesis(
-        "exchanged numbers",
-        topic,
-        part,
-        (),
-        1.0,
-        without,
-        lambda *_: words,
-        lambda _: advice,
-        IS_SO,
-    )

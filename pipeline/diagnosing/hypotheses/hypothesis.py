@@ -87,7 +87,30 @@ class Hypothesis:
 
 
 GainsOf = Callable[[Sequence[tuple[Hypothesis, Number]]], Sequence[float]]
-IS_SO: Mapping[float, str] = {1.0: ""}  # the numbers of what is so, or is not
+
+
+def supposed(
+    kind: Kind,
+    topic: str,
+    part: str,
+    without: Callable[[Trial, Any], Trial],
+    words: str,
+    advice: Advice | None,
+    reported: Callable[[float], float] = float,
+) -> Hypothesis:
+    """Return the hypothesis of what is so or is not, and has no number: see `Hypothesis`."""
+    return Hypothesis(
+        kind,
+        topic,
+        part,
+        (),
+        1.0,
+        without,
+        lambda *_: words,
+        lambda _: advice,
+        {1.0: ""},
+        reported=reported,
+    )
 
 
 def in_topic(

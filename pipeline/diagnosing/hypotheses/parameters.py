@@ -12,12 +12,12 @@ from pipeline.altering.changes import STATED
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
 from pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_RAD
 from pipeline.diagnosing.hypotheses.hypothesis import (
-    IS_SO,
     SCALES,
     Hypothesis,
     Kind,
     has,
     size_of,
+    supposed,
     times,
 )
 from pipeline.diagnosing.likelihood import Trial
@@ -208,17 +208,9 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
         return trial._replace(settings=settings)
 
     is_closed = (getattr(parameters, "gate_probability", None) or 1.0) <= GATE
-    yield Hypothesis(
-        "outliers",
-        "gate_probability",
-        "",
-        (),
-        1.0,
-        without,
-        lambda *_: "some measurements are outliers: of something else, or false",
-        lambda _: None if is_closed else Advice("gate_probability", GATE),
-        IS_SO,
-    )
+    words = "some measurements are outliers: of something else, or false"
+    advice = None if is_closed else Advice("gate_probability", GATE)
+    yield supposed("outliers", "gate_probability", "", without, words, advice)
 
 
 def _reopens(parameters: Parameters | None) -> dict[str, Any]:
