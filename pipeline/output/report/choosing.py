@@ -6,7 +6,6 @@ from pipeline.output.report.evidence import Evidence, Findings, relation
 from pipeline.output.words import listed
 
 MOST_CARDS = 4
-NONE_SOUND = "Believe none of them as they are set."
 
 
 def broken_of(found: Findings) -> list[Evidence]:

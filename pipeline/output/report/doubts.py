@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from pipeline.output.alarms import Alarm
 from pipeline.output.report.evidence import Findings, relation
-from pipeline.output.words import count, listed, quantity
+from pipeline.output.words import count, listed
 from replay.judging.errors.differences import FEWEST_RUNS
 
 MOST_NAMED = 4  # more estimators are counted
@@ -91,10 +91,9 @@ def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
     if not take or len(found.cases) < 2 or not others:
         return []
     who = [f"{label} in {number}" for label, number in sorted(others.items(), key=lambda each: -each[1])]
-    main = quantity(found.main).name.removesuffix(", RMS")
     return [
         f"that {take} is best everywhere, as in {sum(others.values())} of {len(found.cases)} cases "
-        f"another one has the least {main} ({named(who)})"
+        f"another one has the least {found.error_name} ({named(who)})"
     ]
 
 
@@ -125,8 +124,7 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
         unknown.append(f"the covariances of {whose}, which nothing here judges")
     lacking = [label for label in found.labels if label not in found.compared]
     if lacking and found.compared:
-        main = quantity(found.main).name.removesuffix(", RMS")
         where = " in every case" if len(found.cases) > 1 else ""
         have = "has" if len(lacking) == 1 else "have"
-        unknown.append(f"a comparison with {named(lacking)}, which {have} no {main}{where}")
+        unknown.append(f"a comparison with {named(lacking)}, which {have} no {found.error_name}{where}")
     return unknown

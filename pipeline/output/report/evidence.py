@@ -15,7 +15,7 @@ import pandas as pd
 
 from pipeline.output.alarms import Stressing
 from pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
-from pipeline.output.words import is_error
+from pipeline.output.words import is_error, quantity
 from replay.judging.errors.differences import (
     Difference,
     Target,
@@ -164,6 +164,11 @@ class Findings:
         """Return the quantity by which estimators are compared; empty where there is none."""
         there = [key for table in self.tables for key in table.quantities if is_error(key)]
         return next((key for key in (*PREFERRED, *there) if key in there), "")
+
+    @property
+    def error_name(self) -> str:
+        """Return what sentences call that quantity, such as "position error"."""
+        return quantity(self.main).name.removesuffix(", RMS")
 
     @cached_property
     def of(self) -> Mapping[str, Evidence]:

@@ -28,6 +28,8 @@ from replay.judging.errors.differences import FEWEST_RUNS
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
+NONE_SOUND = "Believe none of them as they are set."
+NONE_SOUND_AT_BEST = "Where each errs least, none of them can be believed."
 Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
@@ -79,8 +81,10 @@ def story(
     causes: Sequence[Cause] = (),
     timings: Timings | None = None,
     alarms: Sequence[Alarm] = (),
+    *,
+    at_best: bool = False,
 ) -> Story:
-    """Return the story of estimators that were judged.
+    """Return the story of estimators that were judged; `at_best`, each at the point where it errs least.
 
     Causes, what each cost, and alarms are told where they are known.
     """
@@ -95,7 +99,8 @@ def story(
         for label in ordered[: choosing.MOST_CARDS]
     ]
     draws, differences = _pairs(found, take, ordered[: choosing.MOST_CARDS], own)
-    verdict = _verdict(found, broken, take, equal, own, by_label, timings or {})
+    none_sound = NONE_SOUND_AT_BEST if at_best else NONE_SOUND
+    verdict = _verdict(found, broken, take, equal, own, by_label, timings or {}, none_sound)
     doubts = doubts_of(found, alarms, take, equal)
     return Story(verdict, cards, draws, differences, ordered[choosing.MOST_CARDS :], doubts)
 
@@ -108,6 +113,7 @@ def _verdict(
     own: Scale,
     causes: dict[str, Cause],
     timings: Timings,
+    none_sound: str,
 ) -> list[str]:
     """Say what to do, then who cannot be believed, and why."""
     if not found.labels:
@@ -120,14 +126,8 @@ def _verdict(
         return [_of_innovations(found), *named]
     if not take:
         least = min(broken, key=lambda each: each.error.value if each.error else math.inf)
-        least_is = (
-            f" The least error has {least.estimator}, {_value(least.error, own)}." if least.error else ""
-        )
-        return [
-            choosing.NONE_SOUND,
-            *named,
-            *([least_is.strip()] if least_is else []),
-        ]
+        has = f"The least error has {least.estimator}, {_value(least.error, own)}."
+        return [none_sound, *named, *([has] if least.error else [])]
     return [_advice(found, broken, take, equal, own, timings), *named]
 
 
@@ -141,7 +141,7 @@ def _advice(
 ) -> str:
     """Say whom to take; or that who errs least is not to be believed."""
     error = found.of[take].error
-    main = quantity(found.main).name.removesuffix(", RMS")
+    main = found.error_name
     better = [
         each
         for each in broken
@@ -191,10 +191,9 @@ def _cheapest(labels: list[str], timings: Timings) -> str:
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
     """Say what there is of the only estimator."""
-    main = quantity(found.main).name.removesuffix(", RMS")
-    errs = f"{only.estimator} has a {main} of {_value(only.error, own)} RMS" if only.error else ""
-    state = only.state
-    if state in ("too sure", "failed"):
+    error = f"{found.error_name} of {_value(only.error, own)} RMS"
+    errs = f"{only.estimator} has a {error}" if only.error else ""
+    if only.state in ("too sure", "failed"):
         return [*filter(None, [errs and f"{errs}."]), _doubt(only, causes)]
     if only.decisive is None:
         return [f"{errs}; whether its covariance is right is not known." if errs else ""]
@@ -372,7 +371,7 @@ def _beside(factor: float, take: str) -> str:
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
     """Say which estimators cannot be told apart, and what differences are beyond chance."""
     draws, differences = [], []
-    main = quantity(found.main).name.removesuffix(", RMS")
+    main = found.error_name
     for label in labels if take else ():
         difference = found.difference(take, label, found.main, "low") if label != take else None
         if difference is None or not math.isfinite(difference.low):

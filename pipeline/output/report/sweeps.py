@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.output.report.choosing import NONE_SOUND
 from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, relation, runs_of
 from pipeline.output.report.story import Card, Story, story
 from pipeline.output.results import Result
@@ -149,9 +148,10 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
     best = {label: _best(sweep, label, own) for label, own in errors.items()}
     still = [label for label, own in errors.items() if _is_still(own)]
     found = sweep.at({label: (label, point) for label, point in best.items()})
-    base = story(found)
     if len(still) < len(errors):
+        base = story(found, at_best=True)
         return tried, _with_points(sweep, base, errors, best, still), found
+    base = story(found)
     keys = listed([sweep.name(key) for key in sweep.points[0]])
     return tried, replace(base, verdict=[f"No error depends on {keys}.", *base.verdict]), found
 
@@ -209,8 +209,6 @@ def _with_points(
         else:
             cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
     first, *further = base.verdict or [""]
-    if first == NONE_SOUND:  # as they are set is what the sweep changes
-        first = "Where each errs least, none of them can be believed."
     verdict = [*filter(None, [first]), *sentences, *further]
     at_best = ", each where it errs least" if len(base.cards) > 1 else ", where it errs least"
     others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in base.doubts]
