@@ -42,7 +42,6 @@ LEAST_DROP = 10.0  # of log-likelihood, that its plot shows at least
 ABOUT_PEAK = 3  # values to either side of it that are seen
 LEAST_CORRELATION = 0.25
 TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # places of a slider
-Data = Mapping[str, Any]
 
 
 @dataclass

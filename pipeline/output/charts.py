@@ -16,6 +16,7 @@ from pydantic import PositiveInt, model_validator
 from recorders.parameters import Parameters
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -167,6 +168,22 @@ def curve(
         The series, for `Panel.series`.
     """
     return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
+
+
+def curves(table: "pd.DataFrame", by: list[str], x: str, y: str, style: Style = "line") -> list[Series]:
+    """Return a series of y over x for each group of a table's rows, in order.
+
+    Args:
+        table: with these columns.
+        by: the columns that group the rows and name the series.
+        x: a column of numbers or names.
+        y: a column of numbers.
+        style: how all are drawn.
+    """
+    return [
+        curve(", ".join(map(str, key)), rows[x], rows[y], style)
+        for key, rows in table.groupby(by, sort=False)
+    ]
 
 
 def path(

@@ -33,7 +33,7 @@ BOUNDS = {
     "COG_degrees": (0.0, 360.0),
     "SOG_knots": (0.0, 102.3),
 }
-NO_LATITUDE, NO_LONGITUDE, NO_COURSE, NO_SPEED = 91.0, 181.0, 360.0, 102.3
+NO_COURSE, NO_SPEED = 360.0, 102.3
 
 
 class AisParameters(Parameters):

@@ -12,7 +12,7 @@ from recorders.plausibility.motion import Motion, Slope
 
 GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
 STEADY_M = 5.0
-INTEGER, INTEGERS_A_DEG = 1e6, 1e7
+INTEGER = 1e6
 BETTER = 3.0
 CLEAR = 0.02  # of a spread, above which an exchange is worth trying
 SCALE = (0.9, 1.1)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.models.orientation import heading
+from recorders.models.planar import wrap_angle
 from recorders.plausibility.body import Body, Floats, Series
 from recorders.plausibility.timing import Timing, timing
 from recorders.plausibility.windows import (
@@ -22,7 +23,6 @@ from recorders.plausibility.windows import (
     places_of,
     travelled,
     turned,
-    wrapped,
 )
 
 SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
@@ -244,7 +244,7 @@ class Motion:
             speed = self.timed(self.body.speeds[0])
             sign = np.interp(course.times_s, speed.times_s, np.sign(speed.values))
             offsets = offsets + np.pi * (sign < 0.0)
-        return wrapped(offsets[np.isfinite(offsets)])
+        return wrap_angle(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
         """Compute how horizontal forces fit changes of the velocity; None where these tell nothing."""

@@ -6,10 +6,11 @@ from itertools import pairwise
 import numpy as np
 
 from recorders.models.orientation import compose, conjugate
+from recorders.models.planar import wrap_angle
 from recorders.plausibility.body import Floats, Series
 from recorders.plausibility.finding import Finding, digits
 from recorders.plausibility.motion import Motion, Slope
-from recorders.plausibility.windows import FEWEST, pairs, wrapped
+from recorders.plausibility.windows import FEWEST, pairs
 
 NEAR_DEGREES = 0.1
 TOO_FAST_RADPS = 35.0
@@ -150,7 +151,7 @@ def headings(motion: Motion) -> Iterator[Finding]:
         if ratio is None or ratio.sign < 1 or len(offsets) < FEWEST:
             continue
         mean = float(np.angle(np.mean(np.exp(1j * offsets))))
-        rest = wrapped(offsets - mean)
+        rest = wrap_angle(offsets - mean)
         spread = float(np.std(rest))
         error = spread / np.sqrt(len(rest) / 4.0)  # windows overlap
         if abs(mean) > max(SMALL_RAD, SURE * error) and spread < STEADY_RAD:

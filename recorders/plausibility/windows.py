@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.models.planar import wrap_angle
 from recorders.plausibility.body import Body, Fixes, Floats, Series
 
 SPANS_S = (2.0, 5.0, 10.0)
@@ -145,9 +146,4 @@ def turned(angles: Series, span_s: float) -> Windows:
     """Compute by how much angles change (k,) in windows of a span, wrapped to half a turn."""
     first, second = pairs(angles.times_s, span_s)
     change = angles.values[second] - angles.values[first]
-    return Windows(angles.times_s[first], angles.times_s[second], wrapped(change))
-
-
-def wrapped(angle_rad: Floats) -> Floats:
-    """Wrap angles to -pi to pi."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+    return Windows(angles.times_s[first], angles.times_s[second], wrap_angle(change))

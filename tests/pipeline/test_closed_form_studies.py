@@ -22,7 +22,6 @@ from pipeline.studies.toolkit.repetitions import (
     rms_length,
     rmse_of_runs,
     root_mean_square,
-    share_holds,
     worst_deviation,
 )
 from pipeline.studies.vehicles import scaling
@@ -72,12 +71,6 @@ def test_the_worst_of_printed_numbers_in_standard_errors() -> None:
     worst, allowed = worst_deviation(np.sqrt([2.0 + 3.0 * error, 8.0 - 5.0 * 4.0 * error]), squared, 100)
     assert worst == pytest.approx(5.0)
     assert allowed == pytest.approx(norm.ppf(1 - 0.025 / 2))
-
-
-def test_a_share_holds_within_two_standard_errors() -> None:
-    least = 0.95 - 2.0 * np.sqrt(0.95 * 0.05 / 100)
-    assert share_holds(least + 1e-9, 100)
-    assert not share_holds(least - 1e-9, 100)
 
 
 def test_traces_of_two_independent_errors() -> None:

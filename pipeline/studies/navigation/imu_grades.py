@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -88,9 +88,8 @@ def _chart(largest: pd.DataFrame) -> Chart:
     panel = Panel(
         x=Axis(label="time since the last fix (s)"),
         y=Axis(label="95 % of drives are within (m)", log=True),
+        series=curves(largest, ["grade", "estimator"], "after_s", "error_m"),
     )
-    for (grade, estimator), rows in largest.groupby(["grade", "estimator"], sort=False):
-        panel.series.append(curve(f"{grade}, {estimator}", rows["after_s"], rows["error_m"]))
     return Chart(panels=[panel])
 
 

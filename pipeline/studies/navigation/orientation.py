@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -276,12 +276,14 @@ def _noticed_late(spans: pd.DataFrame, near: tuple[float, float]) -> float:
 
 def _chart(kinds: pd.DataFrame) -> Chart:
     """Mean RMSE of every estimator by kind of movement, a panel for each part."""
-    panels = []
-    for part in PARTS:
-        panel = Panel(x=Axis(label="trials"), y=Axis(label=f"{part} RMSE (deg)", log=True))
-        for label, rows in kinds.groupby("estimator", sort=False):
-            panel.series.append(curve(str(label), rows["kind"].tolist(), rows[f"{part}_deg"], "markers"))
-        panels.append(panel)
+    panels = [
+        Panel(
+            x=Axis(label="trials"),
+            y=Axis(label=f"{part} RMSE (deg)", log=True),
+            series=curves(kinds, ["estimator"], "kind", f"{part}_deg", "markers"),
+        )
+        for part in PARTS
+    ]
     return Chart(panels=panels)
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -361,10 +361,8 @@ def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
         ("position_rmse_m", "position RMSE (m)"),
         ("heading_rmse_deg", "heading RMSE (deg)"),
     ):
-        panel = Panel(x=Axis(label="recording"), y=Axis(label=label, log=True))
-        for (offset, units), own in rows.groupby(["offset", "units"], sort=False):
-            panel.series.append(curve(f"{units}, {offset}", own["recording"], own[name], "line+markers"))
-        panels.append(panel)
+        series = curves(rows, ["units", "offset"], "recording", name, "line+markers")
+        panels.append(Panel(x=Axis(label="recording"), y=Axis(label=label, log=True), series=series))
     return Chart(title=f"{options.smoother}: units and offset of their clock", panels=panels, columns=2)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.charts import Axis, Chart, Panel, curve, curves, level
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -240,10 +240,7 @@ def _lie_chart(table: pd.DataFrame) -> Chart:
         Panel(
             x=Axis(label="lie (m)"),
             y=Axis(label=label, log=quantity != "liar_refused"),
-            series=[
-                curve(str(name), rows["lie_m"], rows[quantity], "line+markers")
-                for name, rows in table.groupby("estimator", sort=False)
-            ],
+            series=curves(table, ["estimator"], "lie_m", quantity, "line+markers"),
         )
         for quantity, label in labels.items()
     ]

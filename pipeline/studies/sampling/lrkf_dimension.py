@@ -35,18 +35,6 @@ RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others
 X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
-class Drive(Parameters):
-    """States what is recorded; estimates are judged by their positions.
-
-    Attributes:
-        scenario: name of the scenario.
-        parameters: what differs from its defaults, by name.
-    """
-
-    scenario: str
-    parameters: dict[str, Any] = {}
-
-
 class Options(Parameters):
     """States functions of several dimensions, and drives.
 
@@ -62,7 +50,7 @@ class Options(Parameters):
     functions: Annotated[int, Field(ge=2)] = 60
     phase_sigma_rad: PositiveFloat = 1.0
     pays: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    drives: dict[str, Drive] = {}
+    drives: dict[str, Record] = {}
 
 
 class Waves(NamedTuple):
@@ -179,15 +167,14 @@ def _relative(found: Floats, wanted: Floats) -> float:
 
 
 def driven(
-    experiment: Experiment, setting: Setting, name: str, drive: Drive
+    experiment: Experiment, setting: Setting, name: str, drive: Record
 ) -> tuple[list[MemorySource], pd.DataFrame]:
     """Return the runs of a scenario, kept in a folder of its name; one row per estimator and run.
 
     A row has the state's dimension, the RMSE of the position, the mean NEES for each component, and how
     long a second of a run took all cores together, in ms: the mean of all runs at once.
     """
-    record = Record(scenario=drive.scenario, parameters=drive.parameters)
-    runner = Runner(experiment.model_copy(update={"record": record}), setting)
+    runner = Runner(experiment.model_copy(update={"record": drive}), setting)
     sources = runner.obtain()
     outputs: dict[str, Ragged] = {}
     rows = []

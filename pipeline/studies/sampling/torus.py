@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -168,10 +168,7 @@ def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart
     for quantity, label in quantities.items():
         for coupling_rad in options.couplings_rad:
             of_coupling = table[table["coupling_rad"] == coupling_rad]
-            series = [
-                curve(str(name), rows["correlation"], rows[quantity])
-                for name, rows in of_coupling.groupby("samples", sort=False)
-            ]
+            series = curves(of_coupling, ["samples"], "correlation", quantity)
             panels.append(
                 Panel(
                     title=f"c = {coupling_rad:g} rad",

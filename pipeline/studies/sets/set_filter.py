@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -174,10 +174,7 @@ def _chart(summary: pd.DataFrame) -> Chart:
     """Draw area and containment, robot by robot."""
     panels = []
     for quantity, label in (("area_m2", "median area (m²)"), ("inside", "share that holds the robot")):
-        series = [
-            curve(str(estimator), rows["case"], rows[quantity], "markers")
-            for estimator, rows in summary[summary["run"] == 0].groupby("estimator", sort=False)
-        ]
+        series = curves(summary[summary["run"] == 0], ["estimator"], "case", quantity, "markers")
         panels.append(Panel(y=Axis(label=label, log=quantity == "area_m2"), series=series))
     return Chart(columns=2, panels=panels)
 

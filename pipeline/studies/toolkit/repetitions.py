@@ -115,11 +115,6 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
     return float(np.max(np.abs(printed**2 - mean) / error)), allowed
 
 
-def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
-    """Tell whether a share of so many trials is, within two standard errors, at least as expected."""
-    return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
-
-
 def groups(
     values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
 ) -> tuple[Axis, list[Series]]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -150,9 +150,8 @@ def _farthest(
 
 def _chart(table: pd.DataFrame) -> Chart:
     """Draw GOSPA of every estimator by scenario."""
-    panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m)"))
-    for label, rows in table.groupby("estimator", sort=False):
-        panel.series.append(curve(str(label), rows["run"], rows["gospa_m"], "line+markers"))
+    series = curves(table, ["estimator"], "run", "gospa_m", "line+markers")
+    panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m)"), series=series)
     return Chart(title="GOSPA (cutoff 20 m) by scenario", panels=[panel])
 
 

@@ -77,12 +77,6 @@ class Case(NamedTuple):
         assert stated is not None
         return VehiclesParameters.model_validate(stated.parameters)
 
-    @property
-    def has_losses(self) -> bool:
-        """Tell whether detections are missed or false."""
-        network = self.parameters.network
-        return network.detection_probability < 1.0 or network.clutter_per_scan > 0.0
-
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
     """Read the stamps (runs, steps) after the start, and true places (runs, steps, vehicles, 2)."""

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.charts import Axis, Chart, Panel, curves
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -151,10 +151,7 @@ def _chart(table: pd.DataFrame) -> Chart:
     }
     panels = []
     for quantity, y in axes.items():
-        series = [
-            curve(str(label), own["vehicles"], own[quantity], "line+markers")
-            for label, own in table.groupby("estimator", sort=False)
-        ]
+        series = curves(table, ["estimator"], "vehicles", quantity, "line+markers")
         panels.append(Panel(x=x, y=y, series=series))
     return Chart(columns=2, panels=panels)
 
