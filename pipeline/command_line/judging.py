@@ -17,8 +17,8 @@ from pipeline.command_line.options import (
     gap_option,
     json_option,
     recover_option,
+    replay_options,
     set_option,
-    settings_option,
 )
 from recorders.errors import BadInput
 
@@ -147,11 +147,7 @@ def evaluate(
     is_flag=True,
     help="Withhold verdicts on differences below what changes do that should not matter.",
 )
-@recover_option
-@gap_option
-@json_option
-@settings_option
-@set_option("estimators")
+@replay_options
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
@@ -175,11 +171,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
 @click.option("--model", help="The model to estimate, where several fit the log.")
 @click.option("--tried", "tells_tried", is_flag=True, help="List what was tried, with what it gains.")
-@recover_option
-@gap_option
-@json_option
-@settings_option
-@set_option("estimators")
+@replay_options
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
 
@@ -204,11 +196,7 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option(
     "--save", type=TIMELINE, help="A timeline (.rrd) of the first log to write: copies fan out in it."
 )
-@recover_option
-@gap_option
-@json_option
-@settings_option
-@set_option("estimators")
+@replay_options
 def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Replay LOG with stamps, order, inputs, start and parameters changed by next to nothing.
 

@@ -199,3 +199,8 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
         return origin_option(asked_first) if replays else asked_first
 
     return added
+
+
+def replay_options(function: Callable[..., None]) -> Callable[..., None]:
+    """Add what commands that replay logs share: how these are read, judged and printed, and settings."""
+    return recover_option(gap_option(json_option(settings_option(set_option("estimators")(function)))))

@@ -22,10 +22,25 @@ from pipeline.command_line.options import (
     late_option,
     parameters_option,
     recover_option,
+    replay_options,
     scheduler_option,
     set_option,
     settings_option,
     workers_option,
+)
+
+validate_option = click.option(
+    "--validate",
+    "held_out",
+    multiple=True,
+    type=ANY_PATH,
+    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
+)
+folds_option = click.option(
+    "--folds",
+    type=COUNT,
+    default=0,
+    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
 )
 
 
@@ -145,30 +160,15 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     default=1,
     help="Start the search from the best of N values of each parameter between its bounds.",
 )
-@click.option(
-    "--validate",
-    "held_out",
-    multiple=True,
-    type=ANY_PATH,
-    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
-)
-@click.option(
-    "--folds",
-    type=COUNT,
-    default=0,
-    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
-)
+@validate_option
+@folds_option
 @click.option(
     "--out", type=RESULT, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
 @workers_option
 @scheduler_option
-@recover_option
-@gap_option
-@json_option
-@settings_option
-@set_option("estimators")
+@replay_options
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
     """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
 
@@ -202,30 +202,15 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     metavar="NAME=LOW:HIGH",
     help="The bounds of a parameter (repeatable) [default: none].",
 )
-@click.option(
-    "--validate",
-    "held_out",
-    multiple=True,
-    type=ANY_PATH,
-    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
-)
-@click.option(
-    "--folds",
-    type=COUNT,
-    default=0,
-    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
-)
+@validate_option
+@folds_option
 @click.option(
     "--out", type=RESULT, default=Path("out/calibrate"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
 @workers_option
 @scheduler_option
-@recover_option
-@gap_option
-@json_option
-@settings_option
-@set_option("estimators")
+@replay_options
 def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     """Search the scales, biases, mounting angles, lever arms and delays that explain LOGS best.
 
