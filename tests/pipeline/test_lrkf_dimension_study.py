@@ -8,7 +8,6 @@ from pipeline.output.claims import decide
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
 from pipeline.studies.sampling.lrkf_dimension import (
-    Drive,
     Options,
     Waves,
     exact,
@@ -86,7 +85,7 @@ def test_the_study_runs_without_drives_and_asks_for_samplings(tmp_path):
 
 def test_a_drive_is_judged_by_its_position(tmp_path):
     """Run by run and estimator by estimator; the extended filter has no samples."""
-    drives = {"landmarks": Drive(scenario="landmarks", parameters={"duration_s": 2.0}).model_dump()}
+    drives = {"landmarks": {"scenario": "landmarks", "parameters": {"duration_s": 2.0}}}
     experiment = Experiment(
         title="t",
         study="lrkf-dimension",
