@@ -80,8 +80,8 @@ FAULTS = [
     ),
     Fault(
         "recorders/simulators/landmarks.py",
-        "covariance=np.diag(sigma**2).reshape(1, 9)",
-        "covariance=np.diag(sigma).reshape(1, 9)",
+        "np.diag(sigma**2)",
+        "np.diag(sigma)",
         LANDMARKS,
     ),
     Fault(

@@ -318,8 +318,8 @@ REDRAWN = [
     ),
     Fault(
         "recorders/simulators/navigation.py",
-        "unit, name",
-        "name, unit",
+        "unit, *densities",
+        "parameters, *densities",
         "tests/recorders/test_navigation.py",
     ),
     Fault(
@@ -508,8 +508,8 @@ REDRAWN = [
     ),
     Fault(
         "pipeline/studies/navigation/quad_inertial.py",
-        'offset", "units',
         'units", "offset',
+        'offset", "units',
         "tests/pipeline/test_study_charts.py",
     ),
     Fault(
@@ -673,8 +673,8 @@ REDRAWN = [
     ),
     Fault(
         "pipeline/studies/navigation/quad_inertial.py",
-        '"recording"], own[name',
-        'name], own["recording"',
+        '"recording", name,',
+        'name, "recording",',
         "tests/pipeline/test_study_charts.py",
     ),
     Fault(
@@ -805,8 +805,8 @@ REDRAWN = [
     ),
     Fault(
         "pipeline/studies/navigation/outages.py",
-        'for name in ("start_s", "length_s")',
-        'for name in ("length_s", "start_s")',
+        "each.start_s, each.length_s",
+        "each.length_s, each.start_s",
         "tests/pipeline/test_made_filter_studies.py",
     ),
     Fault(
