@@ -29,7 +29,7 @@ from pipeline.runs.experiment import (
     run_experiment,
 )
 from pipeline.runs.inputs import load_scenario
-from pipeline.runs.sweeps import Over, Sampling, nested, over_of, points_of, run_sweep
+from pipeline.runs.sweeps import Over, Sampling, over_of, points_of, run_sweep, settings_at
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, write_log
 from recorders.parameters import merge
@@ -229,7 +229,7 @@ def sweep(
     if isinstance(over, Mapping):
         over = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
     points = points_of(over, samples, sampling, stated.with_settings(own, given).seed)
-    found = [stated.with_settings(merge(own, allowed(nested(point))), given) for point in points]
+    found = [stated.with_settings(merge(own, allowed(settings_at(point))), given) for point in points]
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": _inputs(stated, found[0])})
     open_pool = _pool(workers, scheduler, executor, found)

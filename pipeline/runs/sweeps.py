@@ -27,7 +27,7 @@ from pipeline.runs.executors import PoolFactory
 from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.inputs import load_scenario
 from recorders.errors import BadInput
-from recorders.parameters import describe, in_few_words, merge, parse_settings, unit_of
+from recorders.parameters import describe, in_few_words, merge, nested, parse_settings, unit_of
 from recorders.recording import Recorder
 from recorders.registry import load
 from replay.engine.replaying.estimator import configure
@@ -159,17 +159,15 @@ def _at(over: Over, share: float) -> Any:
     return low * (high / low) ** share if over.is_log else low + share * (high - low)
 
 
-def nested(point: Mapping[str, Any]) -> dict[str, Any]:
+def settings_at(point: Mapping[str, Any]) -> dict[str, Any]:
     """Nest values by keys such as `ekf.sigma_range_m` as tables in tables.
 
-    >>> nested({"ekf.sigma_range_m": 0.1, "robots": 2})
+    >>> settings_at({"ekf.sigma_range_m": 0.1, "robots": 2})
     {'ekf': {'sigma_range_m': 0.1}, 'robots': 2}
     """
     tables: dict[str, Any] = {}
     for key, value in point.items():
-        for name in reversed([key] if is_of_topic(key) else key.split(".")):
-            value = {name: value}
-        tables = merge(tables, value)
+        tables = merge(tables, {key: value} if is_of_topic(key) else nested(key, value))
     return tables
 
 
