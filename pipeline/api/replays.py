@@ -31,7 +31,7 @@ from pipeline.runs.ensemble import Pass, Settings, judge_logs
 from pipeline.runs.estimates import add_to_hash
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import open_log, schemas
+from recorders.log import open_log, schemas, topics_of
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.evaluation import Errors, innovations_of
@@ -189,8 +189,7 @@ class Replay:
         found = [
             innovations_of(gather([log.read([topic])[topic]]), run)
             for run, log in enumerate(self.estimates)
-            for topic, stated in log.topics.items()
-            if stated.schema_name == schemas.INNOVATION.full_name
+            for topic in topics_of(log.topics, schemas.INNOVATION)
         ]
         tables = [pd.DataFrame(each._asdict()).rename(columns={"squared": "nis"}) for each in found]
         return joined(tables)

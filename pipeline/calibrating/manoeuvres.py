@@ -18,7 +18,7 @@ from pipeline.tuning.information import information
 from pipeline.tuning.objective import Run, in_memory
 from pipeline.tuning.outcome import TUNED, Tuning
 from recorders.errors import BadInput
-from recorders.log import Schema, Stream, schemas
+from recorders.log import Schema, Stream, schemas, topics_of
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import Ensemble, Source
 
@@ -137,8 +137,8 @@ def _simulated(found: Tuning, log: Source, motion: Motion) -> Run:
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
     """Find the first topic of a schema that the run has of its own."""
-    for name, topic in log.topics.items():
-        if topic.schema_name == schema.full_name and not name.startswith("/estimates/"):
+    for name in topics_of(log.topics, schema):
+        if not name.startswith("/estimates/"):
             return log.read([name])[name]
     return None
 

@@ -21,7 +21,7 @@ from pipeline.output.results import RESULT_FILE
 from pipeline.runs.ensemble import Progress
 from pipeline.runs.estimates import labels_of, recorded_estimators
 from recorders.errors import BadInput, choices, some_of
-from recorders.log import NotMcap, RunMetadata, open_log, schemas
+from recorders.log import NotMcap, RunMetadata, open_log, schemas, topics_of
 from recorders.trajectories import read_trajectory
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.trajectory_streams import truth_of
@@ -124,8 +124,7 @@ def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
 def _truth_topic(source: Source, case: str | None) -> str:
     truths = {
         topic.rpartition("/")[0].removeprefix("/"): topic
-        for topic, each in source.topics.items()
-        if each.schema_name == schemas.TRUTH_STATE.full_name
+        for topic in topics_of(source.topics, schemas.TRUTH_STATE)
     }
     if case is None and len(truths) == 1:
         return next(iter(truths.values()))

@@ -11,7 +11,7 @@ from pipeline.comparing.renamed import Renamed
 from pipeline.diagnosing.advice import number
 from pipeline.runs.ensemble import Pass, judge_logs
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, Schema, Stream, schemas
+from recorders.log import RunMetadata, Schema, Stream, schemas, topics_of
 from recorders.log.streams import concatenate
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Bound
@@ -29,11 +29,8 @@ class Outputs(Mapping[str, Stream]):
 
     def __init__(self, done: Replay, schema: Schema) -> None:
         self._estimates = done.estimates[0]
-        self._topics = [
-            name
-            for name, topic in self._estimates.topics.items()
-            if topic.schema_name == schema.full_name and topic.messages
-        ]
+        topics = self._estimates.topics
+        self._topics = [name for name in topics_of(topics, schema) if topics[name].messages]
 
     def __getitem__(self, topic: str) -> Stream:
         return self._estimates.read([topic])[topic]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
 from replay.distributions import chi2
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource
@@ -253,11 +253,8 @@ def true_path(source: MemorySource, topic: str) -> Path | None:
 
 def map_points(source: MemorySource) -> Floats:
     """Return the points of the log's map in the plane (n, 2)."""
-    found = [
-        source[topic]["position_m"][:, :2]
-        for topic, stated in source.topics.items()
-        if stated.schema_name == schemas.LANDMARK.full_name
-    ]
+    landmarks = topics_of(source.topics, schemas.LANDMARK)
+    found = [source[topic]["position_m"][:, :2] for topic in landmarks]
     return np.concatenate(found) if found else np.empty((0, 2))
 
 

@@ -34,7 +34,7 @@ from pipeline.exploring.sliders import Slider
 from pipeline.exploring.widgets import NONE, buttons, filter_choices, tags_of, time_range, widget_of
 from pipeline.output.words import label_of as label_of_quantity
 from recorders.errors import BadInput
-from recorders.log import schemas
+from recorders.log import schemas, topics_of
 
 WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
 GROW = {"flex": "1 1 350px"}
@@ -76,11 +76,7 @@ class Page:
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
         self._time = time = time_range(self.session.source.epoch_ns)  # its ends come with estimates
-        self.truths = [
-            name
-            for name, each in log.topics.items()
-            if each.schema_name == schemas.TRUTH_STATE.full_name
-        ]
+        self.truths = topics_of(log.topics, schemas.TRUTH_STATE)
         self.plots: dict[str, Plot] = {
             "scene": scene_plot(log, self.truths),
             "lens": lens_plot(),

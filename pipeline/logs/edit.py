@@ -28,7 +28,7 @@ from pipeline.logs.rewriting import (
 from pipeline.output.outputs import changed, check_files
 from pipeline.runs.initial_states import span_of
 from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Log, Stream, open_log, read_empty, schemas
+from recorders.log import Log, Stream, open_log, read_empty, schemas, topics_of
 from recorders.log.schemas import SCHEMAS
 from recorders.parameters import build
 from replay.engine.streams.sources import LogSource
@@ -277,10 +277,10 @@ def constrain(
 
 def _unit_of(log: Log, unit: str | None) -> str:
     """Find the topic of inertial samples that is meant; raises BadInput where it is not clear."""
-    kind = schemas.INERTIAL_SAMPLE.full_name
-    units = [name for name, topic in log.topics.items() if topic.schema_name == kind]
+    kind = schemas.INERTIAL_SAMPLE
+    units = topics_of(log.topics, kind)
     if not units:
-        raise BadInput(f"{log.path}: has no inertial unit, no topic of {kind}")
+        raise BadInput(f"{log.path}: has no inertial unit, no topic of {kind.full_name}")
     if unit is None and len(units) > 1:
         raise BadInput(
             f"{log.path}: has several inertial units; choose one with --unit: {', '.join(units)}"

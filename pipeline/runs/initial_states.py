@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Stream, make_stream, open_log, schemas
+from recorders.log import Clock, Stream, make_stream, open_log, schemas, topics_of
 from replay.engine.replaying.estimator import Bound
 from replay.engine.replaying.late import Late, parse_late
 from replay.engine.streams.blocks import gather
@@ -242,11 +242,10 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
     case = prior.topic.rpartition("/")[0].removeprefix("/")
     found = [
         name
-        for name, topic in estimates.topics.items()
+        for name in topics_of(estimates.topics, schemas.GAUSSIAN_ESTIMATE)
         if name.startswith("/estimates/")
-        and topic.schema_name == schemas.GAUSSIAN_ESTIMATE.full_name
         and split_topic(name)[1] == case
-        and components.keys() <= set(topic.metadata.get("components", "").split(","))
+        and components.keys() <= set(estimates.topics[name].metadata.get("components", "").split(","))
     ]
     own = [name for name in found if split_topic(name)[0] == label] or found
     if len(own) != 1:

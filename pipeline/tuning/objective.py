@@ -26,7 +26,7 @@ from pipeline.tuning.broad_starts import (
     with_find,
 )
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, schemas
+from recorders.log import RunMetadata, Stream, schemas, topics_of
 from recorders.parameters import merge, nested
 from replay.engine.replaying.estimator import Bound, Initialized, bind
 from replay.engine.replaying.replaying import collect, replay
@@ -63,11 +63,8 @@ class Run(NamedTuple):
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
     """Read what estimators read of a log, and its truths, into memory."""
     topics = {topic for each in bound for topic in (*each.static, *each.streams)}
-    topics |= {
-        name
-        for name, topic in source.topics.items()
-        if topic.schema_name == schemas.TRUTH_STATE.full_name and not name.startswith("/estimates/")
-    }
+    truths = topics_of(source.topics, schemas.TRUTH_STATE)
+    topics |= {name for name in truths if not name.startswith("/estimates/")}
     if isinstance(source, MemorySource):
         return Run(Ensemble([source]), source.name)
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)

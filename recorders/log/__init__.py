@@ -5,7 +5,7 @@ Begin with `streams`, which is what a topic is in memory, then `reader` and `wri
 
 from recorders.log.companions import Companion
 from recorders.log.container.reading import NotMcap
-from recorders.log.opening import Log, Topic, open_log
+from recorders.log.opening import Log, Topic, open_log, topics_of
 from recorders.log.reader import read_blocks, read_empty, read_span, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
@@ -30,5 +30,6 @@ __all__ = [
     "read_empty",
     "read_span",
     "read_streams",
+    "topics_of",
     "write_log",
 ]

@@ -11,6 +11,7 @@ from recorders.errors import BadInput
 from recorders.log.companions import COMPANION_OF
 from recorders.log.container.reading import Container, open_container
 from recorders.log.run import RECORD_NAME, RunMetadata
+from recorders.log.schemas import Schema
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,11 @@ class Topic:
     channel_ids: tuple[int, ...]
     metadata: Mapping[str, str]
     messages: int
+
+
+def topics_of(topics: Mapping[str, Topic], schema: Schema) -> list[str]:
+    """Return the names of the topics whose messages have a schema, in the order of `topics`."""
+    return [name for name, topic in topics.items() if topic.schema_name == schema.full_name]
 
 
 @dataclass(frozen=True)

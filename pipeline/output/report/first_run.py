@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from recorders.atomic import scratch_folder
-from recorders.log import open_log, schemas
+from recorders.log import open_log, schemas, topics_of
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
 from replay.engine.streams.sources import LogSource, Source, ensemble_of
 from replay.judging.errors.evaluation import Innovations, split_topic
@@ -137,11 +137,7 @@ def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats
     found: dict[tuple[str, str], list[tuple[Floats, Innovations]]] = {}
     for path in sorted(folder.glob(RUNS))[:MOST_RUNS]:
         output = LogSource(open_log(path))
-        topics = [
-            topic
-            for topic, each in output.topics.items()
-            if each.schema_name == schemas.INNOVATION.full_name
-        ]
+        topics = topics_of(output.topics, schemas.INNOVATION)
         judge = Judge([output], {}, gap_limit_s=GAP_LIMIT_S)
         for block in (
             ensemble_of([output]).blocks(topics, "publish_time", BLOCK_MESSAGES) if topics else ()

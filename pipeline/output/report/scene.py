@@ -16,7 +16,7 @@ from pipeline.output.report.first_run import (
     innovations_of_runs,
 )
 from pipeline.output.words import count
-from recorders.log import open_log, read_streams, schemas
+from recorders.log import open_log, read_streams, schemas, topics_of
 from replay.distributions import chi2
 from replay.engine.streams.sources import LogSource
 from replay.estimators.tracking.scans import ORIGIN, detected_places
@@ -170,11 +170,7 @@ def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
 
 
 def _landmarks(run: FirstRun) -> list[Series]:
-    topics = [
-        topic
-        for topic, each in run.source.topics.items()
-        if each.schema_name == schemas.LANDMARK.full_name
-    ]
+    topics = topics_of(run.source.topics, schemas.LANDMARK)
     found = [each["position_m"][:, :2] for each in run.source.read(topics).values() if len(each)]
     return [path("landmarks", np.concatenate(found), "triangles", reference=True)] if found else []
 
@@ -183,9 +179,8 @@ def _fixes(run: FirstRun) -> list[Series]:
     """Draw measured positions of what is estimated."""
     topics = [
         topic
-        for topic, each in run.source.topics.items()
-        if each.schema_name == schemas.POSITION_FIX.full_name
-        and (not run.case or topic.startswith(f"/{run.case}/"))
+        for topic in topics_of(run.source.topics, schemas.POSITION_FIX)
+        if not run.case or topic.startswith(f"/{run.case}/")
     ]
     found = [each["position_m"][:, :2] for each in run.source.read(topics).values() if len(each)]
     if not found:
@@ -200,9 +195,8 @@ def _clouds(run: FirstRun) -> list[Series]:
     They are drawn systematically, so that a particle's chance to be shown is its weight.
     """
     found = []
-    for topic, each in run.output.topics.items():
-        is_density = each.schema_name == schemas.DENSITY_ESTIMATE.full_name
-        is_here = is_density and split_topic(topic)[1] == run.case
+    for topic in topics_of(run.output.topics, schemas.DENSITY_ESTIMATE):
+        is_here = split_topic(topic)[1] == run.case
         if is_here and set(PLANE) <= set(run.output.empty(topic).components):
             found += _cloud_of(run, topic)
     return found
@@ -212,9 +206,8 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
     estimator, case = split_topic(topic)
     sizes = [
         name
-        for name, found in run.output.topics.items()
-        if found.schema_name == schemas.ESTIMATE_SIZE.full_name
-        and split_topic(name) == (estimator, case)
+        for name in topics_of(run.output.topics, schemas.ESTIMATE_SIZE)
+        if split_topic(name) == (estimator, case)
     ]
     stamps = [time for each in run.output.read(sizes).values() for time in each.publish_time_ns.tolist()]
     if not stamps or not isinstance(run.output, LogSource):
@@ -308,11 +301,7 @@ def _dots(label: str, points: Floats) -> Series:
 
 def _ways(source: LogSource) -> list[Floats]:
     """Return the true ways of the targets of a log, each (n, 2)."""
-    topics = [
-        topic
-        for topic, each in source.topics.items()
-        if each.schema_name == schemas.TRUTH_STATE.full_name
-    ]
+    topics = topics_of(source.topics, schemas.TRUTH_STATE)
     truths = [each for each in source.read(topics).values() if set(PLANE) <= {*each.components}]
     return [
         each["state"][:, [each.components.index(name) for name in PLANE]][thinned(len(each))]
