@@ -14,7 +14,14 @@ from recorders.parameters import Parameters
 
 
 def truth_stream(topic: str, time_ns: ArrayLike, components: Sequence[str], state: ArrayLike) -> Stream:
-    """Make the stream of true states (n, components) at n stamps."""
+    """Make the stream of true states.
+
+    Args:
+        topic: its name.
+        time_ns: (n,) stamps.
+        components: of the state, m names.
+        state: (n, m), in the components' units.
+    """
     return make_stream(
         topic, schemas.TRUTH_STATE, time_ns, metadata=state_metadata(components), state=state
     )
@@ -49,7 +56,14 @@ def prior_stream(
 
 
 def fix_stream(topic: str, time_ns: ArrayLike, position_m: ArrayLike, variance_m2: float) -> Stream:
-    """Make the stream of positions (n, 2) or (n, 3) whose axes have errors of one variance."""
+    """Make the stream of measured positions whose axes have errors of one variance.
+
+    Args:
+        topic: its name.
+        time_ns: (n,) stamps.
+        position_m: (n, 2) in the plane, or (n, 3).
+        variance_m2: of the error along each axis.
+    """
     count, axes = np.shape(position_m)
     return make_stream(
         topic,
@@ -61,7 +75,12 @@ def fix_stream(topic: str, time_ns: ArrayLike, position_m: ArrayLike, variance_m
 
 
 def outage_stream(topic: str, spans_ns: NDArray[np.int64]) -> Stream:
-    """Make the stream of spans (n, 2), begin and end, over which a sensor is silent."""
+    """Make the stream of spans over which a sensor is silent.
+
+    Args:
+        topic: its name.
+        spans_ns: (n, 2) begins and ends.
+    """
     return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
 
 
