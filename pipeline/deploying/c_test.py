@@ -12,7 +12,7 @@ from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Recursive
 from replay.engine.replaying.replaying import replay
 from replay.engine.streams.sources import LogSource
-from replay.inference.kalman.update import reading
+from replay.inference.kalman.update import message_layout
 from replay.inference.run.filtering import Filter
 from replay.inference.run.recursion import CONTROL
 
@@ -146,7 +146,7 @@ def test_text(made: CFilter) -> str:
     control = len(made.controls)
     cases = []
     for number, (name, sensor) in enumerate(made.sensors):
-        width = reading(sensor).width
+        width = message_layout(sensor).width
         cases.append(
             f"        case {number}: /* {sensor.topic}, {width} numbers */\n"
             f"            outcome = NAME_update_{name}(&filter, data, &NAME_as_tuned, &innovation);\n"

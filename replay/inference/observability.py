@@ -37,7 +37,7 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import (
     innovation_components,
-    reading,
+    message_layout,
     sensor_derivative,
     sensor_noise,
 )
@@ -136,7 +136,7 @@ def _carried_by_motion(stage: Stage) -> Function:
 def _added_by_sensor(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, t = len(sensor.measured), model.tangent
-    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
+    read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
 
     def update(

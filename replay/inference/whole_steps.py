@@ -13,7 +13,7 @@ import numpy as np
 from replay.engine.arrays import Function
 from replay.inference.kalman.predict import motion_derivative
 from replay.inference.kalman.regression import measured_with_noise, moved_with_noise, no_variances
-from replay.inference.kalman.update import reading, sensor_derivative
+from replay.inference.kalman.update import message_layout, sensor_derivative
 from replay.inference.linear_algebra.gaussian import wrap
 from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
@@ -103,7 +103,8 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
         gap = traced_step("the prediction in a gap", _gap_noise(model, motion), given)
     innovations, step = [], Shape((model.tangent,))
     for sensor in stage.sensors:
-        what, given = f"sensor {sensor.topic}", (*gaussian, Shape((reading(sensor).width,)), names)
+        what = f"sensor {sensor.topic}"
+        given = *gaussian, Shape((message_layout(sensor).width,)), names
         if kind == SAMPLED and not sensor.linear:
             sampled.append(sampled_function(_of_sensor(model, sensor), next(drawn), given))
             innovate = _sampled_sensor(sensor)
@@ -183,13 +184,13 @@ def _of_motion(model: Model, motion: Motion) -> Sampled:
 
 
 def _of_sensor(model: Model, sensor: Sensor) -> Sampled:
-    read = reading(sensor)
+    layout = message_layout(sensor)
     variances = (sensor.noise if sensor.noises else None) or no_variances
     return Sampled(
         f"sensor {sensor.topic}",
         measured_with_noise(sensor),
         lambda _, given: variances(given[1]),
-        lambda given: (read.reference(given[0]), given[1]),
+        lambda given: (layout.reference(given[0]), given[1]),
         model.kinds,
         tuple(sensor.measured.values()),
     )
@@ -198,7 +199,7 @@ def _of_sensor(model: Model, sensor: Sensor) -> Sampled:
 def _linear_sensor(
     model: Model, sensor: Sensor, memory: Callable[[], Any], *, is_iterated: bool
 ) -> Function:
-    linearise, read = sensor_derivative(model, sensor), reading(sensor)
+    linearise, layout = sensor_derivative(model, sensor), message_layout(sensor)
     m, read_state, add = len(sensor.measured), tuple_of(model.size), adding_noise(len(sensor.measured))
     angular = [kind == "angle" for kind in sensor.measured.values()]
     step_to, chain = relinearising(model)
@@ -210,12 +211,12 @@ def _linear_sensor(
             work = work._replace(step=moved[0], slope=moved[1])
             step_to(mean, work)
             state = work.state
-        linearise(read_state(state), read.reference(data), parameters, work)
+        linearise(read_state(state), layout.reference(data), parameters, work)
         if is_iterated:
             chain(rows, work)
         gain, variances = zeros(m, 0), []
         if sensor.covariance:
-            add(noise, read.noise(data))
+            add(noise, layout.noise(data))
         elif sensor.noise is not None and sensor.noises:
             gain, variances = work.noise_gain[:m, : sensor.noises], sensor.noise(parameters)
         elif sensor.noise is not None:
@@ -230,14 +231,14 @@ def _linear_sensor(
 
 
 def _sampled_sensor(sensor: Sensor) -> Function:
-    read, m = reading(sensor), len(sensor.measured)
+    layout, m = message_layout(sensor), len(sensor.measured)
     angular = [kind == "angle" for kind in sensor.measured.values()]
     add = adding_noise(m)
 
     def innovate(_: Any, __: Any, data: Any, parameters: Any, centre: Any) -> Any:
         noise = zeros(m, m)
         if sensor.covariance and not sensor.noises:
-            add(noise, read.noise(data))
+            add(noise, layout.noise(data))
         elif sensor.noise is not None and not sensor.noises:
             add(noise, sensor.noise(parameters))
         return {"v": [wrap(data[i] - centre[i], angular[i]) for i in range(m)], "N": noise}

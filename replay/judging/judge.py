@@ -32,8 +32,8 @@ from replay.judging.errors.planes import first_fixes
 from replay.judging.errors.truths import Doubt, Truths
 from replay.judging.metrics.means import MeansOfAll
 from replay.judging.metrics.measuring import (
-    Measurement,
     Metric,
+    MetricCollection,
     Output,
     find_metrics,
     metric_key,
@@ -100,7 +100,7 @@ class Judge:
         self._first_run = first_run
         self._burn_in_s = burn_in_s
         self._on_errors = on_errors
-        self._measured = Measurement(find_metrics() if metrics is None else metrics)
+        self._measured = MetricCollection(find_metrics() if metrics is None else metrics)
         self._quantities: dict[str, Quantities] = {}
         self._steps: dict[str, NDArray[np.int64]] = {}
         self._diagnostics = Diagnostics(first_run)

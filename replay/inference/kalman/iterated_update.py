@@ -16,7 +16,7 @@ from replay.inference.kalman.steps import (
 from replay.inference.kalman.update import (
     is_unmeasured,
     linear_innovation,
-    reading,
+    message_layout,
     sensor_derivative,
     write_numbers,
     writing_innovation,
@@ -49,7 +49,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
-    read_state, read_reference = tuple_of(n), reading(sensor).reference
+    read_state, read_reference = tuple_of(n), message_layout(sensor).reference
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
     write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)

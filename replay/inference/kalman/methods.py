@@ -24,7 +24,7 @@ from replay.inference.kalman.steps import Interval, Measurement, Steps, Workspac
 from replay.inference.kalman.update import (
     kalman_update,
     linear_sensor,
-    reading,
+    message_layout,
     sensor_derivative,
 )
 from replay.inference.linear_algebra.gaussian import (
@@ -176,7 +176,7 @@ def _exact_motion(stage: Stage) -> Function:
 def _exact_sensor(stage: Stage, number: int) -> Function:
 
     sensor = stage.sensors[number]
-    moments, read_reference = sensor.moments, reading(sensor).reference
+    moments, read_reference = sensor.moments, message_layout(sensor).reference
     assert moments is not None
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 

@@ -14,7 +14,7 @@ import numpy as np
 from replay.engine.arrays import Floats, Function, varying
 from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
 from replay.inference.kalman.steps import Interval, Measurement, Workspace
-from replay.inference.kalman.update import reading, sensor_noise
+from replay.inference.kalman.update import message_layout, sensor_noise
 from replay.inference.linear_algebra.gaussian import cholesky, wrap
 from replay.inference.linear_algebra.manifold import (
     boxminus,
@@ -260,7 +260,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
-    read_reference, m = reading(sensor).reference, len(kinds)
+    read_reference, m = message_layout(sensor).reference, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
     variances_of = entering or no_variances

@@ -33,7 +33,7 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import (
     is_unmeasured,
-    reading,
+    message_layout,
     sensor_derivative,
     sensor_noise,
     write_numbers,
@@ -173,7 +173,7 @@ def _updating(
     A component that is missing counts as one of a noise of its own, which is as predicted.
     """
     model, sensor = stage.model, stage.sensors[number]
-    t, m, read_reference = model.tangent, len(sensor.measured), reading(sensor).reference
+    t, m, read_reference = model.tangent, len(sensor.measured), message_layout(sensor).reference
     read_state, to_covariance = tuple_of(model.size), FACTORS.to_covariance
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
     write_innovation, find_slope = (

@@ -62,7 +62,7 @@ class Measurement(NamedTuple):
     """Holds what an update goes by, beside the belief.
 
     Attributes:
-        data: the numbers of the message, see `update.reading`.
+        data: the numbers of the message, see `update.message_layout`.
         parameters: the sensor's.
         gate: (m + 1,), bounds of the NIS by the number of components.
         event: the number of the event, see `Interval`.

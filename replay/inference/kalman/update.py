@@ -33,7 +33,7 @@ from replay.inference.model.model import Model, Sensor
 from replay.inference.model.stage import Stage
 
 
-class Reading(NamedTuple):
+class MessageLayout(NamedTuple):
     """Says how a sensor's message stands in an event's data: measurement, reference, its own noise."""
 
     width: int
@@ -42,11 +42,11 @@ class Reading(NamedTuple):
     noise: Function
 
 
-def reading(sensor: Sensor) -> Reading:
+def message_layout(sensor: Sensor) -> MessageLayout:
     """Find where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
     m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
-    return Reading(
+    return MessageLayout(
         m + reference + triangle, tuple_of(m), tuple_of(reference, m), tuple_of(triangle, m + reference)
     )
 
@@ -55,7 +55,7 @@ def sensor_noise(sensor: Sensor) -> Function:
     """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
     if sensor.covariance:
-        read, add_message = reading(sensor).noise, adding_noise(m)
+        read, add_message = message_layout(sensor).noise, adding_noise(m)
 
         def add_read(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
             add_message(spread, read(data))
@@ -112,8 +112,7 @@ def linear_sensor(stage: Stage, number: int) -> Function:
         number: the sensor's, among these.
     """
     sensor = stage.sensors[number]
-    read_state, read = tuple_of(stage.model.size), reading(sensor)
-    read_reference = read.reference
+    read_state, read_reference = tuple_of(stage.model.size), message_layout(sensor).reference
     linearise = sensor_derivative(stage.model, sensor)
     pattern = pattern_of(known_entries(linearise, "rows"), len(sensor.measured))
     compare = linear_innovation(sensor, number, pattern)

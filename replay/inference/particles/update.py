@@ -15,7 +15,7 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import (
     is_unmeasured,
-    reading,
+    message_layout,
     sensor_noise,
     write_numbers,
     writing_innovation,
@@ -130,7 +130,7 @@ def _comparing(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, measure = len(sensor.measured), sensor.measure
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
-    read_state, read_reference, fill = tuple_of(model.size), reading(sensor).reference, filling(m)
+    read_state, read_reference, fill = tuple_of(model.size), message_layout(sensor).reference, filling(m)
     add_noise = sensor_noise(sensor)
 
     def predict_alike(
@@ -264,8 +264,8 @@ def _likelihood(stage: Stage, number: int) -> Function:
     sensor = stage.sensors[number]
     if sensor.log_likelihood is None:
         return gaussian_likelihood
-    stated, read_state, read = sensor.log_likelihood, tuple_of(stage.model.size), reading(sensor)
-    read_measured, read_reference = read.measured, read.reference
+    stated, read_state = sensor.log_likelihood, tuple_of(stage.model.size)
+    _, read_measured, read_reference, _ = message_layout(sensor)
 
     def likelihood(
         states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int

@@ -14,7 +14,7 @@ from replay.engine.streams.blocks import Block, Ragged, ragged_rows
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import GEODETIC, in_plane
 from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
-from replay.inference.kalman.update import reading
+from replay.inference.kalman.update import message_layout
 from replay.inference.model.binding import Found
 from replay.inference.model.model import Control, Map, Sensor
 from replay.inference.model.parameters import number_fields
@@ -73,7 +73,7 @@ class Context(NamedTuple):
 def data_columns(stage: Stage) -> tuple[int, int]:
     """Count the numbers of an event, and find the first of the control's among them."""
     width, control = (
-        max((reading(sensor).width for sensor in stage.sensors), default=0),
+        max((message_layout(sensor).width for sensor in stage.sensors), default=0),
         stage.model.control,
     )
     start = width if control is not None and control.interpolated else 0
@@ -198,7 +198,7 @@ def control_numbers(control: Control, ragged: Ragged) -> Floats:
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
-    """Read the messages of a sensor: measurement, reference and covariance; see `update.reading`.
+    """Read the messages of a sensor: measurement, reference and covariance; see `update.message_layout`.
 
     A message without a covariance, or of which all is NaN, counts as none.
 

@@ -49,8 +49,8 @@ class FilterEvents(NamedTuple):
         offsets: (runs + 1,).
         time_ns: (n,).
         source: (n,) a sensor's number, CONTROL or NOTHING.
-        data: (n, width) the numbers of the message, see `update.reading`; the control's where that is
-            interpolated.
+        data: (n, width) the numbers of the message, see `update.message_layout`; the control's where
+            that is interpolated.
         wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
         arrival: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the

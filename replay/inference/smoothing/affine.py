@@ -30,7 +30,7 @@ from replay.inference.kalman.steps import (
     gaussian_filter,
     workspace,
 )
-from replay.inference.kalman.update import reading, sensor_derivative, whitening
+from replay.inference.kalman.update import message_layout, sensor_derivative, whitening
 from replay.inference.linear_algebra.gaussian import (
     propagate_covariance,
     scalar_update,
@@ -289,7 +289,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
 def affine_sensor(stage: Stage, number: int) -> Function:
     """Make the update of the tangent vector by sensor `number`, one component after the other."""
     model, sensor = stage.model, stage.sensors[number]
-    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
+    read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
     linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
     noise_enters = sensor.noises > 0
 

@@ -123,7 +123,7 @@ def metric_key(estimator: str, quantity: str, case: str) -> str:
     return ".".join(filter(None, (estimator, quantity, case)))
 
 
-class Measurement:
+class MetricCollection:
     """Collects what metrics make of all that is judged, as it comes.
 
     What is judged together (one output topic of one estimator) is told by a key.
@@ -152,7 +152,7 @@ class Measurement:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _metrics=find_metrics(state["_metrics"]))
 
-    def merge(self, other: "Measurement") -> None:
+    def merge(self, other: "MetricCollection") -> None:
         """Take in what was made of other runs by the same metrics."""
         self._named |= other._named
         for place, theirs in other._states.items():
@@ -187,7 +187,7 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> d
 
     Raises BadInput where a metric raises.
     """
-    measurement = Measurement(metrics)
+    measurement = MetricCollection(metrics)
     for number, each in enumerate(judged):
         measurement.add(str(number), each)
     return measurement.finish()
