@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
 from replay.engine.compiling.kernels.numbers import (
+    REAL,
     WHOLE,
     Emitter,
     Number,
@@ -20,6 +21,7 @@ from replay.engine.compiling.kernels.numbers import (
     compare,
     constant,
     is_static,
+    kind_of,
 )
 from replay.engine.compiling.kernels.program import DoesNotCompile, Program
 from replay.engine.compiling.kernels.values import (
@@ -246,6 +248,8 @@ class _Lowering(Frame):
         call = statement.iter
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range":
             bounds = [self.value(each) for each in call.args]
+            if any(kind_of(each) == REAL for each in bounds):
+                raise TypeError(f"{ast.unparse(call)} is of integers only; convert by int()")
             start, stop = (0, bounds[0]) if len(bounds) == 1 else bounds[:2]
             step = bounds[2] if len(bounds) == 3 else 1
             first, end = (self.emitter.as_kind(each, WHOLE) for each in (start, stop))

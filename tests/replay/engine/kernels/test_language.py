@@ -398,6 +398,16 @@ def with_mixed_signs(run: int, out: np.ndarray) -> None:
     out[run] = np.uint64(run) + run
 
 
+def with_a_real_range(run: int, out: np.ndarray) -> None:
+    for _ in range(2.7):
+        out[run] += 1.0
+
+
+def with_a_measured_range(run: int, out: np.ndarray) -> None:
+    for _ in range(1, out[run]):
+        out[run] += 1.0
+
+
 REFUSED = {
     with_try: "a kernel has no try statements",
     with_growth: "an array that is made here has sizes that are known; pass it as scratch",
@@ -407,6 +417,8 @@ REFUSED = {
     with_what_could_change: "an array that could change is part of a kernel; pass it as an argument",
     with_a_sum: "a kernel that makes no arrays cannot call sum; others have allocates=True",
     with_two_kinds: "found is a tuple here and a Number before",
+    with_a_real_range: r"range\(2.7\) is of integers only; convert by int\(\)",
+    with_a_measured_range: r"range\(1, out\[run\]\) is of integers only",
     with_mixed_signs: "signed and unsigned integers together; convert one of them",
 }
 
