@@ -41,7 +41,13 @@ from replay.inference.kalman.update import (
     sensor_derivative,
     sensor_noise,
 )
-from replay.inference.linear_algebra.gaussian import drop_missing, kalman_step, multiply_into, whiten
+from replay.inference.linear_algebra.gaussian import (
+    drop_missing,
+    fill_identity,
+    kalman_step,
+    multiply_into,
+    whiten,
+)
 from replay.inference.linear_algebra.manifold import boxminus, is_flat
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.model import Model
@@ -102,11 +108,9 @@ def gramian_steps(stage: Stage) -> Steps:
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
         belief.messages[run] = 0
-        for i in range(len(transition)):
-            for j in range(len(transition)):
-                found.covariance[row, i, j] = information[i, j]
-                information[i, j] = 0.0
-                transition[i, j] = 1.0 if i == j else 0.0
+        found.covariance[row] = information
+        information[:, :] = 0.0
+        fill_identity(transition)
 
     return Steps(lambda sets: workspace(stage, sets), motion, sensors, estimate)
 

@@ -225,8 +225,7 @@ def weigh_fully(count: int, weights: Floats) -> None:
     Args:
         count, weights: as for `weigh`.
     """
-    for i in range(count):
-        weights[i] = 1.0
+    weights[:count] = 1.0
 
 
 def weigh(

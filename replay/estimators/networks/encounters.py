@@ -146,8 +146,7 @@ def advance(
     velocity = carried.velocity[run, robot]
     pose = (mean[first], mean[first + 1], mean[first + 2])
     linear_drive(pose, (velocity[0], velocity[1]), duration_s, work)
-    for k in range(3):
-        mean[first + k] = work.state[k]
+    mean[first : first + 3] = work.state
     for k in range(2):
         work.variances[k] = density[k] * density[k] / duration_s
     for row in range(3):
@@ -283,9 +282,7 @@ def meet(
         scale(covariance, first[side], 1.0 / weight)
         work.whole[:] = 0.0
         for other in range(side, side + 1 + (both and fusion.joint)):
-            for row in range(2):
-                for k in range(3):
-                    work.whole[row, first[other] + k] = work.both[other, row, k]
+            work.whole[:, first[other] : first[other] + 3] = work.both[other]
         squared = update(mean, covariance, difference, work.whole, noise, work.update, gate)
         if np.isnan(squared):
             return False
@@ -326,8 +323,7 @@ def cooperate(
         if measured > 0 and not meet(mean, covariance, robots, difference, variance, gate, fusion, work):
             return NOT_POSITIVE_DEFINITE
     else:
-        for k in range(2):
-            carried.velocity[run, robot, k] = events.value[event, k]
+        carried.velocity[run, robot] = events.value[event]
     total = 0.0
     for row in range(len(mean)):
         total += mean[row]

@@ -102,9 +102,7 @@ def determinant(matrix: Floats) -> float:
 def put(given: Estimate, place: Estimate) -> None:
     """Copy an estimate; loops, since slices are very slow to compile."""
     copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
-    for row in range(len(given.mean)):
-        for column in range(len(given.mean)):
-            place.independent[row, column] = given.independent[row, column]
+    place.independent[:, :] = given.independent
 
 
 def one_of(estimates: Estimate, i: int) -> Estimate:

@@ -177,8 +177,7 @@ def observe(
         for row in range(size):
             gain[row] = covariance[row, seen] / spread
         at = independent[seen, seen]
-        for row in range(size):
-            crossed[row] = independent[seen, row]
+        crossed[:] = independent[seen]
         for row in range(size):
             mean[row] += gain[row] * error
             for column in range(size):

@@ -383,9 +383,7 @@ def _dead_reckon(
     """Write the orientation that the block's increment leads to, and the error that it adds."""
     increment, covariance = state.increment[run], estimates.covariance[row]
     compose(state.axes[run, :, 3], increment, estimates.orientation[row])
-    for i in range(3):
-        for j in range(3):
-            covariance[i, j] = state.covariance[run, i, j]
+    covariance[:, :] = state.covariance[run]
     for i in range(3):
         turn_back(increment, covariance[i])
     for i in range(3):

@@ -80,8 +80,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
             return NOTHING_MEASURED
         innovation, step, factor = work.innovations[number], work.step, 1.0
         find_slope(mean, covariance, work.slope)
-        for row in range(t):
-            step[row] = 0.0
+        step[:] = 0.0
         for iteration in range(ITERATIONS):
             relinearise(mean, covariance, data, parameters, work)
             write_innovation(innovation, record)
@@ -95,8 +94,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
                 write_numbers(record, squared, determinant, size, False, 1.0)
                 return ALL_WELL
             inflate(innovation, size, factor)
-            for row in range(t):
-                work.turned[row] = step[row]
+            work.turned[:] = step
             kalman_step(innovation, size, step)
             change = 0.0
             for row in range(t):

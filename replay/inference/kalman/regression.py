@@ -113,8 +113,7 @@ def sampling(
             if flat_states:
                 point = tuple(state[row] + away[row] for row in range(components))
             else:
-                for row in range(components):
-                    memory.point[row] = mean[row]
+                memory.point[:] = mean
                 add(memory.point, away)
                 point = read_state(memory.point)
             value = function(point, read_noise(away), arguments)
@@ -186,8 +185,7 @@ def settling(kinds: tuple[str, ...]) -> Function:
             if straight:
                 return
             again = recentre(values, shift)
-            for i in range(v):
-                shift[i] = 0.0
+            shift[:] = 0.0
             if not again:
                 return
 

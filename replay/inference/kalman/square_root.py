@@ -40,7 +40,7 @@ from replay.inference.kalman.update import (
     writing_innovation,
 )
 from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
-from replay.inference.linear_algebra.gaussian import whiten_by, wrap
+from replay.inference.linear_algebra.gaussian import fill_identity, whiten_by, wrap
 from replay.inference.linear_algebra.inflation import inflation
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.corrections import correcting, sloping
@@ -61,8 +61,7 @@ def _linear(linearise: Function, slopes: str) -> Function:
         linearise(state, *given, work)
         for k in range(t):
             weights[k] = 1.0
-            for row in range(t):
-                rows[m + row, k] = factor[row, k]
+            rows[m:, k] = factor[:, k]
             for i in range(m):
                 for row in range(k, t):
                     rows[i, k] += getattr(work, slopes)[i, row] * factor[row, k]
@@ -86,8 +85,7 @@ def _sampled(
             weights[k] = drawn[k]
             for i in range(m):
                 rows[i, k] = memory.values[k, i] - memory.shift[i]
-            for row in range(t):
-                rows[m + row, k] = memory.offsets[k, row]
+            rows[m:, k] = memory.offsets[k]
 
     return spread
 
@@ -95,8 +93,7 @@ def _sampled(
 def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> bool:
     """Fill in N of a noise, which it uses up, and find the factor; False where there is none."""
     first = len(weights) - len(noise)
-    for k in range(len(noise)):
-        weights[first + k] = 1.0
+    weights[first:] = 1.0
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
 
 
@@ -129,15 +126,13 @@ def _linear_motion(stage: Stage) -> Function:
 
 
 def _gap_motion(stage: Stage) -> Function:
-    gap_noise, add, t = stage.motion.gap_noise, adding_noise(stage.model.tangent), stage.model.tangent
+    gap_noise, add = stage.motion.gap_noise, adding_noise(stage.model.tangent)
     fill = filling(stage.model.size)
     assert gap_noise is not None
 
     def stand(state: Any, control: Any, duration_s: float, parameters: Any, work: Workspace) -> None:
         fill(work.state, state)
-        for row in range(t):
-            for column in range(t):
-                work.transition[row, column] = 1.0 if row == column else 0.0
+        fill_identity(work.transition)
 
     def add_noise(state: Any, noise: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         add(noise, gap_noise(state, duration_s, parameters))

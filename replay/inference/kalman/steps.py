@@ -239,12 +239,10 @@ def keeping(stage: Stage) -> Function:
     """Make the prediction in a gap of the control: it keeps the mean and adds the gap noise."""
     model, gap_noise = stage.model, stage.motion.gap_noise
     assert gap_noise is not None
-    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+    read_state, add = tuple_of(model.size), adding_noise(model.tangent)
 
     def keep(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
-        for row in range(t):
-            for column in range(t):
-                work.product[row, column] = covariance[row, column]
+        work.product[:, :] = covariance
         add(covariance, gap_noise(read_state(mean), interval.duration_s, interval.parameters))
         return True
 

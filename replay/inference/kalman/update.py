@@ -170,10 +170,8 @@ def whitening(sensor: Sensor, number: int) -> Function:
         difference, noise, turned = innovation
         for i in range(m):
             difference[i] = wrap(data[i] - work.predicted[i], angular[i])
-            for k in range(len(turned)):
-                turned[k, i] = work.rows[i, k]
-            for j in range(m):
-                noise[i, j] = 0.0
+            turned[:, i] = work.rows[i]
+            noise[i] = 0.0
         add_noise(noise, data, parameters, work)
         size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)

@@ -64,9 +64,7 @@ def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, covarian
 
 def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, factor: Floats) -> bool:
     cross, t = work.product, len(before)
-    for row in range(t):
-        for column in range(t):
-            turned[row, column] = cross[row, column]
+    turned[:, :] = cross
     if not solve_semidefinite(after, turned, factor):
         return False
     for row in range(t):

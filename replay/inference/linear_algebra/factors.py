@@ -98,12 +98,9 @@ def retriangulate(rows: Floats, factor: Floats) -> None:
         rows: A (t, t).
         factor: (t, t), filled.
     """
-    array, weights = np.empty(rows.shape), np.empty(len(rows))
-    for row in range(len(rows)):
-        weights[row] = 1.0
-        for column in range(len(rows)):
-            array[row, column] = rows[row, column]
-    orthogonalise(array, weights, factor)
+    weights = np.empty(len(rows))
+    weights[:] = 1.0
+    orthogonalise(rows.copy(), weights, factor)
 
 
 def _start(covariances: Floats) -> Floats:
@@ -123,8 +120,7 @@ def _to_covariance(factor: Floats) -> None:
 
 
 def _times(factor: Floats, vector: Any, product: Floats) -> None:
-    for row in range(len(factor)):
-        product[row] = 0.0
+    product[:] = 0.0
     for k in range(len(factor)):
         entry = 0.0
         for row in range(k, len(factor)):
@@ -146,15 +142,11 @@ def _turn(turning: Function, vector: Floats, factor: Floats) -> None:
 def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, factor: Floats) -> None:
     t = len(factor)
     array, scales = np.empty((t, 2 * t + 1)), np.empty(2 * t + 1)
-    for row in range(t):
-        for column in range(t):
-            factor[row, column] = 0.0
+    factor[:, :] = 0.0
     for mode in range(len(weights)):
-        for k in range(2 * t + 1):
-            scales[k] = 1.0 if k < t else weights[mode]
+        scales[:t], scales[t:] = 1.0, weights[mode]
+        array[:, :t], array[:, t : 2 * t] = factor, carried[mode]
         for row in range(t):
-            for k in range(t):
-                array[row, k], array[row, t + k] = factor[row, k], carried[mode, row, k]
             array[row, 2 * t] = away[mode, row] - shift[row]
         orthogonalise(array, scales, factor)
 
@@ -168,8 +160,7 @@ def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, _: Floats
             for k in range(column + 1, t):
                 entry -= turned[k, row] * after[k, column]
             turned[column, row] = entry / pivot if pivot > 0.0 else 0.0
-        for column in range(t):
-            before[row, column] = work.rest[row, column]
+        before[row] = work.rest[row]
     _to_covariance(before)
     return True
 

@@ -157,12 +157,9 @@ def drop_missing(innovation: Innovation) -> int:
             continue
         if size < component:
             difference[size] = difference[component]
-            for row in range(len(cross_covariance)):
-                cross_covariance[row, size] = cross_covariance[row, component]
-            for k in range(len(difference)):
-                covariance[size, k] = covariance[component, k]
-            for k in range(len(difference)):
-                covariance[k, size] = covariance[k, component]
+            cross_covariance[:, size] = cross_covariance[:, component]
+            covariance[size] = covariance[component]
+            covariance[:, size] = covariance[:, component]
         size += 1
     return size
 
@@ -257,6 +254,13 @@ def scalar_update(
             covariance[column, row] = covariance[row, column]
 
 
+def fill_identity(matrix: Floats) -> None:
+    """Make a matrix the identity."""
+    matrix[:, :] = 0.0
+    for row in range(len(matrix)):
+        matrix[row, row] = 1.0
+
+
 def multiply(left: Floats, right: Floats, product: Floats) -> None:
     """Fill the product of two square matrices.
 
@@ -278,9 +282,7 @@ def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
         left, matrix, product: F, A and what is worked in, (n, n).
     """
     multiply(left, matrix, product)
-    for row in range(len(matrix)):
-        for column in range(len(matrix)):
-            matrix[row, column] = product[row, column]
+    matrix[:, :] = product
 
 
 def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
@@ -380,8 +382,5 @@ def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covarian
         mean, covariance: (n,), (t, t).
         to_mean, to_covariance: overwritten, as large.
     """
-    for i in range(len(mean)):
-        to_mean[i] = mean[i]
-    for i in range(len(covariance)):
-        for j in range(len(covariance)):
-            to_covariance[i, j] = covariance[i, j]
+    to_mean[:] = mean
+    to_covariance[:, :] = covariance

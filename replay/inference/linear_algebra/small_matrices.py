@@ -84,8 +84,7 @@ def predict(
         for k in range(size):
             entry += transition[row, k] * mean[k]
         product[0, row] = entry
-    for row in range(size):
-        mean[row] = product[0, row]
+    mean[:] = product[0]
     propagate_covariance(covariance, transition, product)
     for row in range(size):
         for column in range(size):

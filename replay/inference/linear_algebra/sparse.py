@@ -56,11 +56,8 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
                     entry += factor * covariance[k, column]
                 product[row, column] = entry
         for row in left:
-            for column in range(size):
-                product[row, column] = covariance[row, column]
-        for row in range(end):
-            for k in range(size):
-                turned[k, row] = product[row, k]
+            product[row] = covariance[row]
+        turned[:, :end] = product[:end].T
         for row, entries in changed:
             factors = tuple(transition[row, k] if value is None else value for k, value in entries)
             for column in range(row, end):
@@ -68,8 +65,7 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
                 for factor, (k, _) in zip(factors, entries, strict=True):
                     entry += turned[k, column] * factor
                 covariance[row, column] = entry
-            for column in range(end, size):
-                covariance[row, column] = product[row, column]
+            covariance[row, end:] = product[row, end:]
         for row in range(size):
             for column in range(min(row, end)):
                 covariance[row, column] = covariance[column, row]

@@ -113,8 +113,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
 
         def compare_together(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
             linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
-            for row in range(t):
-                work.change[0, row] = work.step[row]
+            work.change[0] = work.step
             propagate_covariance(covariance, work.transition, work.product)
 
         return compare_together
@@ -150,8 +149,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
                     for k in range(t):
                         entry += rows[i, k] * work.transition[k, column]
                     work.turned[column] = entry
-                for column in range(t):
-                    rows[i, column] = work.turned[column]
+                rows[i] = work.turned
 
         return stepping(model.kinds, model.correct.move), chain_together
     fill, add, flat = filling(model.size), boxplus(model.kinds), is_flat(model.kinds)

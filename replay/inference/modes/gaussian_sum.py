@@ -192,8 +192,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     ) -> None:
         count = belief.left[run]
         probability = belief.probability[run, :count]
-        for each in range(members):
-            mixtures.probability[row, each] = 0.0
+        mixtures.probability[row] = 0.0
         for each in range(count):
             mixtures.probability[row, belief.member[run, each]] = probability[each]
         to_common_tangent(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)

@@ -112,8 +112,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         run: int, belief: ModeBelief, mixtures: Mixtures, row: int, memory: InteractingMemory
     ) -> None:
         probability = mixtures.probability[row]
-        for mode in range(modes):
-            probability[mode] = belief.probability[run, mode]
+        probability[:] = belief.probability[run]
         to_common_tangent(belief.mean[run], belief.covariance[run], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])

@@ -159,19 +159,16 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, 
     """
     add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
     reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
-    n, t, turn, mix_covariances = len(kinds), tangent_size(kinds), form.turn, form.mix
+    t, turn, mix_covariances = tangent_size(kinds), form.turn, form.mix
 
     def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
         likeliest = likeliest_of(probability)
         centre, away = memory.centre, memory.away
-        for row in range(n):
-            centre[row] = mean[likeliest, row]
+        centre[:] = mean[likeliest]
         for mode in range(len(probability)):
             carried = memory.carried[mode]
             subtract(mean[mode], centre, away, mode)
-            for row in range(t):
-                for column in range(t):
-                    carried[row, column] = covariance[mode, row, column]
+            carried[:, :] = covariance[mode]
             if not flat:
                 turn(reset_back, away[mode], carried)
 
@@ -183,8 +180,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, 
                 entry += weights[mode] * away[mode, row]
             shift[row] = entry
         mix_covariances(weights, away, shift, carried, covariance)
-        for row in range(n):
-            mean[row] = memory.centre[row]
+        mean[:] = memory.centre
         add(mean, shift)
         if not flat:
             turn(reset, shift, covariance)

@@ -115,8 +115,7 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
         data, parameters, _, event = measurement
         probability, log_probability = weights
         numbers, taken = memory.records.numbers, 0
-        for mode in range(len(probability)):
-            numbers[mode, 2] = 0.0
+        numbers[:, 2] = 0.0
         opened = Measurement(data, parameters, memory.open_gate, event)
         for each in (measurement, opened):
             for mode in range(len(probability)):

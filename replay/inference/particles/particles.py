@@ -184,12 +184,10 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
     """
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
     for i in range(len(weight)):
-        for k in range(states.shape[1]):
-            memory.spare[i, k] = states[memory.chosen[i], k]
+        memory.spare[i] = states[memory.chosen[i]]
     for i in range(len(weight)):
         weight[i] = 1.0 / len(weight)
-        for k in range(states.shape[1]):
-            states[i, k] = memory.spare[i, k]
+        states[i] = memory.spare[i]
     return counter + 1
 
 
@@ -293,9 +291,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
     def factored(lower: Floats, variances: Any) -> bool:
-        for row in range(t):
-            for column in range(t):
-                lower[row, column] = 0.0
+        lower[:, :] = 0.0
         add_noise(lower, variances)
         return semidefinite_cholesky(lower, lower, t)
 
@@ -331,8 +327,7 @@ def summing_up(model: Model) -> Function:
             weighted_mean(weight, states, mean)
             moments(weight, states, states, mean, covariance, covariance)
         else:
-            for k in range(n):
-                mean[k] = states[0, k]
+            mean[:] = states[0]
             for i in range(len(states)):
                 subtract(states[i], mean, offsets, i)
             settle(weight, offsets, mean, shift)
@@ -340,7 +335,6 @@ def summing_up(model: Model) -> Function:
         clouds.effective[row] = effective_number(weight)
         for i in range(clouds.states.shape[1]):
             clouds.weight[row, i] = weight[i]
-            for k in range(n):
-                clouds.states[row, i, k] = states[i, k]
+            clouds.states[row, i] = states[i]
 
     return estimate

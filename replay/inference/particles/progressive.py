@@ -58,15 +58,14 @@ def renewing(model: Model) -> Function:
 
     Returns False where the covariance of the particles is no covariance.
     """
-    n, t = model.size, model.tangent
+    t = model.tangent
     subtract, add, settle = boxminus(model.kinds), boxplus(model.kinds), settling(model.kinds)
     moments = moments_of(0, t)
 
     def renew(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
         states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]
         kernel, shift, key = memory.kernel, cloud.shift[run], cloud.key[run]
-        for k in range(n):
-            kernel.mean[k] = states[0, k]
+        kernel.mean[:] = states[0]
         for i in range(len(states)):
             subtract(states[i], kernel.mean, offsets, i)
         settle(weight, offsets, kernel.mean, shift)
@@ -82,8 +81,7 @@ def renewing(model: Model) -> Function:
                 offsets[i, k] *= kept
                 for j in range(k + 1):
                     offsets[i, k] += kernel.width * kernel.covariance[k, j] * kernel.drawn[i, j]
-            for k in range(n):
-                states[i, k] = kernel.mean[k]
+            states[i] = kernel.mean
             add(states[i], offsets[i])
         return True
 
@@ -159,7 +157,6 @@ def effective_after(weight: Floats, likelihood: Floats, power: float, trial: Flo
         weight, likelihood, power: as for `reweigh`, but the weights stay.
         trial: (N,), to work in.
     """
-    for i in range(len(weight)):
-        trial[i] = weight[i]
+    trial[:] = weight
     reweigh(trial, likelihood, power)
     return effective_number(trial)

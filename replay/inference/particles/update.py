@@ -149,7 +149,7 @@ def _comparing(stage: Stage, number: int) -> Function:
             states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
         ) -> None:
             linearise(read_state(states[i]), read_reference(data), parameters, memory.work)
-            no_covariance(memory.sensors[number].noise[i])
+            memory.sensors[number].noise[i] = 0.0
             add_noise(memory.sensors[number].noise[i], data, parameters, memory.work)
 
         predict = predict_with_noise
@@ -157,7 +157,7 @@ def _comparing(stage: Stage, number: int) -> Function:
     def compare(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory) -> None:
         own = memory.sensors[number]
         if len(own.noise) == 1:
-            no_covariance(own.noise[0])
+            own.noise[0] = 0.0
             add_noise(own.noise[0], data, parameters, memory.work)
         for i in range(len(states)):
             predict(states, i, data, parameters, memory)
@@ -165,13 +165,6 @@ def _comparing(stage: Stage, number: int) -> Function:
                 own.differences[i, j] = wrap(data[j] - memory.work.predicted[j], angular[j])
 
     return compare
-
-
-def no_covariance(matrix: Floats) -> None:
-    """Fill a matrix with zeros."""
-    for row in range(len(matrix)):
-        for column in range(len(matrix)):
-            matrix[row, column] = 0.0
 
 
 def keep_predicted(own: SensorMemory) -> int:
@@ -206,10 +199,7 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
         angular: (m,) which are angles.
     """
     mean, spread, _ = own.innovation
-    for j in range(len(mean)):
-        mean[j] = np.nan
-        for k in range(len(mean)):
-            spread[j, k] = 0.0
+    mean[:], spread[:, :] = np.nan, 0.0
     for a in range(size):
         mean[own.kept[a]] = 0.0
     first, total = -1, 0.0

@@ -106,8 +106,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             row -= 1
         kept.time_ns[row], kept.position[row] = time_ns, position
         kept.source[row], kept.target_id[row] = events.source[event], events.target_id[event]
-        for k in range(events.data.shape[1]):
-            kept.data[row, k] = events.data[event, k]
+        kept.data[row] = events.data[event]
         history.counts[run] += 1
         return row
 
@@ -126,10 +125,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         records = Innovations(
             at, kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
         )
-        for i in range(kept.difference.shape[1]):
-            kept.difference[row, i] = np.nan
-            for j in range(kept.difference.shape[1]):
-                kept.covariance[row, i, j] = np.nan
+        kept.difference[row], kept.covariance[row] = np.nan, np.nan
         at[run] = row
         again = RunInputs(stored, inputs.settings, inputs.gates)
         failure = process(run, row, again, carried, RunResults((), records), memory)
@@ -141,16 +137,11 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         """Fill in the innovation of a kept message."""
         if kept.has_innovation[row]:
             result = innovations.end[run]
-            innovations.time_ns[result], innovations.target_id[result] = (
-                kept.time_ns[row],
-                kept.target_id[row],
-            )
-            for i in range(kept.difference.shape[1]):
-                innovations.difference[result, i] = kept.difference[row, i]
-                for j in range(kept.difference.shape[1]):
-                    innovations.covariance[result, i, j] = kept.covariance[row, i, j]
-            for i in range(3):
-                innovations.numbers[result, i] = kept.numbers[row, i]
+            innovations.time_ns[result] = kept.time_ns[row]
+            innovations.target_id[result] = kept.target_id[row]
+            innovations.difference[result] = kept.difference[row]
+            innovations.covariance[result] = kept.covariance[row]
+            innovations.numbers[result] = kept.numbers[row]
             innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: KeptMessages) -> int:

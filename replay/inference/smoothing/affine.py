@@ -126,8 +126,7 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
     if damping == 0.0:
         return
     for component in range(len(mean)):
-        for row in range(len(mean)):
-            column[row] = covariance[row, component]
+        column[:] = covariance[:, component]
         variance = column[component] + trajectory.scale[node, component] / damping
         if variance > 0.0:
             scalar_update(mean, covariance, column, variance, -mean[component])
@@ -208,15 +207,12 @@ def reaching(kinds: tuple[str, ...]) -> Function:
                 offset[order[k]] = 0.0
                 for j in range(rank):
                     offset[order[k]] += factor[order[k], j] * whitened[j]
-            for row in range(len(origin)):
-                trajectory.mean[node, row] = origin[row]
+            trajectory.mean[node] = origin
             add(trajectory.mean[node], offset)
         if noises.rank[node] >= 0:
             held = whitened_square(offset, noises, node, whitened)
-        for row in range(len(offset)):
-            noises.order[node, row] = order[row]
-            for column in range(rank):
-                noises.factor[node, row, column] = factor[row, column]
+        noises.order[node] = order
+        noises.factor[node, :, :rank] = factor[:, :rank]
         noises.rank[node] = rank
         trajectory.cost[0] += 0.5 * squared
         trajectory.held[0] += 0.5 * held

@@ -23,6 +23,7 @@ from replay.engine.compiling.compile import compile_over_runs
 from replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
 from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
+    fill_identity,
     multiply,
     propagate_covariance,
 )
@@ -102,9 +103,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
     def predict(run: int, belief: Chain, interval: Interval, memory: ForwardMemory) -> bool:
         rest, turned, product = memory.rest, memory.turned, memory.product
         mean, covariance = belief.mean[run], belief.covariance[run]
-        for row in range(t):
-            for column in range(t):
-                rest[row, column] = covariance[row, column]
+        rest[:, :] = covariance
         if not predict_filter(run, belief, interval, memory.filter):
             return False
         if not retrace(rest, covariance, memory.filter, turned, memory.factor):
@@ -112,25 +111,20 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         compose(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
         belief.predictions[run] += 1
         find_slope(mean, covariance, belief.slope[run])
-        for row in range(len(mean)):
-            belief.predicted[run, row] = mean[row]
+        belief.predicted[run] = mean
         return True
 
     def estimate(run: int, belief: Chain, nodes: Nodes, row: int, memory: ForwardMemory) -> None:
         mean, covariance = belief.mean[run], belief.covariance[run]
         copy_gaussian(mean, covariance, nodes.mean[row], nodes.covariance[row])
         to_covariance(nodes.covariance[row])
-        still = belief.predictions[run] == 0
-        for i in range(len(mean)):
-            nodes.predicted[row, i] = belief.predicted[run, i]
-            belief.predicted[run, i] = mean[i]
-        for i in range(t):
-            nodes.slope[row, i] = belief.slope[run, i]
-            for j in range(t):
-                unit = 1.0 if i == j else 0.0
-                nodes.gain[row, i, j] = unit if still else belief.gain[run, i, j]
-                nodes.rest[row, i, j] = 0.0 if still else belief.rest[run, i, j]
-        belief.predictions[run] = 0
+        nodes.predicted[row], nodes.slope[row] = belief.predicted[run], belief.slope[run]
+        if belief.predictions[run] == 0:
+            fill_identity(nodes.gain[row])
+            nodes.rest[row] = 0.0
+        else:
+            nodes.gain[row], nodes.rest[row] = belief.gain[run], belief.rest[run]
+        belief.predicted[run], belief.predictions[run] = mean, 0
 
     def memory(sets: tuple[Any, ...]) -> ForwardMemory:
         return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
@@ -167,10 +161,8 @@ def compose(
     """
     t = len(gain)
     if predictions == 0:
-        for row in range(t):
-            for column in range(t):
-                gain[row, column] = next_gain[row, column]
-                rest[row, column] = next_rest[row, column]
+        gain[:, :] = next_gain
+        rest[:, :] = next_rest
         return
     propagate_covariance(next_rest, gain, product)
     multiply(gain, next_gain, product)
@@ -237,8 +229,7 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
     def go_back(mean: Floats, covariance: Floats, nodes: Nodes, node: int, work: BackMemory) -> None:
         """Move the Gaussian of `work` from a node to the one before, whose filtered one is given."""
         gain, rest, step, change = nodes.gain[node], nodes.rest[node], work.step, work.change[0]
-        for row in range(t):
-            work.slope[row] = nodes.slope[node, row]
+        work.slope[:] = nodes.slope[node]
         compare(nodes.predicted[node], work.mean, work.covariance, work)
         for row in range(t):
             entry = 0.0
@@ -250,8 +241,7 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
             for column in range(t):
                 work.covariance[row, column] += rest[row, column]
         find_slope(mean, covariance, work.slope)
-        for row in range(len(mean)):
-            work.mean[row] = mean[row]
+        work.mean[:] = mean
         move(work.mean, work.covariance, work)
 
     def smooth(run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory) -> None:

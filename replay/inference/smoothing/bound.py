@@ -85,9 +85,7 @@ def smooth(
     predicted, turned, factor, product = memory
     for node in range(offsets[run + 1] - 2, offsets[run] - 1, -1):
         here, later, step = covariance[node], covariance[node + 1], transition[node + 1]
-        for row in range(len(here)):
-            for column in range(len(here)):
-                predicted[row, column] = here[row, column]
+        predicted[:, :] = here
         propagate_covariance(predicted, step, turned)  # which becomes F P
         for row in range(len(here)):
             for column in range(len(here)):

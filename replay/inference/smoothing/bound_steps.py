@@ -22,6 +22,7 @@ from replay.inference.linear_algebra.gaussian import (
     cholesky,
     downdate,
     drop_missing,
+    fill_identity,
     kalman_step,
     multiply_into,
     propagate_covariance,
@@ -71,8 +72,7 @@ class BoundMemory(NamedTuple):
 def bound_steps(stage: Stage) -> Steps:
     """Make the steps of an extended Kalman filter that knows where it is."""
     model, motion = stage.model, stage.motion
-    n, t = model.size, model.tangent
-    read_state, read_control = tuple_of(n), tuple_of(model.controls)
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise = motion_noise(model, motion)
 
@@ -86,21 +86,16 @@ def bound_steps(stage: Stage) -> Steps:
         add_noise(state, trajectory.noise[run], duration_s, parameters, work)
         propagate_covariance(trajectory.covariance[run], work.transition, work.product)
         add_noise(state, trajectory.covariance[run], duration_s, parameters, work)
-        for i in range(n):
-            mean[i] = memory.truth[event, i]
+        mean[:] = memory.truth[event]
         return True
 
     def estimate(run: int, trajectory: TrueTrajectory, nodes: Nodes, row: int, _: Any) -> None:
-        for i in range(n):
-            nodes.mean[row, i] = trajectory.mean[run, i]
-        for i in range(t):
-            for j in range(t):
-                nodes.covariance[row, i, j] = trajectory.covariance[run, i, j]
-                nodes.transition[row, i, j] = trajectory.transition[run, i, j]
-                nodes.noise[row, i, j] = trajectory.noise[run, i, j]
-                nodes.information[row, i, j] = trajectory.information[run, i, j]
-                trajectory.transition[run, i, j] = 1.0 if i == j else 0.0
-                trajectory.noise[run, i, j] = trajectory.information[run, i, j] = 0.0
+        nodes.mean[row] = trajectory.mean[run]
+        nodes.covariance[row], nodes.noise[row] = trajectory.covariance[run], trajectory.noise[run]
+        nodes.transition[row] = trajectory.transition[run]
+        nodes.information[row] = trajectory.information[run]
+        fill_identity(trajectory.transition[run])
+        trajectory.noise[run], trajectory.information[run] = 0.0, 0.0
 
     def memory(sets: tuple[Any, ...]) -> BoundMemory:
         sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
@@ -127,24 +122,18 @@ def bound_update(stage: Stage, number: int) -> Function:
             return NO_TRUTH
         innovate(mean, covariance, measurement, work)
         innovation, noise = work.innovations[number], memory.noise[number]
-        for i in range(m):
-            for j in range(m):
-                noise[i, j] = 0.0
+        noise[:, :] = 0.0
         add_noise(noise, measurement.data, measurement.parameters, work)
         size = 0
         for i in range(m):
             if not np.isnan(innovation.difference[i]):
-                for k in range(len(covariance)):
-                    work.rows[size, k] = work.rows[i, k]
-                for j in range(m):
-                    noise[size, j] = noise[i, j]
-                for j in range(m):
-                    noise[j, size] = noise[j, i]
+                work.rows[size] = work.rows[i]
+                noise[size] = noise[i]
+                noise[:, size] = noise[:, i]
                 size += 1
         add_information(trajectory.information[run], work.rows, noise, size)
         drop_missing(innovation)
-        for i in range(size):
-            innovation.difference[i] = 0.0
+        innovation.difference[:size] = 0.0
         if np.isnan(whiten(innovation, size)[0]):
             return NOT_POSITIVE_DEFINITE
         kalman_step(innovation, size, work.step)

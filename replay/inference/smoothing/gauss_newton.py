@@ -125,8 +125,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             mean[row] = belief.predicted[run, row] = -trajectory.offset[0, row]
         belief.predictions[run] = 0
         hold(mean, covariance, trajectory, begin)
-        for row in range(len(plan.initial)):
-            carried.control[run, row] = plan.initial[row]
+        carried.control[run] = plan.initial
         carried.time_ns[run], carried.failure[run] = plan.start_ns[run], ALL_WELL
         nodes.end[run] = begin
         follow(run, inputs, carried, RunResults(nodes, state.innovations), memory)
@@ -214,6 +213,4 @@ def copy_rows(these: Floats, there: Floats, begin: int, end: int) -> None:
         these, there: (n, k), the first to the second.
         begin, end: the rows.
     """
-    for row in range(begin, end):
-        for column in range(these.shape[1]):
-            there[row, column] = these[row, column]
+    there[begin:end] = these[begin:end]
