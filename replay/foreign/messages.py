@@ -9,7 +9,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic
 from recorders.log.streams import check_stream
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.measurements import check_width
 from replay.engine.streams.results import failures_by_run, state_stream
@@ -57,7 +57,7 @@ def static_of(
     )
     if not parts:
         return nothing
-    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for _, _, each in parts])
+    run = np.concatenate([run_of_rows(each.offsets) for _, _, each in parts])
     order = np.argsort(run, kind="stable")
     return Static(
         sum((each.offsets for _, _, each in parts), np.zeros(1, np.int64)),

@@ -21,7 +21,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Estimator
-from replay.engine.streams.blocks import Ragged, copied
+from replay.engine.streams.blocks import Ragged, copied, run_of_rows
 from replay.engine.vectors.tangent import named_now, tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
@@ -197,7 +197,7 @@ class Observability(IteratedSmoother):
         scales = self._scales(state)
         window_of = self._windows(way, state.carried.time_ns)
         found, offsets = self._gramians(state, way, window_of)
-        run = np.repeat(np.arange(len(scales)), np.diff(offsets))
+        run = run_of_rows(offsets)
         spectra = [
             spectrum(each, scale) for each, scale in zip(found.covariance, scales[run], strict=True)
         ]
@@ -239,7 +239,7 @@ class Observability(IteratedSmoother):
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
         """Find the window of every node; what is left behind a run's last whole one belongs to it."""
-        run = np.repeat(np.arange(len(start_ns)), np.diff(way.offsets))
+        run = run_of_rows(way.offsets)
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:
             return np.zeros(len(run), np.int64)

@@ -22,7 +22,7 @@ from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.engine.streams.blocks import gather
+from replay.engine.streams.blocks import gather, run_of_rows
 from replay.engine.streams.sources import MemorySource
 from replay.estimators.networks.covariance_intersection import fuse
 from replay.estimators.networks.networks import CENTRALISED, NetworkParameters, message_bytes
@@ -108,7 +108,7 @@ def network_table(found: Sequence[Errors]) -> pd.DataFrame:
 def _loads(experiment: Experiment, sources: Sequence[MemorySource]) -> dict[str, float | None]:
     """Count the bytes that a directed link carries per run: what is sent, lost or not."""
     links = gather([source.streams["/links"] for source in sources])
-    run = np.repeat(np.arange(links.runs), np.diff(links.offsets))
+    run = run_of_rows(links.offsets)
     ends = np.stack([run, links["sender_id"], links["receiver_id"]])
     messages = ends.shape[1] / max(1, np.unique(ends, axis=1).shape[1])
     states = len(sources[0].streams["/prior"].components)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Clock
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 
 Integers = NDArray[np.int64]
 # Messages that no innovation has passed, of a run that ended, are let go from so many on.
@@ -52,7 +52,7 @@ class Attribution:
         self._topics = list(streams)
         parts = [
             _Messages(
-                _run_of(ragged),
+                run_of_rows(ragged.offsets),
                 ragged.stream.times(order),
                 ragged.stream.position,
                 np.full(len(ragged), number),
@@ -69,7 +69,7 @@ class Attribution:
             return
         there, run, time_ns = (
             _joined(self._waiting),
-            _run_of(innovations),
+            run_of_rows(innovations.offsets),
             innovations.stream.publish_time_ns,
         )
         topic = _topic_of(there, run, time_ns)
@@ -96,10 +96,6 @@ class Attribution:
         self.used.update(other.used)
         self.gated.update(other.gated)
         self.is_known &= other.is_known
-
-
-def _run_of(ragged: Ragged) -> Integers:
-    return np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
 
 
 def _joined(parts: list[_Messages]) -> _Messages:

@@ -26,7 +26,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import make_stream, schemas
 from replay.engine.arrays import Booleans, Integers
 from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals
+from replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals, run_of_rows
 from replay.engine.streams.failures import reason_stream
 
 POLICIES = ("drop", "wait", "rewind")
@@ -192,7 +192,7 @@ def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragg
         streams = {topic: join([waiting[topic], streams[topic]]) for topic in streams}
     columns = [
         (
-            np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+            run_of_rows(ragged.offsets),
             np.full(len(ragged), topic),
             np.arange(len(ragged)),
             ragged.stream.publish_time_ns,

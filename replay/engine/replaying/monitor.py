@@ -24,7 +24,7 @@ from replay.engine.compiling.scratch import Scratch
 from replay.engine.replaying.coverage import Coverage
 from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from replay.engine.replaying.usage import Usage
-from replay.engine.streams.blocks import Ragged, join, ragged_rows
+from replay.engine.streams.blocks import Ragged, join, ragged_rows, run_of_rows
 from replay.engine.streams.failures import Failure, failure_stream, reason_of
 
 Floats = NDArray[np.float64]
@@ -204,7 +204,7 @@ class RunMonitor:
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
         """Return the messages of every run before its end (runs,)."""
         return {
-            topic: _kept(ragged, ragged.stream.times(self._order) < end_ns[_run_of(ragged)])
+            topic: _kept(ragged, ragged.stream.times(self._order) < end_ns[run_of_rows(ragged.offsets)])
             for topic, ragged in streams.items()
         }
 
@@ -291,7 +291,7 @@ class RunMonitor:
         """Return an output without the rows from a run's first bad one on, or from the run's end on."""
         if first_bad is None and not self._has_ends:
             return output
-        run = _run_of(output)
+        run = run_of_rows(output.offsets)
         kept = np.ones(len(run), bool) if first_bad is None else np.arange(len(run)) < first_bad[run]
         if not self._is_batch:
             kept &= output.stream.publish_time_ns < self._end_ns[run]
@@ -340,10 +340,6 @@ def _span_of(ragged: Ragged, clock: Clock) -> tuple[Integers, Integers]:
     begin = ragged.offsets[runs]
     first[runs], last[runs] = np.minimum.reduceat(times, begin), np.maximum.reduceat(times, begin)
     return first, last
-
-
-def _run_of(ragged: Ragged) -> Integers:
-    return np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
 
 
 def _kept(ragged: Ragged, kept: NDArray[np.bool_]) -> Ragged:

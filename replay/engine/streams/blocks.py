@@ -152,6 +152,11 @@ def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArra
     return np.concatenate([[0], np.cumsum(chosen)])[offsets]
 
 
+def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the run of every row (n,) of ragged columns, from their offsets (runs + 1,)."""
+    return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+
+
 def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
@@ -166,7 +171,7 @@ def filled_rows(
     """
     if (end == offsets[1:]).all():
         return slice(None), offsets
-    run = np.repeat(np.arange(len(end)), np.diff(offsets))
+    run = run_of_rows(offsets)
     filled = np.arange(len(run)) < end[run]
     return np.flatnonzero(filled), ragged_rows(filled, offsets)
 
@@ -200,7 +205,7 @@ def join(parts: Sequence[Ragged]) -> Ragged:
     """Join blocks of one topic, each run's rows together."""
     if len(parts) == 1:
         return parts[0]
-    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    run = np.concatenate([run_of_rows(part.offsets) for part in parts])
     stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
     offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
     return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)

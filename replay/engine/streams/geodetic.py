@@ -13,7 +13,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, Topic, schemas
 from recorders.log.planes import ALTITUDE, LATITUDE, LONGITUDE
 from recorders.models.geodesy import into_tangent_plane, tangent_axes
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.channels import stated
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
         origins: (runs, 3) latitudes, longitudes and altitudes, see `origins_of`.
     """
     stream = fixes.stream
-    origin = origins[np.repeat(np.arange(fixes.runs), np.diff(fixes.offsets))]
+    origin = origins[run_of_rows(fixes.offsets)]
     place = stream["latitude_deg"], stream["longitude_deg"]
     is_flat = np.isnan(stream["altitude_m"])
     altitude = np.where(is_flat, origin[:, 2], stream["altitude_m"])

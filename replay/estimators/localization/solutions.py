@@ -9,7 +9,7 @@ import pandas as pd
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Integers
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.channels import stated
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.results import state_stream
@@ -35,7 +35,7 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
         [
             pd.DataFrame(
                 {
-                    "run": np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+                    "run": run_of_rows(ragged.offsets),
                     "sensor": sensor,
                     "time_ns": ragged.stream.publish_time_ns,
                     **{field: ragged[field] for field in fields},

@@ -24,7 +24,7 @@ from replay.engine.api.functions import recursive
 from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Booleans, Floats
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from replay.engine.streams.channels import given_or_stated, numbered
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.priors import Priors, no_priors, priors_of
@@ -203,7 +203,7 @@ def _events(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
     )
     target_id = block.column("target_id", missing=0).astype(np.int64)
-    run_of = np.repeat(np.arange(len(order.offsets) - 1), np.diff(order.offsets))
+    run_of = run_of_rows(order.offsets)
     robot, sees = np.divmod(order.topic, 2)
     numbers = np.array([_number(prefix) for prefix in prefixes])
     fellow = np.minimum(np.searchsorted(numbers, target_id), len(numbers) - 1)

@@ -22,7 +22,7 @@ from replay.engine.api.functions import batch
 from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.channels import numbered
 from replay.engine.streams.results import ALL_WELL, failures_of, states_in
 from replay.engine.vectors.components import components_of
@@ -185,7 +185,7 @@ def _schedule(
     if centralised:
         node = np.zeros_like(node)
     links = whole["/links"]
-    link_run = np.repeat(np.arange(links.runs), np.diff(links.offsets))
+    link_run = run_of_rows(links.offsets)
     ends = {}
     for end in ("sender_id", "receiver_id"):
         if not np.isin(links[end], numbers).all():
@@ -248,7 +248,7 @@ def _schedule(
 
 def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
     """Return run, stamp and index of the part, of all messages, part by part."""
-    run = [np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts]
+    run = [run_of_rows(part.offsets) for part in parts]
     index = [np.full(len(part), number) for number, part in enumerate(parts)]
     time_ns = [part.stream.publish_time_ns for part in parts]
     return np.concatenate(run), np.concatenate(time_ns), np.concatenate(index)

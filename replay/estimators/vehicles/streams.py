@@ -20,7 +20,7 @@ from recorders.parameters import Parameters
 from replay.engine.api.functions import recursive
 from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from replay.engine.streams.channels import numbered, stated
 from replay.engine.streams.failures import Failure, reason_stream
 from replay.engine.streams.measurements import PLANE, read_fixes, read_vectors
@@ -214,7 +214,7 @@ def frames_of(setup: Setup, block: Block) -> Frames:
     """Return a block's messages by run and frame."""
     events = block.events
     runs = len(events.offsets) - 1
-    run_of = np.repeat(np.arange(runs), np.diff(events.offsets))
+    run_of = run_of_rows(events.offsets)
     ends = np.concatenate([[0], np.cumsum(events.is_last)])
     frame_of = ends[:-1] - ends[events.offsets[:-1]][run_of]
     counts = np.diff(ends[events.offsets])

@@ -10,7 +10,7 @@ import numpy as np
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, ragged_rows
+from replay.engine.streams.blocks import Block, Ragged, ragged_rows, run_of_rows
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import GEODETIC, in_plane
 from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
@@ -53,7 +53,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
         asked: the map as the model describes it.
     """
     places = read_vectors(ragged.stream, asked.point, asked.components)
-    run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
+    run = run_of_rows(ragged.offsets)
     keys = (run << 32) + ragged[asked.number]
     order = np.argsort(keys, kind="stable")
     return Points(keys[order], np.ascontiguousarray(places[order]))
@@ -235,7 +235,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     reference: list[Floats] = []
     if sensor.maps:
         target = stream[sensor.maps[0].of].astype(np.int64)
-        run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
+        run = run_of_rows(ragged.offsets)
     for each in sensor.maps:
         places = context.points[each.topic]
         rows = places.rows(run, stream[each.of].astype(np.int64))

@@ -16,7 +16,7 @@ import numpy as np
 from recorders.log import make_stream, schemas
 from replay.engine.arrays import Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
+from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, Steps
@@ -225,7 +225,7 @@ class OutOfSequenceFilter:
         carried, before = copied(state.carried), state.kept
         history = before.with_room(2 * (most_within(before, events, self.window_ns) + 3))
         runs = len(history.first)
-        run = np.repeat(np.arange(runs), np.diff(events.offsets))
+        run = run_of_rows(events.offsets)
         wants_estimate = events.wants_estimate & (events.time_ns >= history.start_ns[run])
         events = events._replace(wants_estimate=wants_estimate)
         due = ragged_rows(wants_estimate, events.offsets)
@@ -297,7 +297,7 @@ def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragge
     """
     if not events.arrival.shape[1]:
         return estimates
-    run = np.repeat(np.arange(estimates.runs), np.diff(events.offsets))
+    run = run_of_rows(events.offsets)
     called = events.wants_estimate & (events.time_ns >= start_ns[run])
     begin = ragged_rows(called, events.offsets)[:-1]
     first = np.repeat(begin - estimates.offsets[:-1], np.diff(estimates.offsets))

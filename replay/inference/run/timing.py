@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import last_of_equals, ragged_rows
+from replay.engine.streams.blocks import last_of_equals, ragged_rows, run_of_rows
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
@@ -56,8 +56,7 @@ def compensate_delays(
         delays_ns: (sensors + 2,), see `delays_of`.
         is_end: whether no more events come.
     """
-    runs = len(events.offsets) - 1
-    run = np.repeat(np.arange(runs), np.diff(events.offsets))
+    run = run_of_rows(events.offsets)
     time_ns = events.time_ns - delays_ns[events.source]
     last_ns = np.append(events.time_ns, 0)[events.offsets[1:] - 1]
     settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
@@ -95,8 +94,7 @@ def output_times(
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
     """Join two sequences of events in time, run by run; at equal stamps those of the first go first."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
-    runs = len(first.offsets) - 1
-    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
+    run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
     columns: Any = (
         np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)

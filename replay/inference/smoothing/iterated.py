@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Ragged, copied, ragged_rows
+from replay.engine.streams.blocks import Ragged, copied, ragged_rows, run_of_rows
 from replay.inference.kalman.methods import FILTERS, Method
 from replay.inference.kalman.steps import Gaussian, Steps
 from replay.inference.model.stage import Stage
@@ -116,7 +116,7 @@ class IteratedSmoother(Smoother):
     def smoothed_once(self, state: FilterState) -> "Way":
         """Return the extended smoother's states at all stamps, from the prior's on."""
         events = reduce(join_events, (*self._first(state), *state.kept))
-        run = np.repeat(np.arange(len(state.next_output)), np.diff(events.offsets))
+        run = run_of_rows(events.offsets)
         asked, start_ns = events.wants_estimate, state.carried.time_ns
         events = events._replace(
             wants_estimate=last_of_stamps(events) & (events.time_ns >= start_ns[run])

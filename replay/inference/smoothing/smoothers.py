@@ -18,7 +18,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Integers
-from replay.engine.streams.blocks import Ragged, copied
+from replay.engine.streams.blocks import Ragged, copied, run_of_rows
 from replay.inference.kalman.methods import (
     FILTERS,
     Method,
@@ -162,7 +162,7 @@ class Smoother(Filter):
         if state.kept:
             piece, window = _joined([state.kept.piece, new]), copied(state.kept.window)
         begin, end = piece.offsets[:-1], piece.offsets[1:]
-        run = np.repeat(np.arange(len(begin)), end - begin)
+        run = run_of_rows(piece.offsets)
         newest_ns = np.append(piece.nodes.time_ns, 0)[end - 1]
         is_ready = newest_ns[run] - piece.nodes.time_ns > self.lag_ns
         stop = begin + np.bincount(run, is_ready, len(begin)).astype(np.int64)
@@ -235,8 +235,7 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
     """Return pieces as one, each run's nodes together."""
     if len(pieces) == 1:
         return pieces[0]
-    runs = np.arange(len(pieces[0].offsets) - 1)
-    run = np.concatenate([np.repeat(runs, np.diff(piece.offsets)) for piece in pieces])
+    run = np.concatenate([run_of_rows(piece.offsets) for piece in pieces])
     order = np.argsort(run, kind="stable")
     columns: Any = zip(*(piece.nodes[1:] for piece in pieces), strict=True)
     offsets = sum((piece.offsets for piece in pieces), np.zeros(1, np.int64))

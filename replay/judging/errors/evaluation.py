@@ -18,7 +18,7 @@ from recorders.log import Stream
 from recorders.log.planes import Origin
 from recorders.models.orientation import heading
 from replay.distributions import chi2
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.planes import into_plane_of
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import (
@@ -251,10 +251,9 @@ def errors_of(
     tangent = tangent_components(names, kinds)
     size = len(tangent_components(list(components), list(components.values())))
     known = np.isfinite(error).all(axis=1)
-    counts = np.diff(estimates.offsets)
-    run = np.repeat(np.arange(len(counts)), counts)
+    run = run_of_rows(estimates.offsets)
     before = estimates.offsets[:-1] if steps is None else estimates.offsets[:-1] - steps
-    step = np.arange(len(stream)) - np.repeat(before, counts)
+    step = np.arange(len(stream)) - before[run]
     epochs = np.array([source.epoch_ns for source in sources])
     rows = match_tangent(stream.metadata, judged, where)
     covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
@@ -378,7 +377,7 @@ def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
     return Innovations(
         estimator,
         case,
-        first_run + np.repeat(np.arange(stream.runs), np.diff(stream.offsets)),
+        first_run + run_of_rows(stream.offsets),
         stream.stream.publish_time_ns,
         stream["accepted"] != 0,
         stream["normalised_innovation_squared"],

@@ -8,7 +8,7 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import Components
 from replay.judging.errors.evaluation import reference, split_topic
@@ -85,7 +85,7 @@ def judge_sets(
 def _judge(
     sizes: Ragged, sets: Ragged, faults: int, sources: Sequence[Source], gap_limit_s: float
 ) -> JudgedSets:
-    run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
+    run = run_of_rows(sizes.offsets)
     topic = sizes.stream.metadata["truth"]
     truth = [
         reference(Truths(source), topic, PLACE, sizes.of_run(number), gap_limit_s)
