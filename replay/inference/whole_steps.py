@@ -13,8 +13,7 @@ import numpy as np
 from replay.engine.arrays import Function
 from replay.inference.kalman.predict import motion_derivative
 from replay.inference.kalman.regression import measured_with_noise, moved_with_noise, no_variances
-from replay.inference.kalman.update import message_layout, sensor_derivative
-from replay.inference.linear_algebra.gaussian import wrap
+from replay.inference.kalman.update import message_layout, residual_of, sensor_derivative
 from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
 from replay.inference.model.corrections import relinearising, stepping
@@ -201,8 +200,7 @@ def _linear_sensor(
 ) -> Function:
     linearise, layout = sensor_derivative(model, sensor), message_layout(sensor)
     m, read_state, add = len(sensor.measured), tuple_of(model.size), adding_noise(len(sensor.measured))
-    angular = [kind == "angle" for kind in sensor.measured.values()]
-    step_to, chain = relinearising(model)
+    subtract, (step_to, chain) = residual_of(sensor), relinearising(model)
 
     def innovate(mean: Any, _: Any, data: Any, parameters: Any, *moved: Any) -> Any:
         work, noise, state = memory(), zeros(m, m), mean
@@ -221,7 +219,8 @@ def _linear_sensor(
             gain, variances = work.noise_gain[:m, : sensor.noises], sensor.noise(parameters)
         elif sensor.noise is not None:
             add(noise, sensor.noise(parameters))
-        difference = [wrap(data[i] - work.predicted[i], angular[i]) for i in range(m)]
+        difference = zeros(m)
+        subtract(data, work.predicted, difference)
         for i in range(m if is_iterated else 0):
             for k in range(model.tangent):
                 difference[i] += rows[i, k] * work.step[k]
@@ -232,16 +231,16 @@ def _linear_sensor(
 
 def _sampled_sensor(sensor: Sensor) -> Function:
     layout, m = message_layout(sensor), len(sensor.measured)
-    angular = [kind == "angle" for kind in sensor.measured.values()]
-    add = adding_noise(m)
+    subtract, add = residual_of(sensor), adding_noise(m)
 
     def innovate(_: Any, __: Any, data: Any, parameters: Any, centre: Any) -> Any:
-        noise = zeros(m, m)
+        difference, noise = zeros(m), zeros(m, m)
+        subtract(data, centre, difference)
         if sensor.covariance and not sensor.noises:
             add(noise, layout.noise(data))
         elif sensor.noise is not None and not sensor.noises:
             add(noise, sensor.noise(parameters))
-        return {"v": [wrap(data[i] - centre[i], angular[i]) for i in range(m)], "N": noise}
+        return {"v": difference, "N": noise}
 
     return innovate
 

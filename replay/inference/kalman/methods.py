@@ -25,10 +25,8 @@ from replay.inference.kalman.update import (
     kalman_update,
     linear_sensor,
     message_layout,
+    residual_of,
     sensor_derivative,
-)
-from replay.inference.linear_algebra.gaussian import (
-    wrap,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.model import Model
@@ -178,15 +176,14 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     sensor = stage.sensors[number]
     moments, read_reference = sensor.moments, message_layout(sensor).reference
     assert moments is not None
-    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
+    subtract = residual_of(sensor)
 
     def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
         data, parameters, _, _ = measurement
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted
         moments(mean, covariance, read_reference(data), parameters, predicted, spread, cross)
-        for i in range(m):
-            difference[i] = wrap(data[i] - predicted[i], angular[i])
+        subtract(data, predicted, difference)
         return True
 
     return innovate

@@ -14,8 +14,8 @@ import numpy as np
 from replay.engine.arrays import Floats, Function, varying
 from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
 from replay.inference.kalman.steps import Interval, Measurement, Workspace
-from replay.inference.kalman.update import message_layout, sensor_noise
-from replay.inference.linear_algebra.gaussian import cholesky, wrap
+from replay.inference.kalman.update import message_layout, residual_of, sensor_noise
+from replay.inference.linear_algebra.gaussian import cholesky
 from replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
@@ -113,7 +113,8 @@ def sampling(
             if flat_states:
                 point = tuple(state[row] + away[row] for row in range(components))
             else:
-                memory.point[:] = mean
+                for row in range(components):
+                    memory.point[row] = mean[row]
                 add(memory.point, away)
                 point = read_state(memory.point)
             value = function(point, read_noise(away), arguments)
@@ -258,8 +259,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
-    read_reference, m = message_layout(sensor).reference, len(kinds)
-    angular = tuple(kind == "angle" for kind in kinds)
+    read_reference, subtract = message_layout(sensor).reference, residual_of(sensor)
     entering = sensor.noise if sensor.noises else None
     variances_of = entering or no_variances
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
@@ -271,8 +271,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
         arguments, variances = (read_reference(data), parameters), variances_of(parameters)
         if not regress(mean, covariance, arguments, variances, spread, cross, event, memory):
             return False
-        for i in range(m):
-            difference[i] = wrap(data[i] - memory.centre[i], angular[i])
+        subtract(data, memory.centre, difference)
         add_noise(spread, data, parameters, work)
         return True
 

@@ -34,13 +34,14 @@ from replay.inference.kalman.steps import (
 from replay.inference.kalman.update import (
     is_unmeasured,
     message_layout,
+    residual_of,
     sensor_derivative,
     sensor_noise,
     write_numbers,
     writing_innovation,
 )
 from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
-from replay.inference.linear_algebra.gaussian import fill_identity, whiten_by, wrap
+from replay.inference.linear_algebra.gaussian import fill_identity, whiten_by
 from replay.inference.linear_algebra.inflation import inflation
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.corrections import correcting, sloping
@@ -170,7 +171,7 @@ def _updating(
     model, sensor = stage.model, stage.sensors[number]
     t, m, read_reference = model.tangent, len(sensor.measured), message_layout(sensor).reference
     read_state, to_covariance = tuple_of(model.size), FACTORS.to_covariance
-    angular = tuple(kind == "angle" for kind in sensor.measured.values())
+    subtract = residual_of(sensor)
     write_innovation, find_slope = (
         writing_innovation(stage, number),
         sloping(model.kinds, model.correct, FACTORS),
@@ -191,8 +192,8 @@ def _updating(
         state, given = read_state(mean), (read_reference(data), parameters)
         spread(state, factor, given, event, work, (rows, weights))
         add_noise(noise, data, parameters, work)
+        subtract(data, work.predicted, difference)
         for i in range(m):
-            difference[i] = wrap(data[i] - work.predicted[i], angular[i])
             if np.isnan(difference[i]):
                 rows[i, :] = noise[i, :] = noise[:, i] = 0.0
                 noise[i, i] = 1.0

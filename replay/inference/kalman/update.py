@@ -51,6 +51,20 @@ def message_layout(sensor: Sensor) -> MessageLayout:
     )
 
 
+def residual_of(sensor: Sensor) -> Function:
+    """Make `subtract(data, predicted, difference)`: what is measured minus what is predicted, (m,).
+
+    Angles differ by no more than half a turn.
+    """
+    angular = tuple(kind == "angle" for kind in sensor.measured.values())
+
+    def subtract(data: Floats, predicted: Floats, difference: Floats) -> None:
+        for i in range(len(angular)):
+            difference[i] = wrap(data[i] - predicted[i], angular[i])
+
+    return subtract
+
+
 def sensor_noise(sensor: Sensor) -> Function:
     """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
@@ -137,13 +151,12 @@ def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = Non
     Returns `compare(covariance, data, parameters, work)`: from the workspace's `predicted` h (m,) and
     `rows` H (m, t), it fills v = y - h, C = P H' and S = H C + R.
     """
-    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
-    add_noise, measure_covariance = sensor_noise(sensor), measuring_covariance(pattern)
+    subtract, add_noise = residual_of(sensor), sensor_noise(sensor)
+    measure_covariance = measuring_covariance(pattern)
 
     def compare(covariance: Floats, data: Floats, parameters: Any, work: Workspace) -> None:
         difference, spread, cross = work.innovations[number]
-        for i in range(m):
-            difference[i] = wrap(data[i] - work.predicted[i], angular[i])
+        subtract(data, work.predicted, difference)
         measure_covariance(covariance, work.rows, cross, spread)
         add_noise(spread, data, parameters, work)
 
@@ -162,16 +175,14 @@ def whitening(sensor: Sensor, number: int) -> Function:
     how many components were measured, and the square of the residual, NaN where R is not positive
     definite.
     """
-    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
-    add_noise = sensor_noise(sensor)
+    m, subtract, add_noise = len(sensor.measured), residual_of(sensor), sensor_noise(sensor)
 
     def whiten_residual(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
         innovation = work.innovations[number]
         difference, noise, turned = innovation
-        for i in range(m):
-            difference[i] = wrap(data[i] - work.predicted[i], angular[i])
-            turned[:, i] = work.rows[i]
-            noise[i] = 0.0
+        subtract(data, work.predicted, difference)
+        turned[:, :] = work.rows[:m].T
+        noise[:, :] = 0.0
         add_noise(noise, data, parameters, work)
         size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)

@@ -16,6 +16,7 @@ from replay.inference.kalman.steps import (
 from replay.inference.kalman.update import (
     is_unmeasured,
     message_layout,
+    residual_of,
     sensor_noise,
     write_numbers,
     writing_innovation,
@@ -128,10 +129,9 @@ def _as_before(states: Floats, data: Floats, parameters: Any, memory: ParticleMe
 def _comparing(stage: Stage, number: int) -> Function:
     """Make `compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
     model, sensor = stage.model, stage.sensors[number]
-    m, measure = len(sensor.measured), sensor.measure
-    angular = tuple(kind == "angle" for kind in sensor.measured.values())
-    read_state, read_reference, fill = tuple_of(model.size), message_layout(sensor).reference, filling(m)
-    add_noise = sensor_noise(sensor)
+    measure, fill = sensor.measure, filling(len(sensor.measured))
+    read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
+    add_noise, subtract = sensor_noise(sensor), residual_of(sensor)
 
     def predict_alike(
         states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
@@ -161,8 +161,7 @@ def _comparing(stage: Stage, number: int) -> Function:
             add_noise(own.noise[0], data, parameters, memory.work)
         for i in range(len(states)):
             predict(states, i, data, parameters, memory)
-            for j in range(m):
-                own.differences[i, j] = wrap(data[j] - memory.work.predicted[j], angular[j])
+            subtract(data, memory.work.predicted, own.differences[i])
 
     return compare
 
