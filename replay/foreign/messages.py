@@ -8,14 +8,15 @@ import numpy as np
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic
 from recorders.log.streams import check_stream
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, run_of_rows
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.blocks import Block, Ragged, by_runs
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.measurements import check_width
 from replay.engine.streams.results import failures_by_run, state_stream
 from replay.foreign.description import Description, TopicRead
 from replay.foreign.native.following import Followed, Static
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, recorded_innovations
+from replay.inference.run.timing import at_stamps_of
 
 
 def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
@@ -57,10 +58,9 @@ def static_of(
     )
     if not parts:
         return nothing
-    run = np.concatenate([run_of_rows(each.offsets) for _, _, each in parts])
-    order = np.argsort(run, kind="stable")
+    order, offsets = by_runs([each.offsets for _, _, each in parts])
     return Static(
-        sum((each.offsets for _, _, each in parts), np.zeros(1, np.int64)),
+        offsets,
         np.concatenate([each.stream.publish_time_ns for _, _, each in parts])[order],
         np.concatenate([np.full(len(each), number) for number, _, each in parts])[order],
         np.concatenate([numbers_of(topic, each.stream, description.width) for _, topic, each in parts])[
@@ -96,7 +96,9 @@ def events_of(description: Description, found: Mapping[str, Topic], block: Block
         sources.append(numbers[name])
     merged = block.events
     source = np.array(sources)[merged.topic]
-    wanted = _wanted(merged.is_last, np.array([each.estimates for each in description.topics])[source])
+    wanted = at_stamps_of(
+        merged.is_last, np.array([each.estimates for each in description.topics])[source]
+    )
     return FilterEvents(
         merged.offsets,
         merged.time_ns,
@@ -106,16 +108,6 @@ def events_of(description: Description, found: Mapping[str, Topic], block: Block
         np.concatenate(targets)[merged.source],
         np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival,
     )
-
-
-def _wanted(is_last: Booleans, estimates: Booleans) -> Booleans:
-    """Tell which of the last events (n,) of their stamps want an estimate: not where none there does."""
-    if estimates.all() or not len(is_last):
-        return is_last.copy()
-    stamp: Integers = np.cumsum(is_last) - is_last
-    asked = np.zeros(int(stamp[-1]) + 1, bool)
-    asked[stamp[estimates]] = True
-    return is_last & asked[stamp]
 
 
 def streams_of(

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from replay.tracing.formulas import Text
 from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
 SHORTEST, LONGEST = 16, 90  # characters: what is shorter is repeated, what is longer gets a line
@@ -123,16 +124,6 @@ class Precision(NamedTuple):
 DOUBLE, SINGLE = Precision(), Precision("float", "f")
 
 
-class _Text(NamedTuple):
-    """Holds an expression, and how tightly its last operation binds."""
-
-    text: str
-    binds: int
-
-    def within(self, binds: int) -> str:
-        return self.text if self.binds >= binds else f"({self.text})"
-
-
 def c_lines(
     named: Mapping[str, Node],
     inputs: Mapping[Any, str],
@@ -155,7 +146,7 @@ def c_lines(
     squared = {node.arguments[0] for node in everything if node.operation is POWER}
     taken = {*inputs.values(), *named, *known.values()}
     free = (name for name in map(f"{of}{{}}".format, range(1, len(everything) + 1)) if name not in taken)
-    found = {node: _Text(name, _WHOLE) for node, name in known.items()}
+    found = {node: Text(name, _WHOLE) for node, name in known.items()}
     for name, output in named.items():
         for node in needed([output], known):
             if node in found:
@@ -169,72 +160,72 @@ def c_lines(
                 own = next(free)
                 kind = "int" if node.is_truth else precision.real
                 yield f"const {kind} {own} = {text.text};"
-                text = _Text(own, _WHOLE)
+                text = Text(own, _WHOLE)
             found[node] = text
         if name.isidentifier():
             yield f"const {precision.real} {name} = {_real(output, found[output], precision).text};"
-            found[output] = _Text(name, _WHOLE) if not output.is_truth else found[output]
+            found[output] = Text(name, _WHOLE) if not output.is_truth else found[output]
         else:
             yield f"{name} = {_real(output, found[output], precision).text};"
 
 
 def truth_text(node: Node, inputs: Mapping[Any, str], precision: Precision) -> str:
     """Write a condition in one expression."""
-    found: dict[Node, _Text] = {}
+    found: dict[Node, Text] = {}
     for each in needed([node]):
         found[each] = _text_of(each, [found[one] for one in each.arguments], inputs, precision)
     return found[node].text
 
 
-def _real(node: Node, text: _Text, precision: Precision) -> _Text:
+def _real(node: Node, text: Text, precision: Precision) -> Text:
     """Write a truth as a number."""
-    return _Text(f"({precision.real}){text.within(_WHOLE)}", _SIGN) if node.is_truth else text
+    return Text(f"({precision.real}){text.within(_WHOLE)}", _SIGN) if node.is_truth else text
 
 
-def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str], precision: Precision) -> _Text:
+def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision: Precision) -> Text:
     operation = node.operation
     if operation is INPUT:
-        return _Text(inputs[node.value], _WHOLE)
+        return Text(inputs[node.value], _WHOLE)
     if operation is CONSTANT:
         if isinstance(node.value, bool):
-            return _Text(str(int(node.value)), _WHOLE)
+            return Text(str(int(node.value)), _WHOLE)
         text = precision.number(node.value)
-        return _Text(text, _SIGN if text.startswith("-") else _WHOLE)
+        return Text(text, _SIGN if text.startswith("-") else _WHOLE)
     if operation is SELECT:
         condition, yes, no = given
         if node.is_truth and [each.value for each in node.arguments[1:]] == [False, True]:
-            return _Text(f"!({condition.text})", _SIGN)
+            return Text(f"!({condition.text})", _SIGN)
         sides = [
             text if node.is_truth else _real(side, text, precision)
             for side, text in zip(node.arguments[1:], (yes, no), strict=True)
         ]
-        return _Text(
+        return Text(
             f"{condition.within(_OR)} ? {sides[0].within(_OR)} : {sides[1].within(_CHOICE)}", _CHOICE
         )
     if operation in (operator.and_, operator.or_, operator.xor):
         sign, binds = _OPERATORS[operation]
-        return _Text(f" {sign} ".join(each.within(_COMPARISON) for each in given), binds)
+        return Text(f" {sign} ".join(each.within(_COMPARISON) for each in given), binds)
     if operation is operator.not_:
-        return _Text(f"!{given[0].within(_WHOLE)}", _SIGN)
+        return Text(f"!{given[0].within(_WHOLE)}", _SIGN)
     numbers = [_real(*each, precision) for each in zip(node.arguments, given, strict=True)]
     if operation is POWER:
         return _power(numbers[0].within(_WHOLE), node.value, precision)
     if operation is operator.neg:
-        return _Text(f"-{numbers[0].within(_WHOLE)}", _SIGN)
+        return Text(f"-{numbers[0].within(_WHOLE)}", _SIGN)
     if operation in _OPERATORS:
         sign, binds = _OPERATORS[operation]
         first, last = numbers
         lowest = _SUM if binds in (_EQUAL, _COMPARISON) else binds
-        return _Text(f"{first.within(lowest)} {sign} {last.within(max(lowest, binds + 1))}", binds)
+        return Text(f"{first.within(lowest)} {sign} {last.within(max(lowest, binds + 1))}", binds)
     listed = ", ".join(each.text for each in numbers)
     if operation in HELPERS:
-        return _Text(f"{HELPERS[operation][0]}({listed})", _WHOLE)
+        return Text(f"{HELPERS[operation][0]}({listed})", _WHOLE)
     if operation in _TESTS:
-        return _Text(f"({operation.__name__}({listed}) != 0)", _WHOLE)
-    return _Text(f"{_LIBM.get(operation, operation.__name__)}{precision.ending}({listed})", _WHOLE)
+        return Text(f"({operation.__name__}({listed}) != 0)", _WHOLE)
+    return Text(f"{_LIBM.get(operation, operation.__name__)}{precision.ending}({listed})", _WHOLE)
 
 
-def _power(base: str, exponent: int, precision: Precision) -> _Text:
+def _power(base: str, exponent: int, precision: Precision) -> Text:
     """Write a power by squaring, as kernels do."""
     found, square, rest = "", base, abs(exponent)
     while rest:
@@ -244,11 +235,11 @@ def _power(base: str, exponent: int, precision: Precision) -> _Text:
         if rest:
             square = f"({square} * {square})"
     if exponent < 0:
-        return _Text(f"{precision.number(1.0)} / ({found})", _PRODUCT)
+        return Text(f"{precision.number(1.0)} / ({found})", _PRODUCT)
     return (
-        _Text(found.removeprefix("(").removesuffix(")"), _PRODUCT)
+        Text(found.removeprefix("(").removesuffix(")"), _PRODUCT)
         if exponent == 2
-        else _Text(found, _PRODUCT if " * " in found else _WHOLE)
+        else Text(found, _PRODUCT if " * " in found else _WHOLE)
     )
 
 

@@ -46,8 +46,8 @@ _KNOWN: dict[float, tuple[str, int]] = {
 }
 
 
-class _Text(NamedTuple):
-    """Holds a formula, and how tightly its last operation binds."""
+class Text(NamedTuple):
+    """Holds a formula or an expression of C, and how tightly its last operation binds."""
 
     text: str
     binds: int
@@ -90,7 +90,7 @@ def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str
     everything = needed(named.values())
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
-    found: dict[Node, _Text] = {}
+    found: dict[Node, Text] = {}
     free = (name for name in map("v{}".format, range(1, len(everything) + 1)))
     taken = set(inputs.values())
     for name, output in named.items():
@@ -102,47 +102,47 @@ def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str
             if not is_named and len(text.text) > (SHORTEST if uses[node] > 1 else LONGEST):
                 own = next(each for each in free if each not in taken)
                 yield f"{own} = {text.text}"
-                text = _Text(own, _WHOLE)
+                text = Text(own, _WHOLE)
             found[node] = text
         yield f"{name} = {found[output].text}"
         if name.isidentifier() and len(found[output].text) > SHORTEST:
-            found[output] = _Text(name, _WHOLE)
+            found[output] = Text(name, _WHOLE)
 
 
-def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str]) -> _Text:
+def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str]) -> Text:
     """Write a node as a formula of those of its arguments."""
     operation = node.operation
     if operation is INPUT:
-        return _Text(inputs[node.value], _WHOLE)
+        return Text(inputs[node.value], _WHOLE)
     if operation is CONSTANT:
         return _constant(node.value)
     if operation is SELECT:
         condition, yes, no = given
         choice = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
-        return _Text(choice, _CHOICE)
+        return Text(choice, _CHOICE)
     if operation is POWER:
-        return _Text(f"{given[0].within(_WHOLE)} ** {node.value}", _POWER)
+        return Text(f"{given[0].within(_WHOLE)} ** {node.value}", _POWER)
     if operation is operator.neg:
-        return _Text(f"-{given[0].within(_PRODUCT)}", _PRODUCT)
+        return Text(f"-{given[0].within(_PRODUCT)}", _PRODUCT)
     if operation is operator.not_:
-        return _Text(f"not {given[0].within(_NOT)}", _NOT)
+        return Text(f"not {given[0].within(_NOT)}", _NOT)
     if operation in _OPERATORS:
         sign, binds = _OPERATORS[operation]
         left, right = given
         first = left.within(_SUM if binds == _COMPARISON else binds)  # Python chains comparisons
         last = right.within(_SIGN if binds == _REMAINDER else binds + 1)
-        return _Text(f"{first} {sign} {last}", binds)
+        return Text(f"{first} {sign} {last}", binds)
     name = "abs" if operation is np.absolute else operation.__name__
-    return _Text(f"{name}({', '.join(each.text for each in given)})", _WHOLE)
+    return Text(f"{name}({', '.join(each.text for each in given)})", _WHOLE)
 
 
-def _constant(value: Any) -> _Text:
+def _constant(value: Any) -> Text:
     if isinstance(value, bool):
-        return _Text(str(value), _WHOLE)
+        return Text(str(value), _WHOLE)
     if value < 0.0 or str(value) == "-0.0":
         text, binds = _constant(-value)
-        return _Text(f"-{text}", min(binds, _SIGN))
+        return Text(f"-{text}", min(binds, _SIGN))
     if value in _KNOWN:
-        return _Text(*_KNOWN[value])
+        return Text(*_KNOWN[value])
     text = repr(float(value))
-    return _Text(text.removesuffix(".0"), _WHOLE)
+    return Text(text.removesuffix(".0"), _WHOLE)

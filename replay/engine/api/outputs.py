@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, make_stream, schemas
 from replay.engine.api.inputs import Floats, Integers, Messages, Skipped
-from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.blocks import Ragged, gather, last_of_equals
 from replay.engine.streams.failures import Failure, reason_stream
 from replay.engine.streams.results import (
     InnovationColumns,
@@ -159,7 +159,8 @@ class Outputs:
         """Return the outputs of one block; of several estimates at a stamp the last stands."""
         # what is said of a covariance that is none is for the replay to find
         is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
-        rows = _last_of_stamps(messages, np.flatnonzero(is_estimate))
+        rows = np.flatnonzero(is_estimate)
+        rows = rows[last_of_equals(np.searchsorted(rows, messages.offsets), messages.time_ns[rows])]
         columns = messages.time_ns, messages.offsets, self.components, self.truth
         state = states_in(rows, f"{self.topic}/state", *columns, results.mean, results.covariance)
         failures = {}
@@ -272,13 +273,3 @@ class Outputs:
                     f"{wanted} is needed"
                 )
         return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
-
-
-def _last_of_stamps(messages: Messages, rows: Integers) -> Integers:
-    """Return of these rows, in order, the last one of every stamp of a run."""
-    time_ns = messages.time_ns[rows]
-    is_last = np.ones(len(rows), bool)
-    np.not_equal(time_ns[1:], time_ns[:-1], out=is_last[:-1])
-    ends = np.searchsorted(rows, messages.offsets[1:])
-    is_last[ends[ends > 0] - 1] = True
-    return rows[is_last]

@@ -157,6 +157,19 @@ def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
+def by_runs(parts: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Order rows of several parts, laid end to end, so that each run's stand together.
+
+    Args:
+        parts: the offsets (runs + 1,) of each.
+
+    Returns:
+        The order (n,) of the rows, and their offsets.
+    """
+    run = np.concatenate([run_of_rows(each) for each in parts])
+    return np.argsort(run, kind="stable"), sum(parts, np.zeros(1, np.int64))
+
+
 def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
@@ -205,10 +218,9 @@ def join(parts: Sequence[Ragged]) -> Ragged:
     """Join blocks of one topic, each run's rows together."""
     if len(parts) == 1:
         return parts[0]
-    run = np.concatenate([run_of_rows(part.offsets) for part in parts])
+    order, offsets = by_runs([part.offsets for part in parts])
     stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
-    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
-    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
+    return Ragged(stream.take(order), offsets)
 
 
 def side_by_side(parts: Sequence[Ragged]) -> Ragged:

@@ -20,10 +20,20 @@ def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
     control = stage.model.control
     if control is None or control.estimates or not stage.sensors:
         return events.wants_estimate
-    stamp: Integers = np.cumsum(events.wants_estimate) - events.wants_estimate
-    sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-    sensed[stamp[events.source != CONTROL]] = True
-    return events.wants_estimate & sensed[stamp]
+    return at_stamps_of(events.wants_estimate, events.source != CONTROL)
+
+
+def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
+    """Tell which of the last events of their stamps have a chosen one at their stamp, (n,).
+
+    Args:
+        is_last: (n,) which events are the last of their stamps.
+        chosen: (n,) which events are looked for.
+    """
+    stamp: Integers = np.cumsum(is_last) - is_last
+    has_one = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+    has_one[stamp[chosen]] = True
+    return is_last & has_one[stamp]
 
 
 def delays_of(stage: Stage, settings: Floats) -> Integers:

@@ -18,7 +18,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Integers
-from replay.engine.streams.blocks import Ragged, copied, run_of_rows
+from replay.engine.streams.blocks import Ragged, by_runs, copied, run_of_rows
 from replay.inference.kalman.methods import (
     FILTERS,
     Method,
@@ -235,10 +235,8 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
     """Return pieces as one, each run's nodes together."""
     if len(pieces) == 1:
         return pieces[0]
-    run = np.concatenate([run_of_rows(piece.offsets) for piece in pieces])
-    order = np.argsort(run, kind="stable")
+    order, offsets = by_runs([piece.offsets for piece in pieces])
     columns: Any = zip(*(piece.nodes[1:] for piece in pieces), strict=True)
-    offsets = sum((piece.offsets for piece in pieces), np.zeros(1, np.int64))
     return Piece(Nodes(offsets[1:], *(np.concatenate(parts)[order] for parts in columns)), offsets)
 
 
