@@ -142,8 +142,7 @@ def prepare(mean: Floats, covariance: Floats, variance: float, work: PhdMemory, 
             factor[i, j] = covariance[PLACE[i], PLACE[j]]
         factor[i, i] += variance
         work.innovation.difference[i] = 0.0
-        for row in range(STATES):
-            gain[row, i] = covariance[row, PLACE[i]]
+        gain[:, i] = covariance[:, PLACE[i]]
     innovation = Innovation(work.innovation.difference, factor, gain)
     if np.isnan(whiten(innovation, 2)[0]):
         return False
@@ -195,10 +194,7 @@ def add_detected(
     if born > 0.0:
         total += born
         work.weight[end] = born
-        for row in range(STATES):
-            work.mean[end, row] = 0.0
-            for column in range(STATES):
-                work.covariance[end, row, column] = 0.0
+        work.mean[end], work.covariance[end] = 0.0, 0.0
         for axis in range(2):
             at = PLACE[axis]
             work.mean[end, at] = place[axis]

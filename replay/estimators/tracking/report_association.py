@@ -326,10 +326,8 @@ def take_in(
     tracks.course_rad[run, place] = reports.course_rad[event]
     tracks.speed_mps[run, place] = reports.speed_mps[event]
     results.number[event] = tracks.number[run, place]
-    for component in range(4):
-        results.mean[event, component] = tracks.mean[run, place, component]
-    for component in range(3):
-        results.spread[event, component] = tracks.spread[run, place, component]
+    results.mean[event] = tracks.mean[run, place]
+    results.spread[event] = tracks.spread[run, place]
 
 
 def forget(run: int, now_ns: int, tracks: Tracks, settings: ReportSettings) -> None:
@@ -346,8 +344,7 @@ def forget(run: int, now_ns: int, tracks: Tracks, settings: ReportSettings) -> N
         for real in (tracks.interval_s, tracks.course_rad, tracks.speed_mps):
             real[run, place] = real[run, last]
         for vector in (tracks.mean, tracks.spread, tracks.weight, tracks.held):
-            for entry in range(vector.shape[2]):
-                vector[run, place, entry] = vector[run, last, entry]
+            vector[run, place] = vector[run, last]
 
 
 def track(

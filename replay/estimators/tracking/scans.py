@@ -11,7 +11,7 @@ import numpy as np
 from recorders.errors import BadInput
 from recorders.log import Stream
 from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.inference.association.scans import Scans, ScanSensor
 
@@ -78,7 +78,7 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     than it says, or the scan of a detection is not there.
     """
     keys, known = (
-        (np.repeat(np.arange(each.runs), np.diff(each.offsets)) << 32) + each["scan_id"].astype(np.int64)
+        (run_of_rows(each.offsets) << 32) + each["scan_id"].astype(np.int64)
         for each in (detection, scan)
     )
     numbers, counts = np.unique(known, return_counts=True)

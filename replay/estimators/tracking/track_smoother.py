@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.estimators.tracking.targets import Targets
 from replay.inference.association.track_smoothing import smooth_tracks
 
@@ -34,7 +34,7 @@ def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
 def smoothed(tracks: Ragged, targets: Targets) -> Ragged:
     """Return the stream of tracks with smoothed states."""
     stream, size = tracks.stream, targets.stage.model.size
-    run = np.repeat(np.arange(tracks.runs), np.diff(tracks.offsets))
+    run = run_of_rows(tracks.offsets)
     _, track = np.unique(
         np.stack([run, stream["track_id"].astype(np.int64)]), axis=1, return_inverse=True
     )

@@ -48,10 +48,8 @@ def nearest(
     Returns:
         0, as no cluster is approximated.
     """
-    for column in range(detections):
-        memory.is_seen[column] = False
-    for row in range(tracks):
-        memory.column_of[row] = NONE
+    memory.is_seen[:detections] = False
+    memory.column_of[:tracks] = NONE
     while True:
         best, chosen_row, chosen_column = 1.0, NONE, NONE
         for row in range(tracks):
@@ -86,13 +84,10 @@ def hungarian(
         0, as no cluster is approximated.
     """
     columns = detections + tracks
-    for column in range(columns):
-        memory.price[column], memory.row_of[column] = 0.0, NONE
-    for row in range(tracks):
-        memory.potential[row], memory.column_of[row] = 0.0, NONE
+    memory.price[:columns], memory.row_of[:columns] = 0.0, NONE
+    memory.potential[:tracks], memory.column_of[:tracks] = 0.0, NONE
     for first in range(tracks):
-        for column in range(columns):
-            memory.distance[column], memory.is_done[column] = np.inf, False
+        memory.distance[:columns], memory.is_done[:columns] = np.inf, False
         row, reached, sink = first, 0.0, NONE
         while sink == NONE:
             closest = NONE

@@ -162,8 +162,7 @@ def beginning(tracker: Tracker) -> Function:
             tracks.hits[run, place] = tracks.chances[run, place] = 1
             tracks.score[run, place] = tracks.best_score[run, place] = 0.0
             tracks.seen_ns[run, place] = tracks.time_ns[run]
-            for sensor in range(tracks.updated_ns.shape[2]):
-                tracks.updated_ns[run, place, sensor] = NEVER
+            tracks.updated_ns[run, place] = NEVER
         return turned_away
 
     return begin_tracks

@@ -100,12 +100,10 @@ def jpda(
         memory: what is worked in.
     """
     approximated = 0
-    for column in range(detections):
-        memory.is_seen[column] = False
+    memory.is_seen[:detections] = False
     for row in range(tracks):
         probability[row, 0] = NONE  # not in a cluster yet
-        for column in range(detections):
-            probability[row, 1 + column] = 0.0
+        probability[row, 1 : 1 + detections] = 0.0
     for row in range(tracks):
         if probability[row, 0] >= 0.0:
             continue
@@ -203,10 +201,8 @@ def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemor
     """Fill a cluster's sums `forward`, and `backward` behind the last item; returns that of all maps."""
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
-    for each in range(items):
-        memory.alone[each] = 1.0
-    for each in range(slots):
-        memory.spare[each] = 1.0
+    memory.alone[:items] = 1.0
+    memory.spare[:slots] = 1.0
     for k in range(rows):
         row = memory.rows[k]
         largest = weights.missed[row]  # what all weights of a track have in common cancels out

@@ -163,8 +163,7 @@ def association_weights(tracker: Tracker) -> Function:
             memory.undetected[detection] = undetected
             memory.clutter[detection] = clutter_of(kind, measured, p) + undetected
         for place in range(tracks.used[run]):
-            for detection in range(count):
-                weights.detected[place, detection] = 0.0
+            weights.detected[place, :count] = 0.0
             weights.missed[place] = 1.0
             if not (begins[kind] or tracks.is_confirmed[run, place]):
                 continue

@@ -108,8 +108,7 @@ def drop(run: int, place: int, tracks: Tracks) -> None:
             mean, covariance = tracks.mean[run, at, mode], tracks.covariance[run, at, mode]
             after = tracks.mean[run, at + 1, mode], tracks.covariance[run, at + 1, mode]
             copy_gaussian(after[0], after[1], mean, covariance)
-        for sensor in range(tracks.updated_ns.shape[2]):
-            tracks.updated_ns[run, at, sensor] = tracks.updated_ns[run, at + 1, sensor]
+        tracks.updated_ns[run, at] = tracks.updated_ns[run, at + 1]
 
 
 def expected(run: int, place: int, component: int, tracks: Tracks) -> float:
