@@ -30,12 +30,11 @@ from replay.inference.kalman.methods import (
     no_steps,
 )
 from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
-from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.modes.mixing import likeliest_of, mixing
+from replay.inference.modes.mixing import MixtureMemory, likeliest_of, mixing, mixture_memory
 from replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
 from replay.inference.run.filtering import FilterState
 
@@ -87,15 +86,10 @@ class GaussianSumBelief(NamedTuple):
 
 
 class GaussianSumMemory(NamedTuple):
-    """Holds what the steps of one core work in; see `mixing.InteractingMemory`, and `factor` (t, t)."""
+    """Holds what the steps of one core work in: the members' filter, their mixture, `factor` (t, t)."""
 
     filters: tuple[Any]
-    centre: Floats
-    away: Floats
-    carried: Floats
-    shift: Floats
-    records: InnovationRecord
-    open_gate: Floats
+    mixture: MixtureMemory
     factor: Floats
 
 
@@ -107,9 +101,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         inner: the steps of the filter of one member.
         members: how many there are at most.
     """
-    n, t = stage.model.size, stage.model.tangent
-    innovation_size = len(innovation_components(stage.sensors))
-    most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    t = stage.model.tangent
     to_common_tangent, mix = mixing(stage.model.kinds, inner.form)
     to_covariance = inner.form.to_covariance
     predict_member = inner.predict
@@ -148,22 +140,23 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         count = belief.left[run]
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
-        to_common_tangent(mean, covariance, probability, memory)
-        likeliest, factor = likeliest_of(probability), memory.factor
-        copy_gaussian(memory.centre, memory.carried[likeliest], memory.centre, factor)
+        mixture, factor = memory.mixture, memory.factor
+        to_common_tangent(mean, covariance, probability, mixture)
+        likeliest = likeliest_of(probability)
+        factor[:, :] = mixture.carried[likeliest]
         to_covariance(factor)
         if not cholesky(factor, factor, t):
             return
         apart = 0.0
         for each in range(count):
             for row in range(t):
-                entry = memory.away[each, row]
+                entry = mixture.away[each, row]
                 for k in range(row):
-                    entry -= memory.factor[row, k] * memory.shift[k]
-                memory.shift[row] = entry / memory.factor[row, row]
-                apart += probability[each] * memory.shift[row] * memory.shift[row]
+                    entry -= factor[row, k] * mixture.shift[k]
+                mixture.shift[row] = entry / factor[row, row]
+                apart += probability[each] * mixture.shift[row] * mixture.shift[row]
         if apart < AGREED:
-            mix(probability, memory, mean[0], covariance[0])
+            mix(probability, mixture, mean[0], covariance[0])
             belief.member[run, 0] = belief.member[run, likeliest]
             probability[0], belief.log_probability[run, 0] = 1.0, 0.0
             belief.left[run] = 1
@@ -195,26 +188,15 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         mixtures.probability[row] = 0.0
         for each in range(count):
             mixtures.probability[row, belief.member[run, each]] = probability[each]
-        to_common_tangent(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
-        mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_common_tangent(
+            belief.mean[run, :count], belief.covariance[run, :count], probability, memory.mixture
+        )
+        mix(probability, memory.mixture, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> GaussianSumMemory:
-        records = (
-            np.empty((members, innovation_size)),
-            np.empty((members, innovation_size, innovation_size)),
-            np.empty((members, 3)),
-        )
-        return GaussianSumMemory(
-            (inner.memory(sets),),
-            centre=np.empty(n),
-            away=np.empty((members, t)),
-            carried=np.empty((members, t, t)),
-            shift=np.empty(t),
-            records=InnovationRecord(*records),
-            open_gate=np.full(most + 1, np.inf),
-            factor=np.empty((t, t)),
-        )
+        mixture = mixture_memory(stage, members)
+        return GaussianSumMemory((inner.memory(sets),), mixture, np.empty((t, t)))
 
     updates = (
         of_run(mixture_update(stage, number, update)) for number, update in enumerate(inner.updates)

@@ -33,14 +33,19 @@ from replay.inference.kalman.methods import (
     no_steps,
 )
 from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
-from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.tuples import filling
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.model.validation import switching_of
-from replay.inference.modes.mixing import InteractingMemory, mixing, mixing_weights, transition_matrix
+from replay.inference.modes.mixing import (
+    InteractingMemory,
+    mixing,
+    mixing_weights,
+    mixture_memory,
+    transition_matrix,
+)
 from replay.inference.modes.mixture import (
     MixtureFilter,
     Mixtures,
@@ -84,9 +89,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     """
     model, switching = stage.model, stage.model.switching
     assert switching is not None
-    modes, n, t = len(filters), model.size, model.tangent
-    components = len(innovation_components(stage.sensors))
-    most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    modes = len(filters)
     form = filters[0].form
     to_common_tangent, mix = mixing(model.kinds, form)
     fill_transition, fill_weights, predict_modes = (
@@ -102,10 +105,10 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         probability, log_probability = belief.probability[run], belief.log_probability[run]
         fill_rates(memory.rates, rates_of(interval.parameters))
         fill_transition(memory.rates, interval.duration_s, memory.transition)
-        to_common_tangent(mean, covariance, probability, memory)
+        to_common_tangent(mean, covariance, probability, memory.mixture)
         fill_weights(probability, log_probability, memory)
         for mode in range(modes):
-            mix(memory.weights[mode], memory, mean[mode], covariance[mode])
+            mix(memory.weights[mode], memory.mixture, mean[mode], covariance[mode])
         return predict_modes(Gaussian(mean, covariance), interval, memory.filters)
 
     def estimate(
@@ -113,30 +116,20 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     ) -> None:
         probability = mixtures.probability[row]
         probability[:] = belief.probability[run]
-        to_common_tangent(belief.mean[run], belief.covariance[run], probability, memory)
-        mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_common_tangent(belief.mean[run], belief.covariance[run], probability, memory.mixture)
+        mix(probability, memory.mixture, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> InteractingMemory:
         waiting = iter(sets)
         inner = tuple(each.memory(tuple(next(waiting) for _ in each.sampled)) for each in filters)
-        records = InnovationRecord(
-            np.empty((modes, components)),
-            np.empty((modes, components, components)),
-            np.empty((modes, 3)),
-        )
         return InteractingMemory(
             inner,
             rates=np.empty(modes * (modes - 1)),
             transition=np.empty((modes, modes)),
             weights=np.empty((modes, modes)),
             predicted=np.empty(modes),
-            centre=np.empty(n),
-            away=np.empty((modes, t)),
-            carried=np.empty((modes, t, t)),
-            shift=np.empty(t),
-            records=records,
-            open_gate=np.full(most + 1, np.inf),
+            mixture=mixture_memory(stage, modes),
         )
 
     def of_run(update: Function) -> Function:

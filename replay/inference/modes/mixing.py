@@ -7,6 +7,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function
 from replay.inference.kalman.steps import InnovationRecord
+from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.manifold import (
     boxminus,
@@ -16,10 +17,39 @@ from replay.inference.linear_algebra.manifold import (
     tangent_size,
 )
 from replay.inference.linear_algebra.tuples import total
+from replay.inference.model.stage import Stage
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
 Matrix = tuple[tuple[float, ...], ...]  # its rows
+
+
+class MixtureMemory(NamedTuple):
+    """Holds what a mixture of M Gaussians is made and updated in.
+
+    Attributes:
+        centre: (n,), the mean in whose tangent space mixtures are made.
+        away, carried: (M, t), (M, t, t), the Gaussians there.
+        shift: (t,), of a mixture.
+        records: what every Gaussian's update tells, first axis = mode.
+        open_gate: (m + 1,), bounds that let everything in.
+    """
+
+    centre: Floats
+    away: Floats
+    carried: Floats
+    shift: Floats
+    records: InnovationRecord
+    open_gate: Floats
+
+
+def mixture_memory(stage: Stage, count: int) -> MixtureMemory:
+    """Make what mixtures of so many Gaussians are made and updated in."""
+    n, t, m = stage.model.size, stage.model.tangent, len(innovation_components(stage.sensors))
+    most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    records = InnovationRecord(np.empty((count, m)), np.empty((count, m, m)), np.empty((count, 3)))
+    away, carried = np.empty((count, t)), np.empty((count, t, t))
+    return MixtureMemory(np.empty(n), away, carried, np.empty(t), records, np.full(most + 1, np.inf))
 
 
 class InteractingMemory(NamedTuple):
@@ -30,11 +60,7 @@ class InteractingMemory(NamedTuple):
         rates, transition: (M (M - 1),), and Pi (M, M).
         weights: (M, M), row j those of all modes in the mixture of mode j.
         predicted: (M,), the logarithms of c.
-        centre: (n,), the mean in whose tangent space mixtures are made.
-        away, carried: (M, t), (M, t, t), the modes' Gaussians there.
-        shift: (t,), of a mixture.
-        records: what every mode's update tells, first axis = mode.
-        open_gate: (m + 1,), bounds that let everything in.
+        mixture: for the modes' Gaussians.
     """
 
     filters: tuple[Any, ...]
@@ -42,12 +68,7 @@ class InteractingMemory(NamedTuple):
     transition: Floats
     weights: Floats
     predicted: Floats
-    centre: Floats
-    away: Floats
-    carried: Floats
-    shift: Floats
-    records: InnovationRecord
-    open_gate: Floats
+    mixture: MixtureMemory
 
 
 @lru_cache(maxsize=16)
@@ -161,7 +182,9 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, 
     reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
     t, turn, mix_covariances = tangent_size(kinds), form.turn, form.mix
 
-    def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
+    def to_common_tangent(
+        mean: Floats, covariance: Floats, probability: Floats, memory: MixtureMemory
+    ) -> None:
         likeliest = likeliest_of(probability)
         centre, away = memory.centre, memory.away
         centre[:] = mean[likeliest]
@@ -172,7 +195,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, 
             if not flat:
                 turn(reset_back, away[mode], carried)
 
-    def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
+    def mix(weights: Floats, memory: MixtureMemory, mean: Floats, covariance: Floats) -> None:
         away, carried, shift = memory.away, memory.carried, memory.shift
         for row in range(t):
             entry = 0.0

@@ -81,7 +81,7 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
 
     def blend(probability: Floats, memory: Any, record: InnovationRecord) -> float:
         """Note the innovation of the mixture of all modes; returns its NIS."""
-        innovation, records = memory.filters[0].innovations[number], memory.records
+        innovation, records = memory.filters[0].innovations[number], memory.mixture.records
         difference, covariance, _ = innovation
         for i in range(m):
             first = records.difference[0, places[i]]
@@ -114,14 +114,15 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
     ) -> int:
         data, parameters, _, event = measurement
         probability, log_probability = weights
-        numbers, taken = memory.records.numbers, 0
+        records, taken = memory.mixture.records, 0
+        numbers = records.numbers
         numbers[:, 2] = 0.0
-        opened = Measurement(data, parameters, memory.open_gate, event)
+        opened = Measurement(data, parameters, memory.mixture.open_gate, event)
         for each in (measurement, opened):
             for mode in range(len(probability)):
                 if numbers[mode, 2] == 0.0:
                     own = InnovationRecord(
-                        memory.records.difference[mode], memory.records.covariance[mode], numbers[mode]
+                        records.difference[mode], records.covariance[mode], numbers[mode]
                     )
                     outcome = update_mode(mode, gaussians, each, memory.filters[0], own)
                     if outcome != ALL_WELL:

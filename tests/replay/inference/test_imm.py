@@ -21,7 +21,7 @@ from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
 from replay.inference.model.model import Model, Motion, Sensor, Switching
 from replay.inference.model.parameters import ModelParameters
-from replay.inference.modes.mixing import InteractingMemory, mixing, transition_matrix
+from replay.inference.modes.mixing import MixtureMemory, mixing, transition_matrix
 from replay.inference.run import filtering
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
@@ -385,10 +385,10 @@ def quaternion(turns: Any) -> Any:
 
 
 def memory_of(n: int, t: int, modes: int) -> Any:
-    """As much of a filter's memory as mixing needs."""
-    rest: dict[str, Any] = dict.fromkeys(InteractingMemory._fields)
+    """As much of a mixture's memory as mixing needs."""
+    rest: dict[str, Any] = dict.fromkeys(MixtureMemory._fields)
     shapes = {"centre": (n,), "away": (modes, t), "carried": (modes, t, t), "shift": (t,)}
-    return InteractingMemory(**rest | {name: np.empty(shape) for name, shape in shapes.items()})
+    return MixtureMemory(**rest | {name: np.empty(shape) for name, shape in shapes.items()})
 
 
 # The gate
