@@ -32,14 +32,12 @@ class KernelSource:
     one function, over different models, are two, and what two kernels need is one and compiled once.
     """
 
-    def __init__(self, allocates: bool = True) -> None:
+    def __init__(self) -> None:
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
-        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
-        self.options = f"_nrt={allocates}{bounds}"
         inner += ", pipeline_class=Inlined"
-        if not allocates:  # one piece is faster where no counting of references stands in the way
-            inner += ", forceinline=True"
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt=True{bounds}"
         self._decorator = f"@numba.njit({inner}, {self.options})"
         self.definitions: dict[str, str] = {}
         # where a definition's lines come from, in words

@@ -204,9 +204,9 @@ def _widened(state: Any, runs: int) -> Any:
     return type(state)(*(np.repeat(part[None], runs, axis=0) for part in state))
 
 
-def heading_model(given: Given[Any], topic: str = "headings") -> HeadingModel:
+def heading_model(given: Given[Any]) -> HeadingModel:
     """Return the model that parameters and channel state."""
-    stated = {name: given.stated(topic, name) for name in HeadingsFilterParameters.model_fields}
+    stated = {name: given.stated("headings", name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])
         for which in ("system", "measurement")

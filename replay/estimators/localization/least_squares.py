@@ -26,6 +26,7 @@ LEAST_DAMPING = 1e-12
 RANK_TOLERANCE = 1e-10
 # Components of a unit null vector below this are rounding.
 PARTICIPATION = 1e-8
+TOLERANCE = 1e-6  # of a step, in standard deviations
 SMALLEST_STEP = 2.0**-12
 # Costs are in squared standard deviations: less than this is rounding.
 COST_ROUNDING = 1e-12
@@ -118,18 +119,17 @@ class _Whitened(NamedTuple):
         return np.isfinite(self.cost) & np.asarray(np.isfinite(self.jacobian).all(axis=(1, 2)))
 
 
-def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iterations: int = 50) -> Solution:
+def solve(model: Model, start: Floats, *, max_iterations: int = 50) -> Solution:
     """Search the weighted least-squares estimate of every run from `start` (runs, n).
 
     `model(parameters, rows)` linearizes the runs `rows`, which may be none. A run has converged when its
-    next full step is shorter than `tolerance` standard deviations in the metric of its own information;
+    next full step is shorter than `TOLERANCE` standard deviations in the metric of its own information;
     that step is still taken. A row of `start` that is not finite is a run without a starting point.
     Raises BadInput for a wrong shape only.
 
     Args:
         model: (parameters (k, n), rows (k,)) -> the linearisation of these runs.
         start: (runs, n), not finite for a run without a starting point.
-        tolerance: in standard deviations.
         max_iterations: how many steps there are at most.
     """
     if start.ndim != 2 or 0 in start.shape:
@@ -137,10 +137,7 @@ def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iteration
 
     def solve_block(block: Rows) -> Solution:
         return _solve_block(
-            lambda parameters, rows: model(parameters, block[rows]),
-            start[block],
-            tolerance,
-            max_iterations,
+            lambda parameters, rows: model(parameters, block[rows]), start[block], max_iterations
         )
 
     count = -(-len(start) // BLOCK_RUNS)
@@ -149,7 +146,7 @@ def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iteration
     return Solution(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
-def _solve_block(model: Model, start: Floats, tolerance: float, max_iterations: int) -> Solution:
+def _solve_block(model: Model, start: Floats, max_iterations: int) -> Solution:
     parameters = start.astype(np.float64)
     iterations = np.zeros(len(start), np.int64)
     status = np.where(np.isfinite(start).all(axis=1), Status.NOT_FINITE, Status.NO_START)
@@ -162,7 +159,7 @@ def _solve_block(model: Model, start: Floats, tolerance: float, max_iterations: 
             break
         step, length = _gauss_newton(here)
         iterations[rows] = iteration
-        done = length < tolerance
+        done = length < TOLERANCE
         parameters[rows[done]] += step[done]
         status[rows[done]] = Status.CONVERGED
         rows, here, step = rows[~done], here.take(~done), step[~done]

@@ -136,16 +136,15 @@ def consistency(state: Consistent) -> dict[str, float]:
     return values
 
 
-def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Floats, Floats]:
-    """Compute where the mean NEES lies over so many runs: the lower and the upper bound, (n,) each.
+def step_bounds(runs: Floats, size: int) -> tuple[Floats, Floats]:
+    """Compute where 95 % of mean NEES lie over so many runs: the lower and the upper bound, (n,) each.
 
     Args:
         runs: (n,), how many there are at each step.
         size: components of the error.
-        probability: with which it lies there.
     """
     counts, place = np.unique(runs, return_inverse=True)
-    bounds = np.array([chi_square_interval(size, int(count), probability) for count in counts])
+    bounds = np.array([chi_square_interval(size, int(count)) for count in counts])
     return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
 
 
