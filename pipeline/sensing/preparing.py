@@ -124,10 +124,10 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
     spread, most = float(np.nanstd(means)), _STILL.get(unit_of(field), math.inf)
     size = max(20, len(values) // 200)
     blocks = np.diff(values)[: (len(values) - 1) // size * size].reshape(-1, size)
-    with np.errstate(invalid="ignore"):
-        activity = np.sqrt(np.nanmean(blocks**2, axis=1))
-    busiest = int(np.nanargmax(activity))
-    if spread > most or activity[busiest] > 4 * np.nanmedian(activity) > 0:
+    is_there, activity = np.isfinite(blocks).any(axis=1), np.zeros(len(blocks))
+    activity[is_there] = np.sqrt(np.nanmean(blocks[is_there] ** 2, axis=1))
+    busiest = int(np.argmax(activity))
+    if spread > most or activity[busiest] > 4 * np.median(activity[is_there]) > 0:
         at_s = busiest * size * step_s
         raise BadInput(
             f"{name}: the unit moves, most of all {at_s:.0f} s into the log; record it at rest, or take "

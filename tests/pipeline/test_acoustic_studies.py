@@ -1,14 +1,20 @@
 """Shots in sequence and sounds in recordings: what errors are of, and which numbers hold a claim."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from pipeline.output.claims import decide
+from pipeline.output.results import Outcome
 from pipeline.runs.experiment import load_experiment
+from pipeline.studies.acoustic import recordings
 from pipeline.studies.acoustic.recordings import (
     Options,
     Published,
+    Simulated,
     _explained,
     delays_of,
     differences_of,
@@ -33,6 +39,10 @@ def test_a_shot_is_where_it_was_fired_and_when_it_was_heard_last():
     assert np.isin(last_ns, reports_ns).all()
     # meanwhile the shooter has moved
     assert np.linalg.norm(positions(source, last_ns) - fired, axis=1).min() > 0.1
+
+
+def names(**columns: Any) -> Any:
+    return SimpleNamespace(**columns)
 
 
 def verdicts(metrics: dict, of: str) -> list[str]:
@@ -121,3 +131,49 @@ def test_covariances_are_right_within_chi_square(nees, inside, expected):
     }
     metrics |= {"simulated.sounds.snr-10": 100.0, "simulated.coordinates.snr-10": 2.0}
     assert verdicts(metrics, "simulated, 10 dB") == expected
+
+
+def test_simulated_sounds_have_errors_and_regions_by_their_noise(monkeypatch: pytest.MonkeyPatch):
+    """Of two noises: what is recorded, and its columns, metrics and shares by closed forms."""
+    asked: list[Any] = []
+
+    def record(scenario: str, parameters: dict, seed: int, runs: int, _: object) -> list:
+        asked.append((scenario, parameters, seed, runs))
+        return [names(streams={"/sound/truth": {"state": np.zeros((1, 2))}})]
+
+    def replay(_: list, estimators: dict) -> SimpleNamespace:
+        size_m = asked[-1][1]["snr_db"]
+        error = size_m * np.array([[0.6, 0.8, 9.0], [0.0, 2.0, 9.0], [3.0, 0.0, 9.0], [2.4, 3.2, 9.0]])
+        nees = np.array([1.0, 5.9, 6.1, 20.0])
+        assert estimators == {"ekf": "its settings"}
+        return names(errors=[names(error=error, nees=nees, run=np.arange(4))])
+
+    monkeypatch.setattr(recordings, "record_ensemble", record)
+    runner: Any = names(
+        setting=names(progress=None),
+        experiment=names(estimators={"ekf": "its settings", "ukf": "others"}),
+        replay=replay,
+    )
+    wanted = Simulated(runs=4, seed=7, snr_db=[10.0, 2.5], parameters={"height_m": 3.0})
+    outcome = Outcome()
+    table = recordings.simulate(runner, wanted, "ekf")
+    recordings._judge_simulated(table, "ekf", outcome)
+    recorded = [{"height_m": 3.0, "snr_db": noise} for noise in (10.0, 2.5)]
+    assert asked == [("sound-source", parameters, 7, 4) for parameters in recorded]
+    assert list(table) == ["snr_db", "run", "error_m", "nees", "inside", "coordinates"]
+    assert table["error_m"].tolist() == pytest.approx([10.0, 20.0, 30.0, 40.0, 2.5, 5.0, 7.5, 10.0])
+    assert outcome.metrics == {
+        f"{name}.snr-{noise:g}": pytest.approx(value)
+        for noise in (10.0, 2.5)
+        for name, value in (
+            ("ekf.median_error_m", 2.5 * noise),
+            ("ekf.nees", 8.25),
+            ("ekf.median_nees", 6.0),
+            ("ekf.coverage_share", 0.5),
+            ("simulated.sounds", 4.0),
+            ("simulated.coordinates", 2.0),
+        )
+    }
+    [panel] = outcome.figures["simulated"].panels
+    assert [each.label for each in panel.series] == ["10 dB", "2.5 dB"]
+    assert (panel.series[1].x, panel.series[1].y) == ([2.5, 5.0, 7.5, 10.0], [0.25, 0.5, 0.75, 1.0])

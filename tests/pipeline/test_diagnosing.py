@@ -23,6 +23,7 @@ from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
 from replay.engine.replaying.estimator import bind
+from tests.claims.pages import stored
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -440,6 +441,31 @@ def test_the_study_counts_what_is_named_and_what_a_removal_gains(
     assert told["diagnosis.first.landmarks-bias"] == told["diagnosis.first_two.landmarks-bias"] == 2.0
     assert told["diagnosis.nothing_share"] == 1.0
     assert told["diagnosis.counted"] == 2.0
+
+
+def test_each_fault_of_the_study_changes_what_it_says_and_is_kept_by_its_name() -> None:
+    """Of a log the messages of one topic alone, or the estimator's settings."""
+    kept = stored()["diagnosis"].metrics
+    for name, scenario in study.SCENARIOS.items():
+        short = scenario._replace(parameters={**scenario.parameters, "duration_s": 12.0})
+        for label, fault in scenario.faults.items():
+            assert f"diagnosis.worth.{name}-{label}" in kept
+            before, after = study._recorded(short, fault, 3, 0)
+            changed = {
+                topic
+                for topic, stream in before.streams.items()
+                if _bits(stream) != _bits(after.streams[topic])
+            }
+            recorded = {fault.topic or SEEN} if fault.record else set()
+            assert changed == {*filter(None, [fault.altered]), *(fault.exchanged or recorded)}, label
+            assert bool(changed) != bool(fault.settings), label
+    assert len([each for each in kept if each.startswith("diagnosis.worth.")]) == 3 + 10 + 9 + 10
+
+
+def _bits(stream: fl.Stream) -> tuple:
+    """All that a stream holds."""
+    columns = (each.tobytes() for each in stream.columns.values())
+    return stream.publish_time_ns.tobytes(), stream.log_time_ns.tobytes(), stream.metadata, *columns
 
 
 def test_what_the_gate_keeps_out_names_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,10 +18,11 @@ from pipeline.diagnosing.battery.car import (
 )
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
-from recorders.plausibility.body import bodies
+from recorders.plausibility.body import Series, bodies
 from recorders.plausibility.checks import findings
-from recorders.plausibility.motion import Motion
+from recorders.plausibility.motion import Lag, Motion
 from recorders.plausibility.speeds import scatter
+from recorders.plausibility.timing import Timing
 from recorders.recording import record_run
 from tests.pipeline.test_planes import HERE, car
 
@@ -184,6 +185,43 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
     assert found.words.startswith("/car/odometry: 2 of its 1002 messages are there twice")
     [found] = findings({wheels.topic: slow, **rest})
     assert (found.cause, found.topic) == ("clock", "/car/odometry")
+
+
+def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
+    """By lags and gains that are sure: of speeds beside places, of turns only where they are alike."""
+    [body] = bodies(recorded(faulty(2000, "nothing")).streams)
+    series = Series("/turns", "turn_radps", np.array([10.0, 11.0, 13.0]), np.array([1.0, 2.0, 4.0]))
+
+    def times_s(way: str, speeds: Timing | None, turns: Timing | None) -> list[float]:
+        motion = Motion(body)
+        for name, found in (("speed_lags", speeds), ("turn_lags", turns)):
+            lags = [Lag(series.topic, "/car/fix", found)] if found else []
+            setattr(motion, name, [Lag("/other", "/car/fix", SAME), *lags])
+        moved = getattr(motion, way)(series)
+        assert moved.values.tolist() == series.values.tolist()
+        return moved.times_s.tolist()
+
+    late, gaining = Timing(-0.5, 0.0, 0.99, 9.0, 0.1), Timing(-0.5, 0.1, 0.99, 9.0, 0.1)
+    unlike, unsure = late._replace(likeness=0.5), late._replace(evidence=1.0)
+    still, moved = [10.0, 11.0, 13.0], [9.5, 10.5, 12.5]
+    slowed = [9.5, 10.4, 12.2]
+    for speeds, turns, aligned, timed, likened in (
+        (None, None, still, still, still),
+        (late, None, moved, moved, moved),
+        (gaining, None, slowed, slowed, slowed),
+        (unsure, None, still, still, still),
+        (None, gaining, slowed, still, slowed),
+        (SAME, gaining, still, still, slowed),
+        (SAME, late, still, still, moved),
+        (SAME, unlike, still, still, still),
+        (SAME, unsure, still, still, still),
+        (gaining, late, slowed, slowed, slowed),
+    ):
+        found = [times_s(way, speeds, turns) for way in ("aligned", "timed", "likened")]
+        assert found == [pytest.approx(each) for each in (aligned, timed, likened)], (speeds, turns)
+
+
+SAME = Timing(0.0, 0.0, 0.99, 0.0, 0.1)
 
 
 def test_of_equal_stamps_the_first_is_taken() -> None:

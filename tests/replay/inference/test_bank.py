@@ -10,12 +10,21 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
+from replay.engine.streams.results import ALL_WELL
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Model, Motion
+from replay.inference.kalman.steps import InnovationRecord, Measurement, Steps, workspace
+from replay.inference.model.model import Control, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
-from replay.inference.modes.gaussian_sum import split, widest
+from replay.inference.model.stage import Stage
+from replay.inference.modes.gaussian_sum import (
+    AGREED,
+    GaussianSumBelief,
+    gaussian_sum_steps,
+    split,
+    widest,
+)
 from tests.replay.inference.replays import outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
@@ -157,6 +166,43 @@ def test_a_bank_finds_an_unknown_heading_and_knows_how_well():
     assert np.median(left[:, -1]) == 1.0
     assert mean_nees(found, list(truths), 8) == pytest.approx(3.0, abs=0.8)
     assert mean_nees(outputs(ROLLER, "ekf", list(logs)), list(truths), 8) > 10.0
+
+
+def said_nothing(run: int, belief: Any, measurement: Any, memory: Any, record: Any) -> int:
+    record.difference[:], record.covariance[:], record.numbers[:] = 0.0, 1.0, (0.0, 0.0, 1.0)
+    return ALL_WELL
+
+
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_members_agree_by_the_squared_distance_of_their_means(share: float):
+    """By the likeliest one's covariance; mean and spread of what is left are the mixture's."""
+    root = np.array([[1.0, 0.0, 0.0], [0.7, 0.5, 0.0], [-0.4, 0.3, 0.2]])
+    weights, apart = np.array([0.3, 0.5, 0.2]), np.array([[-0.2, 0.4, 0.5], [0.0] * 3, [0.3, 0.1, -0.6]])
+    apart *= np.sqrt(share * AGREED / (weights @ (apart**2).sum(axis=1)))
+    centre, covariance = np.array([5.0, -2.0, 3.1]), root @ root.T
+    away = apart @ root.T
+    belief = GaussianSumBelief(
+        (centre + away)[None],
+        np.stack([2.0 * covariance, covariance, 3.0 * covariance])[None],
+        weights[None].copy(),
+        np.log(weights)[None],
+        np.array([[4, 6, 8]]),
+        np.array([3]),
+    )
+    sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, {"z": "linear"}, move)
+    stage = Stage(ROLLER, ROLLER.motion, (sensor,))
+    inner = Steps(lambda _: workspace(stage), move, (said_nothing,), move)
+    steps = gaussian_sum_steps(stage, inner, 9)
+    record = InnovationRecord(np.empty(1), np.empty((1, 1)), np.empty(3))
+    nothing = Measurement(np.empty(1), None, np.empty(2), 0)
+    assert steps.updates[0](0, belief, nothing, steps.memory(()), record) == ALL_WELL
+    assert belief.left[0] == (1 if share < 1.0 else 3)
+    if share < 1.0:
+        mean = weights @ away
+        spread = (weights @ [2.0, 1.0, 3.0]) * covariance + (away.T * weights) @ away
+        assert_allclose(belief.mean[0, 0], centre + mean)
+        assert_allclose(belief.covariance[0, 0], spread - np.outer(mean, mean))
+        assert (belief.member[0, 0], belief.probability[0, 0]) == (6, 1.0)
 
 
 def test_what_has_no_angle_is_refused():

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from recorders.recording import record_run
 from recorders.registry import available
 
@@ -22,7 +22,12 @@ MOST = 6  # numbers of a message that are told
 
 
 def in_words() -> Iterator[str]:
-    """Of every scenario a run, short where it is long; of some another one, which is adverse."""
+    """What each message says; of every scenario a short run, of some an adverse one too."""
+    yield "# messages"
+    for schema in schemas.SCHEMAS.values():
+        yield f"{schema.full_name}: {schema.purpose}"
+        yield from ("  " + " ".join(_declared(field)) for field in schema)
+    yield ""
     names = [name for name, entry in available("recorders").items() if ".simulators." in entry.value]
     for name, parameters in [*((name, SHORT.get(name, {})) for name in names), *ADVERSE.items()]:
         recording, run = record_run(name, parameters, 5, 0)
@@ -31,6 +36,13 @@ def in_words() -> Iterator[str]:
             yield from _told(stream, run.epoch_ns)
         yield from (f"note {name}: {note}" for name, note in run.notes.items())
         yield ""
+
+
+def _declared(field: schemas.Field) -> Iterator[str]:
+    yield f"{field.name}, {field.kind}"
+    for may_be in ("nan", "absent", "partial"):
+        if getattr(field, f"may_be_{may_be}"):
+            yield f"or {may_be}"
 
 
 def _told(stream: Stream, epoch_ns: int) -> Iterator[str]:

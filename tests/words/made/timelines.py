@@ -3,14 +3,17 @@
 Estimates are made; what values are drawn is tested in `tests/replay/timeline`.
 """
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun.chunk as rc
 
+from recorders.log import Stream, make_stream, schemas
 from replay.engine.streams.blocks import gather
 from replay.judging.judge import Judge
 from replay.timeline.show import show
@@ -48,7 +51,8 @@ def in_words(folder: Path) -> Iterator[str]:
         common = source.streams.get("/truth")
         truths = {case: source.streams.get(f"/{case}/truth", common) for case in cases}
         made = [estimate("one", case, truth) for case, truth in truths.items() if truth is not None]
-        outputs = {each.topic: gather([each]) for each in made}
+        beside = [stream for each in made for stream in _beside(each)]
+        outputs = {each.topic: gather([each]) for each in [*made, *beside]}
         errors = Judge([source], {}, gap_limit_s=2.0).add(outputs).errors
         path = folder / f"{scenario}.rrd"
         show(source, outputs, [each for each in errors if each is not None], save=path)
@@ -63,6 +67,38 @@ def in_words(folder: Path) -> Iterator[str]:
             yield from entities[:-1]
             yield f"{entities[-1]}: {told}"
         yield ""
+
+
+def _beside(state: Stream) -> Iterator[Stream]:
+    """What a filter says beside its states: particles, two modes, one that is gated, a failure."""
+    stem, time_ns = state.topic.rpartition("/")[0], state.publish_time_ns
+    rising = np.linspace(0.1, 0.9, len(time_ns))
+    modes = np.stack([rising, 1.0 - rising], axis=1)
+    named = {"components": "calm,agile", "kinds": "linear,linear"}
+    yield make_stream(
+        f"{stem}/modes", schemas.MODE_PROBABILITIES, time_ns, metadata=named, probability=modes
+    )
+    count = np.full(len(time_ns), 50)
+    yield make_stream(
+        f"{stem}/effective",
+        schemas.EFFECTIVE_PARTICLES,
+        time_ns,
+        particles=count,
+        effective=count * rising,
+    )
+    yield make_stream(
+        f"{stem}/innovation",
+        schemas.INNOVATION,
+        time_ns,
+        target_id=np.zeros(len(time_ns), int),
+        accepted=np.arange(len(time_ns)) > 0,
+        innovation=modes,
+        covariance=np.tile([4.0, 1.0, 1.0, 9.0], (len(time_ns), 1)),
+        normalised_innovation_squared=9.0 * rising,
+        log_likelihood=-rising,
+    )
+    failed = {"reasons": json.dumps(["the covariance is no longer positive definite"])}
+    yield make_stream(f"{stem}/failure", schemas.FAILURE, time_ns[-1:], metadata=failed, reason=[0])
 
 
 def _layout(path: Path) -> Iterator[str]:

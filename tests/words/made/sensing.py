@@ -1,0 +1,69 @@
+"""What is said of a sensor's noise, and in which order: recordings at rest of noises that are known."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.output.terminal import print_table
+from pipeline.sensing import study
+from pipeline.sensing.noise import noise
+from pipeline.sensing.terms import Terms
+from recorders.log import RunMetadata, make_stream, schemas
+from replay.engine.streams.sources import MemorySource
+from tests.words.made.printing import printed
+
+STEP_S, SIZE = 0.04, 3000
+TIMES_S = STEP_S * np.arange(SIZE)
+SHEET = {"turn_rate_radps": "0.05 deg/s/sqrt(Hz)", "specific_force_mps2": "100 ug/sqrt(s)"}
+
+
+def at_rest() -> Iterator[str]:
+    """An inertial unit whose axes walk, are steady, or forget; messages are lost; a sheet is given."""
+    turn = [Terms(1e-3, 3e-4), Terms(1e-3), Terms(1e-3, 0.0, 2e-3, 2.0)]
+    force = [Terms(1e-2), Terms(1e-2, 1e-2), Terms(2e-2, 1e-3)]
+    yield from _said(_columns(turn), _columns(force), lost=slice(200, 230))
+
+
+def disturbed() -> Iterator[str]:
+    """Another that warms up, drifts, vibrates, and whose neighbours are alike."""
+    turn, force = _columns([Terms(1e-3)] * 3), _columns([Terms(1e-2)] * 3)
+    turn[:, 0] += 0.02 * np.exp(-TIMES_S / 10.0)
+    turn[:, 1] += 1e-4 * TIMES_S
+    turn[:, 2] += 2e-3 * np.sin(0.25 * np.pi * TIMES_S)
+    force[:, 0] = np.convolve(np.pad(force[:, 0], 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
+    force[:, 1] += np.where(np.arange(SIZE) % 1000 < 500, 0.02, -0.02)
+    force[:, 2] += 1e-4 * TIMES_S + 0.2 * np.exp(-TIMES_S / 4.0) + 0.03 * np.sin(44.0 * TIMES_S)
+    yield from _said(turn, force, taus=[0.4, 4.0])
+
+
+SENSED = (at_rest, disturbed)
+
+
+def _columns(terms: list[Terms]) -> NDArray[np.float64]:
+    return np.stack([study.unit(n, SIZE, each, STEP_S) for n, each in enumerate(terms)], axis=1)
+
+
+def _said(
+    turn: NDArray[np.float64],
+    force: NDArray[np.float64],
+    lost: slice = slice(0, 0),
+    taus: list[float] | None = None,
+) -> Iterator[str]:
+    """The table and the sentences of the command."""
+    is_there = np.ones(SIZE, bool)
+    is_there[lost] = False
+    stream = make_stream(
+        "/imu",
+        schemas.INERTIAL_SAMPLE,
+        np.rint(1e9 * TIMES_S).astype(np.int64),
+        specific_force_mps2=force + np.array([0.0, 0.0, 9.81]),
+        turn_rate_radps=turn,
+        magnetic_field_ut=np.full((SIZE, 3), np.nan),
+    ).take(is_there)
+    source = MemorySource({stream.topic: stream}, RunMetadata("made", {}), "made")
+    found = noise(source, sheet=SHEET, taus=taus or ())
+    yield from printed(
+        print_table, ("column", "term", "value", "95 % from", "to"), found.table.to_numpy()
+    )
+    yield from (f"  {note}" for note in found.notes)
