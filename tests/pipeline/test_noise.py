@@ -24,6 +24,7 @@ from pipeline.sensing.terms import Terms
 from pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
 from tests.pipeline.conftest import Said
+from tests.words import studies
 
 STEP_S = 0.02
 ALL = Terms(1e-3, 1e-4, 4e-4, 20.0, 2e-5)
@@ -295,7 +296,9 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     stds = [float(np.std(each)) for each in units]
     experiment = SimpleNamespace(runs=4)
     setting = SimpleNamespace(options=study.NoiseOptions(seeds=(5,)), progress=lambda each, *_: each)
-    found = study.study(experiment, setting).metrics
+    outcome = study.study(experiment, setting)
+    studies.hold("sensor-noise", [], outcome)
+    found = outcome.metrics
     assert found["noise.covered.0-white"] == 3.0
     assert found["noise.covered.0-walk"] == 0.0
     assert [found[f"noise.covered.0-deviation-{each:g}s"] for each in taus_s] == [4.0, 4.0, 0.0]

@@ -21,6 +21,7 @@ from replay.engine.replaying.replaying import collect
 from replay.engine.streams.measurements import PLANE
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.estimators.tracking.scan_sensors import place_clutter, polar_clutter
+from replay.estimators.tracking.scans import detected_places
 from replay.inference.association.association import existence_after, marginals
 from replay.inference.model.parameters import settings_type
 from replay.judging.tracks.errors import instants_of, track_errors, track_figures, tracks_at
@@ -438,6 +439,30 @@ def test_clusters_that_are_too_large_are_told(uncompiled: None):
         row = [(1.0 * each, 0.0) for each in range(count)]
         found = replay(log(sensor("radar", {**RADAR, "sigma_m": "9"}, [0, 1], [row, row])))
         assert found["approximation"]["tracks"].tolist() == told
+
+
+def test_a_detection_lies_beside_where_its_sensor_was_at_its_scan():
+    """Scans are numbered in no order, have several detections or none; fixes come between them."""
+    scan = make_stream(
+        "/radar/scan", schemas.SCAN, [10, 20, 30], scan_id=[7, 3, 9], detections=[2, 0, 1]
+    )
+    detected = make_stream(
+        "/radar/detection",
+        schemas.DETECTION,
+        [30, 10, 10],
+        scan_id=[9, 7, 7],
+        position_m=[[1.0, 2.0], [30.0, 4.0], [5.0, 60.0]],
+    )
+    fix = make_stream(
+        "/ship/fix",
+        schemas.POSITION_FIX,
+        [12, 20, 31],
+        position_m=[[100.0, 200.0], [400.0, 300.0], [999.0, 999.0]],
+        covariance_m2=np.tile(np.eye(2).ravel(), (3, 1)),
+    )
+    assert detected_places(scan, detected, None).tolist() == detected["position_m"].tolist()
+    found = detected_places(scan, detected, fix)
+    assert found.tolist() == [[401.0, 302.0], [130.0, 204.0], [105.0, 260.0]]
 
 
 def test_a_lag_is_of_the_measurement(uncompiled: None):

@@ -39,6 +39,7 @@ FAMILIES: Mapping[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 OTHER = "of no family"  # the robots' log, by schema
 KINDS = {1: "tabs", 2: "side by side", 3: "one below the other", 4: "a grid"}
 # What is drawn is tested elsewhere, and is long.
+LOOKS = ("colors", "labels", "level", "radii", "text")
 DATA = ("positions", "strips", "centers", "half_sizes", "quaternions", "buffer", "line_strings")
 
 
@@ -167,9 +168,16 @@ def _short(value: Any) -> str:
 
 
 def _moves(columns: Columns) -> Iterator[str]:
-    """What moves, how many rows of it, and from when to when."""
-    if columns:
-        kinds = {name.partition(":")[0] for name in columns if ":" in name}
-        times = columns["sim_time"]
-        span = f"from {times[0] / 1e9:.4f} to {times[-1] / 1e9:.4f} s"
-        yield f"{len(times)} of {' and '.join(sorted(kinds))} {span}"
+    """What moves, how many rows of it, from when to when, and how it looks or what it says meanwhile."""
+    if not columns:
+        return
+    kinds = {name.partition(":")[0] for name in columns if ":" in name}
+    times = columns["sim_time"]
+    span = f"from {times[0] / 1e9:.4f} to {times[-1] / 1e9:.4f} s"
+    yield f"{len(times)} of {' and '.join(sorted(kinds))} {span}"
+    for name in sorted(columns):
+        what = name.partition(":")[2]
+        if what in LOOKS:
+            shown = dict.fromkeys(each for row in columns[name] for each in row or ())
+            told = [f"#{each:08x}" if what == "colors" else _short(each) for each in shown]
+            yield f"{what} {' '.join(told[:8])}"
