@@ -41,12 +41,15 @@ def _kept() -> dict[str, set[str]]:
 def _named(labels: list[str], outcome: Outcome) -> Iterator[str]:
     """A line for each; what a test chose, its estimators, numbers and cases, is left open."""
     for name, table in outcome.tables.items():
-        yield _open(labels, f"table {name}: {', '.join(map(str, table.columns))}")
+        of = f"table {name}" if len(table) else f"table {name} without rows"
+        yield _open(labels, f"{of}: {', '.join(map(str, table.columns))}")
     for name, figure in outcome.figures.items():
         if isinstance(figure, Chart):
             yield _open(labels, f"figure {name}: '{figure.title}'")
             for panel in figure.panels:
                 drawn = [*panel.series, *panel.bands]
+                if not any(each.x for each in drawn):
+                    yield _open(labels, f"figure {name}, '{panel.title}': nothing")
                 for each in drawn:
                     told = f"figure {name}, '{panel.title}': {panel.y.label} over {panel.x.label}"
                     style = getattr(each, "style", "band")

@@ -16,6 +16,8 @@ import rerun.chunk as rc
 from recorders.log import Stream, make_stream, schemas
 from replay.engine.streams.blocks import gather
 from replay.judging.judge import Judge
+from replay.timeline.drawing.curves import CurvePanel, save_curves
+from replay.timeline.drawing.plane import Stroke
 from replay.timeline.show import show
 from tests.replay.timeline.making import estimate, record
 from tests.replay.timeline.test_timeline import Columns, read
@@ -47,7 +49,10 @@ def in_words(folder: Path) -> Iterator[str]:
     """The layout and the entities of a short run of every family."""
     recorded = {name: (record(name, **given), cases) for name, (given, cases) in FAMILIES.items()}
     robots, cases = recorded["landmarks"]
-    recorded[OTHER] = replace(robots, run=replace(robots.run, scenario=OTHER)), cases
+    receiver = _receiver(robots.epoch_ns)
+    streams = {**robots.streams, receiver.topic: receiver}
+    other = replace(robots, run=replace(robots.run, scenario=OTHER), streams=streams)
+    recorded[OTHER] = other, cases
     for scenario, (source, cases) in recorded.items():
         common = source.streams.get("/truth")
         truths = {case: source.streams.get(f"/{case}/truth", common) for case in cases}
@@ -68,6 +73,34 @@ def in_words(folder: Path) -> Iterator[str]:
             yield from entities[:-1]
             yield f"{entities[-1]}: {told}"
         yield ""
+    yield from _curves(folder / "curves.rrd")
+
+
+def _receiver(epoch_ns: int) -> Stream:
+    """What components say of a solution and of a body: all that is known, and one that is not."""
+    quality = [*range(1, 8), 7]
+    return make_stream(
+        "/robot1/receiver",
+        schemas.VECTOR_MEASUREMENT,
+        epoch_ns + 10**8 * np.arange(8),
+        metadata={"components": "quality,standing,rolling"},
+        value=np.stack([quality, np.arange(8) % 2, np.arange(8) // 4], axis=1).astype(float),
+    )
+
+
+def _curves(path: Path) -> Iterator[str]:
+    """Two panels of curves over logarithms, of which a place is not positive."""
+    x = np.array([1e-2, 1.0, 50.0])
+    falling = np.stack([x, 1e3 / x], axis=1)
+    strokes = {"one": Stroke((1, 2, 3), 1.5), "two": Stroke((4, 5, 6), 2.5)}
+    first = CurvePanel("x over y", {"one": falling, "two": falling[1:] * [3.0, 1e-3]}, strokes)
+    second = CurvePanel("of one", {"one": np.vstack([falling, [-1.0, 2.0]])}, strokes)
+    save_curves("curves", [first, second], path)
+    yield "# curves"
+    yield from _layout(path)
+    still = read(path, static=True)
+    for entity in sorted(still):
+        yield f"{entity}: {', '.join(_looks(still[entity]))}"
 
 
 def _beside(state: Stream) -> Iterator[Stream]:
@@ -117,7 +150,7 @@ def _layout(path: Path) -> Iterator[str]:
         parts[f"{part}/{number}"] |= named
     within = {each for part in parts.values() for each in part.get("ContainerBlueprint:contents", ())}
     [root] = [each for each in parts if each.startswith("container/") and each not in within]
-    yield f"time: {parts['time_panel/']['TimePanelBlueprint:timeline'][0]}"
+    yield from (f"time: {each}" for each in parts["time_panel/"].get("TimePanelBlueprint:timeline", ()))
     yield from _board(parts, root, 1)
 
 
@@ -180,4 +213,4 @@ def _moves(columns: Columns) -> Iterator[str]:
         if what in LOOKS:
             shown = dict.fromkeys(each for row in columns[name] for each in row or ())
             told = [f"#{each:08x}" if what == "colors" else _short(each) for each in shown]
-            yield f"{what} {' '.join(told[:8])}"
+            yield f"{what} {' '.join(told[:20])}"
