@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import rgb_to_hsv
 from scipy.stats import chi2
 
 from recorders.log import RunMetadata, make_stream, schemas
@@ -12,6 +13,7 @@ from recorders.models.scores import Matcher, score_stream
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.timeline.drawing.canvas import PALETTE, WRONG
+from replay.timeline.families.ais import track_colours
 from replay.timeline.show import Drawing
 from tests.replay.timeline.making import ESTIMATORS, columns, drawn, logged_late, of_both, record
 from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
@@ -124,6 +126,12 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
         ("right: score of each probe", "matchers/finger/right"),
     }
     check_views(run.picture, titles)
+
+
+def test_neighbours_in_number_are_far_apart_in_hue() -> None:
+    hue = rgb_to_hsv(track_colours(np.arange(1, 100)) / 255.0)[:, 0]
+    apart = np.abs(np.diff(hue))
+    assert np.minimum(apart, 1.0 - apart).min() > 1 / 3
 
 
 def test_reports_are_where_they_were_and_vessels_are_counted(tmp_path: Path) -> None:

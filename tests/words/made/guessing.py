@@ -68,6 +68,7 @@ def clocks() -> Iterator[str]:
     uneven[[3, 20]] = uneven[[2, 19]]
     uneven[15] -= 1.0
     yield from _guessed(time_s=uneven, level=BEND)
+    yield from _guessed(time=0.25 * ROWS + 1e4 * (ROWS > 12), level=BEND)  # one long gap
     yield from _guessed(level=BEND, other=-BEND)
     yield from _guessed(**{"0": BEND, "1": ROWS})
     day = [f"{5 + row % 3:02d}.10.2026" for row in ROWS.tolist()]
