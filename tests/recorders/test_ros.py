@@ -1,6 +1,7 @@
 """The importer of ROS logs: equal to rosbags' own reading, clocks, transforms, losses, bad input."""
 
 import json
+import re
 import shutil
 import sqlite3
 import tarfile
@@ -470,6 +471,9 @@ def test_a_bag_that_was_cut_off(form: str, tmp_path: Path) -> None:
     assert 500 < len(numbers) < 2500
     assert numbers == list(range(len(numbers)))
     assert any(key.startswith("lost") for key in notes), notes
+    told = re.search(r"its last (\d+) bytes are not a whole message", " ".join(notes.values()))
+    assert (told is not None) == (form == "bag")
+    assert told is None or 0 < int(told[1]) < 1000  # of a message
 
 
 def test_rows_of_a_database_from_its_pages(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from tests.words.made import (
     alarms,
     claims,
     comparing,
+    defaults,
     deploying,
     diagnosing,
     guessing,
@@ -38,13 +39,14 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
 
 
 def everything(folder: Path) -> dict[str, str]:
-    """The text of every command, of claims, models, logs, timelines; an empty folder takes files."""
+    """The text of every command, and what no command prints; an empty folder takes files."""
     found = commands.texts(folder)
     for command, cases in MADE.items():
         for case in cases:
             lines = [f"# {case.__doc__}", *case()]
             found[command] += "\n" + "\n".join(lines) + "\n"
     found["claims"] = "\n".join(limits.in_words()) + "\n"
+    found["defaults"] = "\n".join(defaults.in_words()) + "\n"
     found["modelled"] = "\n".join(modelled.in_words()) + "\n"
     found["recorded"] = "\n".join(recorded.in_words()) + "\n"
     found["timelines"] = "\n".join(timelines.in_words(folder)) + "\n"

@@ -8,7 +8,8 @@ from pipeline.command_line.group import fuselog
 from tests.words.everything import everything
 from tests.words.texts import differences, path_of
 
-BESIDE = ("claims", "modelled", "recorded", "timelines")  # what no command prints as it is kept
+# What no command prints as it is kept.
+BESIDE = ("claims", "defaults", "modelled", "recorded", "timelines")
 
 
 @pytest.fixture(scope="module")
