@@ -18,6 +18,7 @@ import pytest
 import fuselog as fl
 from pipeline.command_line import main
 from recorders.linting.lint import lint
+from recorders.linting.magnetic import FIELD, units
 from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
 from recorders.recording import import_run
 
@@ -192,6 +193,24 @@ def apart(streams: Streams) -> Streams:
     """A car, and of its two receivers one in a namespace of its own."""
     named = {f"/car{topic}": replace(each, topic=f"/car{topic}") for topic, each in streams.items()}
     return renamed("/car/fix", "/gps/fix", keeps=True)(named)
+
+
+def test_a_field_at_the_ends_of_the_earths_is_the_earths() -> None:
+    """In its unit nothing is said, in another one that, and beyond the ends that it is in none."""
+    stream = clean(1)[MAG]
+    for norm, words in (
+        (22.0, ""),
+        (67.0, ""),
+        (21.9, "is in no unit"),
+        (67.1, "is in no unit"),
+        (0.22, "is in G"),
+        (0.67, "is in G"),
+        (0.219, "is in no unit"),
+        (0.671, "is in no unit"),
+    ):
+        level = replace(stream, columns={**stream.columns, FIELD: np.tile([norm, 0.0, 0.0], (600, 1))})
+        told = [each.words for each in units(level, {})]
+        assert [words in each for each in told] == [True] * bool(words), norm
 
 
 def framed(streams: Streams) -> Streams:
