@@ -20,14 +20,19 @@ def in_words() -> Iterator[str]:
             module = file.relative_to(ROOT).with_suffix("").parts
             import_module(".".join(module).removesuffix(".__init__"))
     found = {f"{each.__module__}.{each.__qualname__}": each for each in _below(Parameters)}
-    for name in sorted(found):
-        if name.partition(".")[0] in PACKAGES:
+    for name, kind in sorted(found.items()):
+        if name.partition(".")[0] in PACKAGES and _is_written(kind):
             yield f"# {name}"
-            for field in found[name].__annotations__:
-                if field in found[name].model_fields:
-                    own = found[name].model_fields[field]
+            for field in kind.__annotations__:
+                if field in kind.model_fields:
+                    own = kind.model_fields[field]
                     yield f"{field}" if own.is_required() else f"{field}: {_told(own.default)}"
             yield ""
+
+
+def _is_written(kind: type[Parameters]) -> bool:
+    """Whether a class stands in its module; others are made of a model's when it is replayed."""
+    return getattr(import_module(kind.__module__), kind.__qualname__, None) is kind
 
 
 def _below(kind: type[Parameters]) -> Iterator[type[Parameters]]:
