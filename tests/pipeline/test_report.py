@@ -30,7 +30,7 @@ from pipeline.output.charts import (
     level,
 )
 from pipeline.output.claims import Claim
-from pipeline.output.report import write_report
+from pipeline.output.report import _figure, write_report
 from pipeline.output.report.first_run import Followed
 from pipeline.output.report.kinds import run_sentences
 from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
@@ -193,6 +193,27 @@ def test_metrics_have_the_order_of_e_and_their_bounds(
     assert names[:3] == ["ukf", "dead-reckoning", "ekf"]
     told = "a consistent estimator lies from 0.216 to 9.35"
     assert told in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_figures_are_captioned_and_told_to_those_who_cannot_see_them(tmp_path: Path) -> None:
+    """By its title a chart, else by its name; a picture by its quantity and case, if it is of one."""
+    panel = Panel(x=Axis(label="t (s)"), y=Axis(label="NEES"), series=[curve("ekf", [0.0], [1.0])])
+    above = panel.model_copy(update={"title": "left", "y": Axis(label="error (m)")})
+    (tmp_path / "nees-robot1.svg").write_bytes(b"<svg/>")
+    (tmp_path / "two_robots-1.svg").write_bytes(b"<svg/>")
+    shown = [_figure(tmp_path / f"{name}.svg") for name in ("nees-robot1", "two_robots-1")]
+    for title in ("", "Errors"):
+        chart = Chart(panels=[above, panel, panel], title=title)
+        (tmp_path / "two_robots-1.json").write_text(chart.model_dump_json())
+        shown.append(_figure(tmp_path / "two_robots-1.svg"))
+    told = [(each.name, each.caption, each.description) for each in shown]
+    charted = "Chart: error (m) over t (s); NEES over t (s); left; ekf"
+    assert told == [
+        ("nees-robot1", "NEES of robot1", "Figure: NEES of robot1"),
+        ("two_robots-1", "two_robots-1", "Figure: two_robots-1"),
+        ("two_robots-1", "two robots 1", charted),
+        ("two_robots-1", "Errors", charted),
+    ]
 
 
 def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) -> None:
