@@ -14,10 +14,11 @@ from pipeline.studies.acoustic.cases import Mode
 from pipeline.studies.optical import los, printed
 from pipeline.studies.optical.cases import ALONE, BLIND, JOINT
 from pipeline.studies.sets import error_bounds, set_filter, set_membership
-from pipeline.studies.tracking import autoferry, crossing
+from pipeline.studies.tracking import ais, autoferry, crossing
 from pipeline.studies.tracking.tracking import means_of, nis_metrics
 from pipeline.studies.vehicles import scaling, vehicles
 from pipeline.studies.vehicles.cases import Scores
+from recorders.log import make_stream, schemas
 from replay.judging.sets.evaluation import JudgedSets
 
 S = 10**9
@@ -160,6 +161,28 @@ def test_growth_of_a_difference_is_from_the_least_clutter_to_the_most() -> None:
     later = names(log_time_ns=np.array([9]), publish_time_ns=np.array([9]))
     source: Any = names(streams={"/radar/scan": arrived, "/other": later, "/lidar/scan": later})
     assert autoferry._last_late_ns(source) == 7
+
+
+def test_vessels_are_drawn_best_first_and_those_heard_of_late_are_counted() -> None:
+    """Shares of vessels that are heard often alone; a vessel is live for 30 s, a track as well."""
+    shares = {"a": [0.2, 0.9, 0.5, 0.7, 1.0], "b": [0.3, 0.1, 0.4, 0.6, 1.0]}
+    reports = [ais.MANY_REPORTS + 1] * 4 + [ais.MANY_REPORTS]
+    vessels = pd.concat(
+        [pd.DataFrame({"estimator": of, "share": own, "reports": reports}) for of, own in shares.items()]
+    )
+    identity = make_stream(
+        "/identity", schemas.IDENTITY, S * np.array([10, 20, 100]), thing_id=[1, 2, 1]
+    )
+    source = names(epoch_ns=10 * S, read=lambda _: {"/identity": identity})
+    chart = ais.tracks_chart(names(sources=[source], judged=[]), vessels, ais.AisOptions(live_s=30.0))
+    above, below = chart.panels
+    drawn = {each.label: (each.x, each.y) for each in (*above.series, *below.series)}
+    assert drawn == {
+        "a": ([0, 1, 2, 3], [0.9, 0.7, 0.5, 0.2]),
+        "b": ([0, 1, 2, 3], [0.6, 0.4, 0.3, 0.1]),
+        f"kept: {ais.KEPT_SHARE:g}": ([0, 3], [ais.KEPT_SHARE] * 2),
+        "vessels": ([0, 10, 30, 40, 90], [1, 2, 1, 0, 1]),
+    }
 
 
 def of_sensor(scheme_m: dict[str, float]) -> Any:

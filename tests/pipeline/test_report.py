@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from pipeline.output.charts import (
     level,
 )
 from pipeline.output.claims import Claim
-from pipeline.output.report import _figure, write_report
+from pipeline.output.report import _figure, _legend, write_report
 from pipeline.output.report.first_run import Followed
 from pipeline.output.report.kinds import run_sentences
 from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
@@ -214,6 +215,23 @@ def test_figures_are_captioned_and_told_to_those_who_cannot_see_them(tmp_path: P
         ("two_robots-1", "two robots 1", charted),
         ("two_robots-1", "Errors", charted),
     ]
+
+
+@pytest.mark.parametrize(
+    ("main", "compared", "words"),
+    [
+        ("gospa_m", ["a", "b"], "GOSPA: "),
+        ("gospa_m", [], ""),
+        ("position_rmse_m", ["a", "b"], ""),
+    ],
+)
+def test_what_estimators_of_tracks_are_compared_by_is_told(
+    main: str, compared: list[str], words: str
+) -> None:
+    begun: Any = SimpleNamespace(found=SimpleNamespace(main=main, compared=compared))
+    told = _legend(begun)
+    assert told.startswith(words)
+    assert told.endswith("Less is better.") == bool(told) == bool(words)
 
 
 def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) -> None:
