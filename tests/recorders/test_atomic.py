@@ -55,6 +55,17 @@ def test_what_a_user_calls_part_or_old_is_left_alone(tmp_path):
     assert contents(tmp_path) == {**before, "r/a": "new", "f": "new"}
 
 
+def test_a_place_beyond_a_folder_that_is_missing_is_the_one_beside_it(tmp_path):
+    """`missing/../out` is `out`, for files and folders, before and after `missing` is there."""
+    for number in (1, 2):
+        with whole_file(tmp_path / "missing" / ".." / "file") as new:
+            new.write_text(f"file {number}")
+        with whole_folder(tmp_path / "other" / ".." / "folder", lambda _: None) as new:
+            (new / "in it").write_text(f"folder {number}")
+        assert (tmp_path / "file").read_text() == f"file {number}"
+        assert (tmp_path / "folder" / "in it").read_text() == f"folder {number}"
+
+
 def test_the_last_whole_one_of_two_writers_wins(tmp_path):
     place = tmp_path / "f"
     with whole_file(place) as first:
