@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +22,10 @@ from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
 from recorders.plausibility.body import Series, bodies
 from recorders.plausibility.checks import findings
-from recorders.plausibility.motion import Lag, Motion
+from recorders.plausibility.motion import Forces, Lag, Motion
 from recorders.plausibility.speeds import scatter
 from recorders.plausibility.timing import Timing
+from recorders.plausibility.turns import _by_forces
 from recorders.recording import record_run
 from tests.pipeline.test_planes import HERE, car
 
@@ -219,6 +222,22 @@ def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
     ):
         found = [times_s(way, speeds, turns) for way in ("aligned", "timed", "likened")]
         assert found == [pytest.approx(each) for each in (aligned, timed, likened)], (speeds, turns)
+
+
+@pytest.mark.parametrize(
+    ("fit", "mirrored", "says"), [(0.99, 0.1, -1), (0.1, 0.99, 1), (0.3, 0.1, 0), (None, None, 0)]
+)
+def test_forces_are_witnesses_where_they_go_with_a_frame_or_its_mirror_image(
+    fit: float | None, mirrored: float | None, says: int
+) -> None:
+    found = None if fit is None else Forces(0.0, fit, mirrored)
+    own, other = (SimpleNamespace(topic=topic) for topic in ("/imu", "/other"))
+    motion: Any = SimpleNamespace(
+        body=SimpleNamespace(forces=[other, own]),
+        aligned=lambda force: force,
+        forces=lambda force: found if force is own else Forces(0.0, 1.0, 0.0),
+    )
+    assert _by_forces(motion, own) == says
 
 
 SAME = Timing(0.0, 0.0, 0.99, 0.0, 0.1)

@@ -597,7 +597,7 @@ def test_frames_and_constants_that_change(tmp_path: Path) -> None:
     own = np.eye(3).ravel()
     sent: list[Sent] = [
         ("/point", START_NS + number, make("geometry_msgs/msg/PointStamped", header__frame_id=frame))
-        for number, frame in enumerate(["map", "odom", "map"])
+        for number, frame in enumerate(["map", "odom", "map", "gps"])
     ]
     sent += [
         ("/imu", START_NS + number,
@@ -607,7 +607,8 @@ def test_frames_and_constants_that_change(tmp_path: Path) -> None:
     ]  # fmt: skip
     streams, notes = imported(write_bag(tmp_path / "bag", "db3", sent, make.store))
     assert (len(streams["/position"]), len(streams["/position/odom"])) == (2, 1)
-    assert streams["/position/odom"].metadata == {"frame_id": "odom"}
+    for frame in ("odom", "gps"):  # longer and as long as the first one's
+        assert streams[f"/position/{frame}"].metadata == {"frame_id": frame}
     key = (
         "/imu: inertial kept whose turn_rate_covariance_rad2ps2 is not the first one's, which is stated"
     )
