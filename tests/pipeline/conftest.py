@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -72,7 +73,7 @@ def reviewed_names(request: pytest.FixtureRequest) -> Iterator[None]:
         return write_outcome(folder, name, settings, outcome)
 
     with pytest.MonkeyPatch.context() as patch:
-        if "stud" in request.module.__name__:
+        if re.search("stud|tuning", request.module.__name__):
             patch.setattr("pipeline.runs.experiment.write_outcome", written)
         yield
 
