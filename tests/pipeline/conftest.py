@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 import shutil
 import signal
 import subprocess
@@ -66,15 +65,16 @@ def fuselog() -> Callable[..., Said]:
 
 @pytest.fixture(scope="module", autouse=True)
 def reviewed_names(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Whatever a study finds in a test of studies has names that were reviewed."""
+    """What a study finds in a test of studies, or tuning in any, has names that were reviewed."""
+    of_studies = "stud" in request.module.__name__
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
-        studies.hold(settings["study"], list(settings.get("estimators", {})), outcome)
+        if of_studies or settings["study"].startswith("tuning"):
+            studies.hold(settings["study"], list(settings.get("estimators", {})), outcome)
         return write_outcome(folder, name, settings, outcome)
 
     with pytest.MonkeyPatch.context() as patch:
-        if re.search("stud|tuning", request.module.__name__):
-            patch.setattr("pipeline.runs.experiment.write_outcome", written)
+        patch.setattr("pipeline.runs.experiment.write_outcome", written)
         yield
 
 
