@@ -13,7 +13,7 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
+from recorders.log import RunMetadata, make_stream, schemas, write_log
 from recorders.log.opening import Topic
 from recorders.recording import Recording
 from replay.engine.replaying.estimator import configure
@@ -294,3 +294,25 @@ def test_a_tables_covariance_has_every_entry_in_its_place(tmp_path: Path) -> Non
     [read] = read_estimates(tmp_path / "estimates.csv", "mine", topic).values()
     assert len(names) == 5
     np.testing.assert_allclose(read["covariance"].reshape(covariance.shape), covariance, rtol=1e-15)
+
+
+def test_a_log_of_a_program_needs_estimates_and_nothing_else(tmp_path: Path) -> None:
+    stamps = np.arange(3) * 10**9
+    state = make_stream(
+        "/state",
+        schemas.GAUSSIAN_ESTIMATE,
+        stamps,
+        metadata={"components": "x_m", "kinds": "linear"},
+        mean=np.zeros((3, 1)),
+        covariance=np.ones((3, 1)),
+    )
+    other = make_stream("/fix", schemas.POSITION_FIX, stamps, position_m=np.zeros((3, 2)),
+                        covariance_m2=np.ones((3, 4)))  # fmt: skip
+    for streams, words in (([state, other], ""), ([other], "wrote a log without estimates")):
+        write_log(tmp_path / "log.mcap", streams, RunMetadata("made"))
+        if words:
+            with pytest.raises(BadInput, match=words):
+                read_estimates(tmp_path / "log.mcap", "own", None)
+        else:
+            found = read_estimates(tmp_path / "log.mcap", "own", None)
+            assert [each.schema.name for each in found.values()] == ["GaussianEstimate"]
