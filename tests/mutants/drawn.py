@@ -502,7 +502,7 @@ DRAWN = [
     ),
     Fault(
         "replay/inference/kalman/iterated_update.py",
-        "        for row in range(t):\n            step[row] = 0.0\n        for iteration",
+        "        step[:] = 0.0\n        for iteration",
         "        for iteration",
         "tests/replay/estimators/test_ranging.py",
     ),
@@ -946,8 +946,8 @@ DRAWN = [
     ),
     Fault(
         "replay/inference/particles/update.py",
-        "own.differences[i, j] = wrap(data[j] - memory.work.predicted[j], angular[j])",
-        "own.differences[i, j] = data[j] - memory.work.predicted[j]",
+        "subtract(data, memory.work.predicted, own.differences[i])",
+        "own.differences[i, :] = data[: len(own.differences[i])] - memory.work.predicted",
         "tests/replay/inference/test_particles.py",
     ),
     Fault(
