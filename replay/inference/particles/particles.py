@@ -185,9 +185,8 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
     for i in range(len(weight)):
         memory.spare[i] = states[memory.chosen[i]]
-    for i in range(len(weight)):
-        weight[i] = 1.0 / len(weight)
-        states[i] = memory.spare[i]
+    weight[:] = 1.0 / len(weight)
+    states[:, :] = memory.spare
     return counter + 1
 
 
@@ -333,8 +332,8 @@ def summing_up(model: Model) -> Function:
             settle(weight, offsets, mean, shift)
             moments(weight, offsets, offsets, shift, covariance, covariance)
         clouds.effective[row] = effective_number(weight)
-        for i in range(clouds.states.shape[1]):
-            clouds.weight[row, i] = weight[i]
-            clouds.states[row, i] = states[i]
+        kept = clouds.states.shape[1]  # all particles, or none where they are not wanted
+        clouds.weight[row] = weight[:kept]
+        clouds.states[row] = states[:kept]
 
     return estimate
