@@ -456,8 +456,9 @@ def test_each_fault_of_the_study_changes_what_it_says_and_is_kept_by_its_name() 
                 for topic, stream in before.streams.items()
                 if _bits(stream) != _bits(after.streams[topic])
             }
+            altered = {fault.altered or fault.topic} if fault.alteration else set()
             recorded = {fault.topic or SEEN} if fault.record else set()
-            assert changed == {*filter(None, [fault.altered]), *(fault.exchanged or recorded)}, label
+            assert changed == altered | {*(fault.exchanged or recorded)}, label
             assert bool(changed) != bool(fault.settings), label
     assert len([each for each in kept if each.startswith("diagnosis.worth.")]) == 3 + 10 + 9 + 10
 
