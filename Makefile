@@ -30,13 +30,15 @@ test-fast: .venv/with-test
 	$(MAKE) -j3 fast-replay-lane fast-rooms-lane lint
 
 fast-rooms-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/pipeline
+	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/mutants tests/pipeline
 
 fast-replay-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
+	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/mutants \
+		--ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py \
+		tests/pipeline/test_deploying.py
 
 inference-lane: .venv/with-test
 	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py tests/pipeline/test_campaigns.py \
@@ -45,7 +47,8 @@ inference-lane: .venv/with-test
 pipeline-lane: .venv/with-test
 	$(BIN)/pytest tests/pipeline --ignore-glob='*stud*.py' --ignore=tests/pipeline/test_faults.py \
 		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py \
-		--ignore=tests/pipeline/test_campaigns.py --ignore-glob='*test_command_*.py'
+		--ignore=tests/pipeline/test_campaigns.py --ignore=tests/pipeline/test_deploying.py \
+		--ignore-glob='*test_command_*.py'
 
 rooms-lane: .venv/with-test
 	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \

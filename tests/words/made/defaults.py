@@ -19,19 +19,21 @@ def in_words() -> Iterator[str]:
         if _DECLARES.search(file.read_text(encoding="utf-8")):
             module = file.relative_to(ROOT).with_suffix("").parts
             import_module(".".join(module).removesuffix(".__init__"))
-    found = {f"{each.__module__}.{each.__qualname__}": each for each in _below(Parameters)}
+    written = (each for each in _below(Parameters) if _is_written(each))
+    found = {f"{each.__module__}.{each.__qualname__}": each for each in written}
     for name, kind in sorted(found.items()):
-        if name.partition(".")[0] in PACKAGES and _is_written(kind):
-            yield f"# {name}"
-            for field in kind.__annotations__:
-                if field in kind.model_fields:
-                    own = kind.model_fields[field]
-                    yield f"{field}" if own.is_required() else f"{field}: {_told(own.default)}"
-            yield ""
+        yield f"# {name}"
+        for field in kind.__annotations__:
+            if field in kind.model_fields:
+                own = kind.model_fields[field]
+                yield f"{field}" if own.is_required() else f"{field}: {_told(own.default)}"
+        yield ""
 
 
 def _is_written(kind: type[Parameters]) -> bool:
-    """Whether a class stands in its module; others are made of a model's when it is replayed."""
+    """Whether a class of ours stands in its module; others are made of it by the same name."""
+    if kind.__module__.partition(".")[0] not in PACKAGES:
+        return False
     return getattr(import_module(kind.__module__), kind.__qualname__, None) is kind
 
 
