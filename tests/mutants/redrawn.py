@@ -126,8 +126,8 @@ REDRAWN = [
     ),
     Fault(
         "replay/judging/errors/truths.py",
-        "topic.schema_name",
-        "topic.name",
+        "source.topics, schemas.TRUTH_STATE",
+        "source.topics, schemas.POSITION_FIX",
         "tests/replay/judging/test_set_errors.py",
     ),
     Fault(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
 from recorders.log.streams import concatenate
 from replay.engine.streams.sources import Source
 
@@ -31,11 +31,7 @@ class Truths:
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self.topics = [
-            topic.name
-            for topic in source.topics.values()
-            if topic.schema_name == schemas.TRUTH_STATE.full_name
-        ]
+        self.topics = topics_of(source.topics, schemas.TRUTH_STATE)
         self._beside: dict[str, list[str]] = {}
         for topic in self.topics:
             self._beside.setdefault(topic.rpartition("/")[0], []).append(topic)

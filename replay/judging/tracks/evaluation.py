@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
@@ -54,10 +54,9 @@ def targets_of(source: Source) -> Judged | None:
     to the end of the last truth.
     """
     topics = [
-        topic.name
-        for topic in source.topics.values()
-        if topic.schema_name == schemas.TRUTH_STATE.full_name
-        and {*PLANE} <= {*topic.metadata.get("components", "").split(",")}
+        topic
+        for topic in topics_of(source.topics, schemas.TRUTH_STATE)
+        if {*PLANE} <= {*source.topics[topic].metadata.get("components", "").split(",")}
     ]
     truths = [truth for truth in source.read(topics).values() if len(truth)]
     if not truths:

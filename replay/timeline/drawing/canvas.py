@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Stream, schemas
+from recorders.log import Schema, Stream, schemas, topics_of
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import Errors, Floats, split_topic
 
@@ -131,8 +131,7 @@ class Scene:
 
     @property
     def _truths(self) -> list[str]:
-        schema_name = schemas.TRUTH_STATE.full_name
-        return [each.name for each in self.source.topics.values() if each.schema_name == schema_name]
+        return topics_of(self.source.topics, schemas.TRUTH_STATE)
 
 
 def _prefix(topic: str) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.canvas import TRUTH, WRONG, Canvas, Scene, Timeline, beside
 from replay.timeline.drawing.events import above_events, draw_events
@@ -34,9 +34,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _seen(scene: Scene) -> list[Stream]:
-    fixes = schemas.POSITION_FIX.full_name
-    topics = [topic.name for topic in scene.source.topics.values() if topic.schema_name == fixes]
-    return [scene.read(topic) for topic in topics]
+    return [scene.read(topic) for topic in topics_of(scene.source.topics, schemas.POSITION_FIX)]
 
 
 def _is_target(stream: Stream) -> bool:
