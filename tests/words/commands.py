@@ -1,21 +1,22 @@
 """What the commands print: one script over a few small logs, its output by command."""
 
 import io
-import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
-from pyarrow.parquet import read_schema
-
+from pipeline.api.api import write
+from pipeline.calibrating import ellipsoid_study
 from pipeline.command_line import main
 from pipeline.output import terminal
+from pipeline.sensing import study as noise_study
+from pipeline.sensing.terms import Terms
+from tests.words.results import result_in_words
 
 ROOT = Path(__file__).parents[2]
 # In this order: what a line writes, later ones read. Of a line that is wrong its error is kept.
@@ -28,11 +29,11 @@ replay other.mcap -e ekf --set sigma_range_m=0.02 -o sure.mcap
 replay run.mcap -e ekf -e dead-reckoning -o wide.mcap --set ekf.sigma_bearing_rad=0.1 --parameters
 evaluate est.mcap
 evaluate est.mcap --metric accuracy
-evaluate line.tum --truth shifted.tum
-compare run.mcap other.mcap -e ekf -e ukf
+evaluate line.tum --truth shifted.tum --out judged
+compare run.mcap other.mcap -e ekf -e ukf --out compared
 compare est.mcap sure.mcap
 compare est.mcap wide.mcap -e ekf
-diagnose run.mcap -e ekf
+diagnose run.mcap -e ekf --out diagnosed
 diagnose run.mcap -e ekf --set /robot1/odometry.forward_mps_scale=1.3 --tried
 stress run.mcap -e ekf
 observability run.mcap
@@ -42,8 +43,10 @@ tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
 calibrate run.mcap -e ekf
 deploy run.mcap -e smoother:ekf -o never
 noise run.mcap
+noise still.mcap --topic /wheels.turn_radps --out quiet
 ellipsoid car.mcap --field /body/inertial.specific_force_mps2
 ellipsoid car.mcap --field /body/inertial
+ellipsoid turned.mcap --field /imu.magnetic_field_ut --out turned
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
 check other.mcap --against ekf.golden.xz
@@ -89,10 +92,12 @@ def texts(folder: Path) -> dict[str, str]:
     with chdir(folder), _alike():
         _write_files()
         for line in SCRIPT:
-            found[line.split()[0]].append(_said(line.split()))
+            command, *others = line.split()
+            found[command].append(_said([command, *others]))
+            place = Path(others[others.index("--out") + 1] if "--out" in others else f"out/{command}")
+            if (place / "result.json").exists():
+                found[command].append(result_in_words(place))
         found["report"].append(_page(Path("page.html").read_text(encoding="utf-8")))
-        for command, place in (("run", "result"), ("sweep", "swept"), ("tune", "out/tune")):
-            found[command].extend(_figures(Path(place)))
     return {command: "\n".join(sections) for command, sections in found.items()}
 
 
@@ -144,33 +149,11 @@ def _page(page: str) -> str:
     return "\n".join(["# the page", *filter(None, map(_masked, lines))]) + "\n"
 
 
-def _figures(folder: Path) -> Iterator[str]:
-    """The columns of a result's tables; the titles, axes and legends of its figures."""
-    lines = ["# its tables and figures"]
-    for path in sorted((folder / "tables").glob("*.parquet")):
-        lines.append(f"{path.stem}: {', '.join(read_schema(path).names)}")
-    for path in sorted((folder / "figures").glob("*.json")):
-        lines.append(f"{path.stem}: {chart_in_words(json.loads(path.read_text(encoding='utf-8')))}")
-    yield "\n".join(lines) + "\n"
-
-
-def chart_in_words(chart: Mapping[str, Any]) -> str:
-    """What a chart's titles, axes and legends say."""
-    panels = []
-    for panel in chart["panels"]:
-        drawn = [f"{each['label']} ({each['style']})" for each in panel["series"]]
-        drawn += [f"{each['label']} (band)" for each in panel["bands"]]
-        title = f"{panel['title']}: " if panel["title"] else ""
-        panels.append(f"  {title}{_axis(panel['y'])} over {_axis(panel['x'])}: {', '.join(drawn)}")
-    return "\n".join([chart["title"], *panels])
-
-
-def _axis(axis: Mapping[str, Any]) -> str:
-    return axis["label"] + (" (log)" if axis["log"] else "")
-
-
 def _write_files() -> None:
-    """Trajectories and a table that commands of the script read."""
+    """Trajectories, a table, and logs of units at rest and turned, that commands of the script read."""
+    walk = noise_study.unit(1, 3000, Terms(1e-3, 3e-4), 0.04)
+    write(Path("still.mcap"), noise_study.at_rest(walk, 0.04))
+    write(Path("turned.mcap"), ellipsoid_study.recorded("magnetometer", 1))
     for name, apart in (("line.tum", 0.0), ("shifted.tum", 0.01)):
         rows = (f"{time} {time + apart * (time % 3) ** 2} {apart} 0 0 0 0 1\n" for time in range(9))
         Path(name).write_text("".join(rows), encoding="utf-8")
