@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
+import pyarrow.parquet as pq
 
 MOST_WORDS = 6  # of a column that are all given
 TINY = 1e-9  # of the greatest of some numbers: what is less is rounding
@@ -16,7 +16,7 @@ def result_in_words(folder: Path) -> str:
     """What stands in a result folder."""
     lines = ["# its tables and figures"]
     for path in sorted((folder / "tables").rglob("*.parquet")):
-        table = pd.read_parquet(path)
+        table = pq.read_table(path).to_pandas(ignore_metadata=True)
         name = path.relative_to(folder / "tables").with_suffix("").as_posix()
         lines.append(f"{name}: {len(table)} rows")
         lines += [f"  {column}: {_of_all(table[column].tolist())}" for column in table]
