@@ -1,6 +1,7 @@
 """What the commands print: one script over a few small logs, its output by command."""
 
 import io
+import logging
 import os
 import re
 from collections import defaultdict
@@ -117,7 +118,8 @@ def _said(arguments: list[str]) -> str:
     """A command, and below it what it prints; lines of standard error begin with a bar."""
     out, err = io.StringIO(), io.StringIO()
     cache = {"FUSELOG_CACHE": "empty"} if arguments[0] == "cache" else {}
-    with redirect_stdout(out), redirect_stderr(err), patch.dict(os.environ, cache):
+    logs = patch.object(logging.getLogger(), "handlers", [])  # so that the command makes its own
+    with redirect_stdout(out), redirect_stderr(err), patch.dict(os.environ, cache), logs:
         code = main(arguments)
     lines = [f"$ fuselog {' '.join(arguments)}" + (f"   # exit code {code}" if code else "")]
     lines += [

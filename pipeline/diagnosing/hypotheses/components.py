@@ -17,11 +17,7 @@ from replay.engine.replaying.estimator import Reading
 
 FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
 ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)
-TURNS_RAD = {
-    0.5 * np.pi: "a quarter turn",
-    -0.5 * np.pi: "a quarter turn the other way",
-    np.pi: "half a turn",
-}
+TURNS_RAD = (0.5 * np.pi, -0.5 * np.pi, np.pi)
 SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # of how much what is read varies
 LARGEST_FACTOR = 12.0  # its logarithm
 # By the unit of a field, what may be in it instead: how many of it make the field's own.
@@ -196,7 +192,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         without,
         words,
         mend,
-        specials,
+        tuple(specials),
         reported=lambda at: float(np.exp(at)),
     )
 

@@ -1,7 +1,7 @@
 """Defines a hypothesis: one thing that may be wrong, and how it is undone."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -56,7 +56,7 @@ class Hypothesis:
         without: the trial without the fault of this number.
         words: what is wrong, from the number and the ends of its 95 % interval.
         mend: what to try against this number; None where it is done already.
-        specials: numbers that are tried as they are, with what they mean, such as a unit.
+        specials: numbers that are tried as they are, such as the factor of a unit.
         size: of how many numbers it is.
         floor: of the magnitude: what is less is no fault.
         reported: the number as tables have it: a factor, where it is searched by its logarithm.
@@ -70,7 +70,7 @@ class Hypothesis:
     without: Callable[[Trial, Any], Trial]
     words: Callable[[Any, Any, Any], str]
     mend: Callable[[Any], Advice | None]
-    specials: Mapping[float, str] = field(default_factory=dict)
+    specials: Sequence[float] = ()
     size: int = 1
     floor: float = 0.0
     reported: Callable[[float], float] = float
@@ -108,7 +108,7 @@ def supposed(
         without,
         lambda *_: words,
         lambda _: advice,
-        {1.0: ""},
+        (1.0,),
         reported=reported,
     )
 

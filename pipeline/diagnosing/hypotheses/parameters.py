@@ -193,7 +193,7 @@ def _parameters(
         without,
         words,
         mend,
-        TURNS_RAD if is_round else {},
+        TURNS_RAD if is_round else (),
         size,
     )
 

@@ -65,7 +65,7 @@ def of_stamps(
         in_topic(topic, alter.delayed),
         late,
         mend_late,
-        SPECIAL_S,
+        tuple(SPECIAL_S),
         floor=hold_s,
     )
     clock = in_topic(topic, alter.drifted(first_ns))
