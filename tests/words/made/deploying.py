@@ -1,8 +1,18 @@
-"""Made cases of what `fuselog deploy` says of single precision."""
+"""Made cases of `fuselog deploy`: the folders that it writes, and what it says of single precision."""
 
+import re
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
+from unittest.mock import patch
 
+from pipeline.api.api import record, write
+from pipeline.deploying import certificate
+from pipeline.deploying.deploying import deploy
 from pipeline.deploying.folder import lost_sentence
+from tests.replay.estimators.test_attitude import carried
+
+_DIGEST = re.compile(r"\b[0-9a-f]{16}\b")
 
 
 def lost() -> Iterator[str]:
@@ -11,4 +21,38 @@ def lost() -> Iterator[str]:
         yield lost_sentence({"lost_event": 111, "lost_s": 1.11}, is_root=is_root)
 
 
-DEPLOYED = (lost,)
+def written() -> Iterator[str]:
+    """Of three filters the page, and what their other files say that no earlier one said."""
+    memory = certificate.Memory("a compiler", 1234, 567)
+    single = certificate.Single(2.5e-6, 89, None, None)
+    said: set[str] = set()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write(folder / "robot.mcap", record("landmarks", seed=7, duration_s=1.0))
+        write(folder / "carried.mcap", [carried()[0].take(slice(0, 200))])
+        for place, log, label, model, found in (
+            ("plain", "robot", "ekf", "robot", (memory, None)),
+            ("root", "robot", "sqrt:ukf", "robot", (memory, single)),
+            ("sampled", "carried", "ukf", "orientation", (None, None)),
+        ):
+            out, options = folder / place / "own", {"single": place == "root", "model": model}
+            with patch.object(certificate, "_compiled", lambda *_, found=found: found):
+                deploy(folder / f"{log}.mcap", label, out, **options)
+            page = (out / "README.md").read_text(encoding="utf-8")
+            yield from filter(None, _DIGEST.sub("DIGEST", page).splitlines())
+            lines = dict.fromkeys(line for line in _beside(out) if line not in said)
+            said |= lines.keys()
+            yield from lines
+
+
+def _beside(folder: Path) -> Iterator[str]:
+    """What the other files say to who reads them or builds with them."""
+    for path in sorted(folder.iterdir()):
+        text = _DIGEST.sub("DIGEST", path.read_text(encoding="utf-8"))
+        if path.suffix in (".txt", ".json"):
+            yield from filter(None, text.splitlines())
+        elif path.name != "fuselog_filter.h":
+            yield from (" ".join(each.split()) for each in re.findall(r"/\*.*?\*/", text, re.DOTALL))
+
+
+DEPLOYED = (lost, written)
