@@ -288,7 +288,7 @@ def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:
     plot.fill(of, "line", x=lags + SHIFTS[of], y=white.correlation, zero=np.zeros(len(lags)))
     ends = [0.0, len(lags) + 1.0]
     plot.fill(of, "interval", t=ends, low=[-white.bound] * 2, high=[white.bound] * 2)
-    most = max(LEAST_CORRELATION, 1.1 * float(np.nanmax(np.abs(white.correlation))))
+    most = max(LEAST_CORRELATION, 1.1 * float(np.nan_to_num(np.abs(white.correlation)).max()))
     plot.figure.y_range.update(start=-most, end=most)
     plot.say(f"Whiteness of the innovations of {quantity(name).name}")
 

@@ -1,6 +1,7 @@
 """All texts: what commands print, with made cases of sentences; claims, models, logs and timelines."""
 
 from collections.abc import Callable, Iterable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 from tests.claims import limits
@@ -14,6 +15,7 @@ from tests.words.made import (
     diagnosing,
     guessing,
     modelled,
+    page,
     plausibility,
     recorded,
     reporting,
@@ -48,6 +50,8 @@ def everything(folder: Path) -> dict[str, str]:
     found["claims"] = "\n".join(limits.in_words()) + "\n"
     found["defaults"] = "\n".join(defaults.in_words()) + "\n"
     found["modelled"] = "\n".join(modelled.in_words()) + "\n"
+    if find_spec("bokeh"):
+        found["page"] = "\n".join(page.in_words()) + "\n"
     found["recorded"] = "\n".join(recorded.in_words()) + "\n"
     found["timelines"] = "\n".join(timelines.in_words(folder)) + "\n"
     return found

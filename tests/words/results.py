@@ -19,16 +19,16 @@ def result_in_words(folder: Path) -> str:
         table = pq.read_table(path).to_pandas(ignore_metadata=True)
         name = path.relative_to(folder / "tables").with_suffix("").as_posix()
         lines.append(f"{name}: {len(table)} rows")
-        lines += [f"  {column}: {_of_all(table[column].tolist())}" for column in table]
+        lines += [f"  {column}: {in_numbers(table[column].tolist())}" for column in table]
     for path in sorted((folder / "figures").glob("*.json")):
         lines.append(f"{path.stem}: {chart_in_words(json.loads(path.read_text(encoding='utf-8')))}")
     result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     lines.append("result.json:")
     for name, value in result["metrics"].items():
         known = {key: result[key].get(name) for key in ("bounds", "intervals")}
-        ends = [f"{key} {_of_all(value)}" for key, value in known.items() if value]
+        ends = [f"{key} {in_numbers(value)}" for key, value in known.items() if value]
         values = value if isinstance(value, list) else [value]
-        lines.append(f"  {', '.join([f'{name}: {_of_all(values)}', *ends])}")
+        lines.append(f"  {', '.join([f'{name}: {in_numbers(values)}', *ends])}")
     return "\n".join([*lines, *_files(result)]) + "\n"
 
 
@@ -46,12 +46,12 @@ def chart_in_words(chart: Mapping[str, Any]) -> str:
 
 
 def _axis(axis: Mapping[str, Any]) -> str:
-    limits = "" if axis["limits"] is None else f" ({_of_all(axis['limits'])})"
+    limits = "" if axis["limits"] is None else f" ({in_numbers(axis['limits'])})"
     return axis["label"] + (" (log)" if axis["log"] else "") + limits
 
 
 def _drawn(each: Mapping[str, Any], *names: str) -> str:
-    return ", ".join(f"{name} {_of_all(each[name])}" for name in names)
+    return ", ".join(f"{name} {in_numbers(each[name])}" for name in names)
 
 
 def _files(result: Mapping[str, Any]) -> Iterator[str]:
@@ -60,7 +60,7 @@ def _files(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"  {name}{'' if found else ' (by the clock)'}"
 
 
-def _of_all(values: Iterable[Any]) -> str:
+def in_numbers(values: Iterable[Any]) -> str:
     """The first, the last, the least and the greatest of numbers; the words of what is none."""
     values = list(values)
     numbers = [float(each) for each in values if isinstance(each, int | float)]

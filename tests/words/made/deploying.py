@@ -4,10 +4,13 @@ import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from unittest.mock import patch
 
 from pipeline.api.api import record, write
 from pipeline.deploying import certificate
+from pipeline.deploying.c_replay import why_no_replay
 from pipeline.deploying.deploying import deploy
 from pipeline.deploying.folder import lost_sentence
 from tests.replay.estimators.test_attitude import carried
@@ -45,6 +48,27 @@ def written() -> Iterator[str]:
             yield from lines
 
 
+def unreplayed() -> Iterator[str]:
+    """Why fuselog cannot replay a filter in C, and that it can."""
+    plain = {"topic": "fix", "name": "fix", "read": None, "is_numbered": False}
+    for name, interpolated, control, fallbacks, geodetic, sensor in (
+        ("well", False, None, [], [], {}),
+        ("interpolated", True, None, [], [], {}),
+        ("of messages", False, None, ["fix"], [], {}),
+        ("control", False, SimpleNamespace(read=len), [], [], {}),
+        ("geodetic", False, None, [], [SimpleNamespace(name="fix")], {}),
+        ("sensor", False, SimpleNamespace(read=None), [], [], {"read": len}),
+        ("point", False, None, [], [], {"is_numbered": True}),
+    ):
+        sensors = [SimpleNamespace(**{**plain, **sensor})]
+        filtering = SimpleNamespace(
+            stage=SimpleNamespace(model=SimpleNamespace(control=control), sensors=sensors),
+            found=SimpleNamespace(fallbacks=fallbacks, geodetic=geodetic),
+        )
+        made: Any = SimpleNamespace(filtering=filtering, is_interpolated=interpolated)
+        yield f"{name}: {why_no_replay(made) or 'nothing'}"
+
+
 def _beside(folder: Path) -> Iterator[str]:
     """What the other files say to who reads them or builds with them."""
     for path in sorted(folder.iterdir()):
@@ -55,4 +79,4 @@ def _beside(folder: Path) -> Iterator[str]:
             yield from (" ".join(each.split()) for each in re.findall(r"/\*.*?\*/", text, re.DOTALL))
 
 
-DEPLOYED = (lost, written)
+DEPLOYED = (lost, unreplayed, written)
