@@ -25,7 +25,7 @@ from pipeline.calibrating.car import (
     straight,
 )
 from pipeline.calibrating.kalibr import FILE, kalibr_yaml
-from pipeline.calibrating.manoeuvres import advice, gain
+from pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from pipeline.tuning.information import information
 from pipeline.tuning.objective import in_memory
 from recorders.models.inertial import from_mounting
@@ -143,8 +143,13 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
     without = replace(
         log, streams={name: log.streams[name] for name in log.streams if "fix" not in name}
     )
+    found = fl.calibrate(log, "ekf")
     with pytest.raises(fl.BadInput, match="--next: run 0 of car C has no odometry with fixes"):
-        advice(replace(fl.calibrate(log, "ekf"), logs=[without]))
+        advice(replace(found, logs=[without]))
+    for left_out in ("nothing", "/car/heading"):  # a manoeuvre has the sensors of the log
+        streams = {name: log.streams[name] for name in log.streams if name != left_out}
+        made = _simulated(found, replace(log, streams=streams), circle).ensemble[0]
+        assert {*made.topics} == {*streams}
 
 
 @pytest.mark.paper

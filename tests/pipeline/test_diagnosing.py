@@ -284,18 +284,20 @@ def test_what_is_wrong_with_messages_is_said() -> None:
 
 
 def test_components_of_which_the_same_is_true_are_one_sentence() -> None:
-    """A recorded filter's fixes: x and y half as large as stated, z biased; each is said once."""
+    """A recorded filter's fixes: x and y half as large as stated, z biased; w is well."""
     rng = np.random.default_rng(2)
     innovation = 0.5 * rng.normal(size=(400, 3)) + np.array([0.0, 0.0, 3.0])
+    innovation = np.column_stack([innovation, rng.normal(size=400)])
+    names = {"components": "x_m,y_m,z_m,w_m", "kinds": ",".join(["linear"] * 4)}
     stream = fl.make_stream(
         "/estimates/ekf2/vehicle/fix/innovation",
         fl.schemas.INNOVATION,
         np.arange(400) * 10**9,
-        metadata={"components": "x_m,y_m,z_m", "kinds": "linear,linear,linear", "noise": "EKF2_GPS_P"},
+        metadata={**names, "noise": "EKF2_GPS_P"},
         target_id=np.zeros(400, int),
         accepted=np.ones(400, int),
         innovation=innovation,
-        covariance=np.tile(np.eye(3).ravel(), (400, 1)),
+        covariance=np.tile(np.eye(4).ravel(), (400, 1)),
         normalised_innovation_squared=np.sum(innovation**2, axis=1),
         log_likelihood=np.zeros(400),
     )

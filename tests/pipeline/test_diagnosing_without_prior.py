@@ -15,7 +15,7 @@ from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
 from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import EVER_NS, Likelihood, Trial, _span, first_of_each
+from pipeline.diagnosing.likelihood import EVER_NS, Likelihood, Trial, _broad, _span, first_of_each
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
@@ -35,6 +35,15 @@ def test_the_likelihood_over_broad_starts_is_that_of_the_sheet() -> None:
     assert likelihood(car(1)) == pytest.approx(-372.645841, abs=1e-3)
     right = likelihood(car(2000))
     assert likelihood(car(2000), 16.0) == pytest.approx(right, abs=1e-6)
+
+
+def test_a_broad_model_knows_how_far_messages_are_from_the_last() -> None:
+    """By root mean squares of 2, over known steps alone, and of .3 over the ends of a circle."""
+    lines = [0.0, 1.0, np.nan, 4.0, 4.0 + np.sqrt(7.0), 4.0 + np.sqrt(7.0) - 2.0]
+    angles = [np.pi - 0.15, 0.15 - np.pi, np.pi - 0.15, np.nan, 0.0, -0.3]
+    numbers = np.stack([lines, angles, np.ones(6)], axis=1)
+    wanted = sum(-0.5 * (np.log(2.0 * np.pi * sigma**2) + 1.0) for sigma in (2.0, 0.3))
+    assert _broad(numbers, ["linear", "angle", "linear"]) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize(("stated", "factor", "size"), [(4.0, 1.99, "large"), (1 / 16, 4.02, "small")])

@@ -20,12 +20,19 @@ def told() -> Iterator[str]:
     """What the logs determine: each by itself, ever less, and two that they hardly distinguish."""
     for curvature in (4.1, 3.9, 0.5, 0.1, 0.0, -1.0):
         made = np.diag([curvature, 500.0, 500.0])
-        yield f"{curvature:g}: {' / '.join(doubts(confidence([0, 1, 2], made), SEARCHED)) or 'nothing'}"
+        yield from _determined(curvature, made)
     for mixed in (-0.999, 0.999):
         made = 400.0 * np.array([[1.0, mixed, 0.0], [mixed, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        yield f"{mixed:g}: {' / '.join(doubts(confidence([0, 1, 2], made), SEARCHED)) or 'nothing'}"
+        yield from _determined(mixed, made)
     made = np.diag([1.0, 500.0])
     yield f"at other places: {' / '.join(doubts(confidence([1, 2], made), SEARCHED))}"
+
+
+def _determined(of: float, curvature: np.ndarray) -> Iterator[str]:
+    """What a curvature tells of three parameters, and their standard errors."""
+    found = confidence([0, 1, 2], curvature)
+    errors = ", ".join(f"{each:.4g}" for each in np.sqrt(np.diag(found.covariance)))
+    yield f"{of:g}: {' / '.join(doubts(found, SEARCHED)) or 'nothing'} [{errors}]"
 
 
 def search() -> Iterator[str]:
