@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
@@ -122,7 +123,7 @@ def _events() -> tuple[MemorySource, list[Stream]]:
     """All that may happen to an estimator, once."""
     stamps = SECOND * np.arange(1, 5)
     truth = make_stream("/truth", schemas.TRUTH_STATE, stamps, metadata=PLANE, state=np.eye(4)[:, :2])
-    made = [estimate("one", "", truth)]
+    made = [estimate("one", "", truth), _cloud(stamps[1:3])]
     reasons = {"reasons": '["for this reason"]'}
     kinds = (schemas.STARTED, schemas.DIAGNOSED, schemas.SKIPPED, schemas.FAILURE)
     for stamp, schema in zip(stamps, kinds, strict=True):
@@ -142,3 +143,17 @@ def _events() -> tuple[MemorySource, list[Stream]]:
         ),
     ]
     return own("unheard-of", truth), made
+
+
+def _cloud(stamps: NDArray[np.int64]) -> Stream:
+    """Three particles at each stamp."""
+    rows = 3 * len(stamps)
+    return make_stream(
+        "/estimates/one/particle",
+        schemas.DENSITY_ESTIMATE,
+        np.repeat(stamps, 3),
+        metadata=PLANE,
+        weight=np.tile([0.5, 0.25, 0.25], len(stamps)),
+        mean=np.arange(2.0 * rows).reshape(rows, 2),
+        covariance=np.zeros((rows, 4)),
+    )

@@ -56,7 +56,7 @@ MOST = 6  # numbers of a row
 
 
 def in_words(folder: Path) -> Iterator[str]:
-    """The layout and the entities of a short run of every family."""
+    """The layout and the entities of a short run of every family, whose truth ends before estimates do."""
     recorded = {name: (record(name, **given), cases) for name, (given, cases) in FAMILIES.items()}
     robots, cases = recorded["landmarks"]
     receiver = _receiver(robots.epoch_ns)
@@ -67,11 +67,13 @@ def in_words(folder: Path) -> Iterator[str]:
         common = source.streams.get("/truth")
         truths = {case: source.streams.get(f"/{case}/truth", common) for case in cases}
         known = {case: truth for case, truth in truths.items() if truth is not None}
-        of_one = [estimate("one", case, truth) for case, truth in known.items()]
+        of_one = [_broken(estimate("one", case, truth)) for case, truth in known.items()]
         beside = [stream for each in of_one for stream in _beside(each)]
-        of_two = [estimate("two", case, truth) for case, truth in list(known.items())[:1]]
+        of_two = [_broken(estimate("two", case, truth)) for case, truth in list(known.items())[:1]]
+        ending = {truth.topic: truth.take(slice(None, -1)) for truth in known.values() if len(truth) > 2}
+        ended = replace(source, streams={**source.streams, **ending})
         yield f"# {scenario}"
-        yield from _drawn(source, [*of_one, *beside, *of_two], folder / f"{scenario}.rrd")
+        yield from _drawn(ended, [*of_one, *beside, *of_two], folder / f"{scenario}.rrd")
         yield ""
     for title, source, made in boards.boards():
         yield f"# {title}"
@@ -97,6 +99,12 @@ def _drawn(source: MemorySource, made: list[Stream], path: Path) -> Iterator[str
     for line, entities in alike.items():
         yield from entities[:-1]
         yield f"{entities[-1]}: {line}"
+
+
+def _broken(states: Stream) -> Stream:
+    """The same, the covariance of whose second estimate is none."""
+    states["covariance"][1:2, 0] *= -1.0
+    return states
 
 
 def _receiver(epoch_ns: int) -> Stream:
