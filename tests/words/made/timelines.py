@@ -56,7 +56,7 @@ MOST = 6  # numbers of a row
 
 
 def in_words(folder: Path) -> Iterator[str]:
-    """The layout and the entities of a short run of every family, whose truth ends before estimates do."""
+    """The layout and the entities of a short run of every family, whose truth ends a stamp early."""
     recorded = {name: (record(name, **given), cases) for name, (given, cases) in FAMILIES.items()}
     robots, cases = recorded["landmarks"]
     receiver = _receiver(robots.epoch_ns)
