@@ -192,6 +192,7 @@ OF_SENSORS = (
     Edge("radians of a turn", lambda x: one(magnetic.iron, field(0.5, turn=x)), (3.0, 6.283)),
     Edge("fields of a turn", lambda n: one(magnetic.iron, field(0.5, count=int(n))), (30, 80)),
     Edge("upright, of its length", lambda x: one(forces.upright, leaning(x)), (0.7, 0.99)),
+    Edge("upside down", lambda x: one(forces.upright, leaning(x, axis=2)), (-0.7, -0.99)),
     Edge("samples of it", lambda n: one(forces.upright, leaning(0.99, int(n))), (10, 80)),
     Edge("not symmetric by", lambda x: one(covariances.impossible, spread(x, 0.0)), (1e-8, 1e-3)),
     Edge("a correlation of 1 and", lambda x: one(covariances.impossible, spread(x, x)), (1e-8, 1e-3)),
@@ -283,7 +284,7 @@ def _told(edge: Edge) -> str:
             near, before = middle, words
         else:
             far, after = middle, words
-    at = f"{far:.4g}" if not is_whole else f"{far}"
+    at = f"{far}" if is_whole else f"{far:#.5g}"
     return f"{edge.title}: {before}, and from {at} on {after}"
 
 

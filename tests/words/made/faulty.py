@@ -201,8 +201,9 @@ def placed(metres: float, noise: float = 0.0) -> Stream:
     )
 
 
-def leaning(share: float, count: int = ROWS) -> Stream:
-    force = 9.8 * np.array([share, np.sqrt(1.0 - share**2), 0.0])
+def leaning(share: float, count: int = ROWS, axis: int = 0) -> Stream:
+    """A unit one of whose axes is up by a share."""
+    force = 9.8 * np.roll([share, np.sqrt(1.0 - share**2), 0.0], axis)
     return inertial(count, force=np.tile(force, (count, 1)))
 
 

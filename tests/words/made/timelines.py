@@ -181,6 +181,9 @@ def _layout(path: Path) -> Iterator[str]:
         parts[f"{part}/{number}"] |= named
     within = {each for part in parts.values() for each in part.get("ContainerBlueprint:contents", ())}
     [root] = [each for each in parts if each.startswith("container/") and each not in within]
+    for name in sorted(each for each in parts if "_panel/" in each):
+        told = " ".join(map(str, parts[name].get("PanelBlueprint:state", ())))
+        yield from [f"{name.strip('/')}: state {told}"] if told else []
     yield from (f"time: {each}" for each in parts["time_panel/"].get("TimePanelBlueprint:timeline", ()))
     yield from _board(parts, root, 1)
 
@@ -235,9 +238,14 @@ def _numbers(columns: Columns) -> Iterator[str]:
             continue
         values[np.abs(values) < 1e-6 * np.abs(known).max()] = 0.0
         ends = [values] if len(values) <= 2 * MOST else [values[:MOST], values[-MOST:]]
-        told = " to ".join(" ".join(f"{each:.4g}" for each in end) for end in ends)
+        told = " to ".join(" ".join(map(_digits, end)) for end in ends)
         told = "" if what == "buffer" else f"{told}, "
         yield f"{what} {told}{len(values)} with rms {np.sqrt(np.mean(known**2)):.4g}"
+
+
+def _digits(number: float) -> str:
+    """Four digits, with zeros: what is compared may differ by one of the last."""
+    return f"{number:.4g}" if number == round(number) else f"{number:#.4g}"
 
 
 def _flat(value: Any) -> Floats:
