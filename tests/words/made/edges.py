@@ -20,6 +20,7 @@ from tests.words.made.faulty import (
     UPRIGHT,
     alike,
     both,
+    by_velocities,
     climbing,
     counted,
     fast,
@@ -243,6 +244,7 @@ OF_MOTION = (
     Edge("of many fixes", lambda x: speeds.rest(resting(x, 900)), (1.0, 9.0)),
     Edge("fixes at rest", lambda n: speeds.rest(resting(20.0, n)), (5, 30)),
     Edge("rad/s of a turn", lambda x: turns.quaternions(turning(x)), (0.01, 0.4)),
+    Edge("of summed velocities", lambda x: speeds.factors(by_velocities(x)), (1.0, 1.6)),
     Edge("how these differ", lambda x: speeds.factors(motion(speed=alike(3.6, spread_=x))), (0.5, 0.1)),
 )  # fmt: skip
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, make_stream, schemas
 from recorders.plausibility.body import Body, Fixes, Series
-from recorders.plausibility.motion import Forces, Lag, Slope
+from recorders.plausibility.motion import Forces, Lag, Motion, Slope
 from recorders.plausibility.timing import Timing
 
 BEGIN_NS = 1_700_000_000 * 10**9
@@ -279,6 +279,17 @@ def weighing(norm: float, share: float = 0.0) -> Any:
 
 def fast(rate: float, share: float = 1.0) -> Any:
     return motion(rate=np.where(np.arange(ROWS) < share * ROWS, rate, 0.0), turn=None)
+
+
+def by_velocities(factor: float) -> Motion:
+    """A body without places, whose velocities are summed, and wheels in another unit."""
+    times_s = 0.1 * np.arange(600)
+    speed = 10.0 + 5.0 * np.sin(0.2 * times_s)
+    velocity = np.stack([0.8 * speed, 0.6 * speed], axis=1)
+    source = Series("/velocity", "velocity_mps", times_s, velocity)
+    return Motion(
+        Body(velocities=[source], speeds=[Series("/wheels", "forward_mps", times_s, factor * speed)])
+    )
 
 
 def late(seconds: float) -> Any:
