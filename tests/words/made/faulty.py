@@ -283,8 +283,8 @@ def fast(rate: float, share: float = 1.0) -> Any:
 
 def by_velocities(factor: float) -> Motion:
     """A body without places, whose velocities are summed, and wheels in another unit."""
-    times_s = 0.1 * np.arange(600)
-    speed = 10.0 + 5.0 * np.sin(0.2 * times_s)
+    times_s = 0.2 * np.arange(60)
+    speed = 10.0 + 5.0 * np.sin(times_s)
     velocity = np.stack([0.8 * speed, 0.6 * speed], axis=1)
     source = Series("/velocity", "velocity_mps", times_s, velocity)
     return Motion(
