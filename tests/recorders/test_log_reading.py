@@ -207,7 +207,12 @@ def test_an_opened_log_tells_its_topics_and_its_run(path):
         ("/scan", "fuselog.Scan", 20),
         ("/truthstate", "fuselog.TruthState", 20),
     ]
-    assert read_streams(log, ["/scan"])["/scan"].components == ["x_m", "y_m"]
+    scan = read_streams(log, ["/scan"])["/scan"]
+    assert scan.components == ["x_m", "y_m"]
+    for rows, told in ((slice(1), "1 message"), (slice(2), "2 messages")):
+        assert repr(scan.take(rows)).startswith(
+            f"<Stream /scan, fuselog.Scan, {told}: publish_time_ns, "
+        )
 
 
 def test_a_log_without_messages_is_a_log(path):

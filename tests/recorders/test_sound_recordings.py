@@ -56,7 +56,8 @@ def delays_of(recording: Recording, name: str = "coords") -> dict[int, float]:
 
 
 def test_the_whole_recordings_are_one_sound(folder):
-    recording = read(folder, truth_m={"coords": [3.0, 4.0]})
+    recording = read(folder, truth_m={"coords": [3.0, 4.0], "bang": [0.0, 0.0]})
+    assert recording.notes["truth_m"] == "no sound has the name bang"
     found = delays_of(recording)
     assert list(found.values()) == pytest.approx(list(LATER.values()), abs=0.02)
     streams = {stream.topic: stream for stream in recording.streams}

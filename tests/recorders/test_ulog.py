@@ -307,6 +307,16 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         "mag_field": [0.2, 0.1, 0.4],
         "flow": [0.1, 0.2],
         "baro_vpos": [-30],
+        "rng_vpos": [-30],
+        "ev_hpos": [10, 20],
+        "ev_vpos": [-30],
+        "ev_hvel": [1, 2],
+        "ev_vvel": [-3],
+        "gps_hvel": [1, 2],
+        "gps_vvel": [-3],
+        "gravity": [0.2, 0.1, 0.4],
+        "airspeed": [15],
+        "beta": [0.5],
     }
     measured = {
         "gps_hpos": [11, 22],
@@ -315,6 +325,16 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         "mag_field": [0.3, 0.15, 0.45],
         "flow": [0.15, 0.3],
         "baro_vpos": [-31],
+        "rng_vpos": [-32],
+        "ev_hpos": [13, 21],
+        "ev_vpos": [-34],
+        "ev_hvel": [1.5, 2.25],
+        "ev_vvel": [-3.5],
+        "gps_hvel": [1.25, 2.5],
+        "gps_vvel": [-3.75],
+        "gravity": [0.3, 0.15, 0.45],
+        "airspeed": [16],
+        "beta": [0.7],
     }
     fields = "".join(f"float[{len(each)}] {name};" for name, each in predicted.items()).replace(
         "[1]", ""
@@ -325,7 +345,9 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     formats += (f"{topics[2]}:{stamps}uint64_t control_mode_flags;",)
     subscribed = [message("A", struct.pack("<BH", 0, 20 + n) + t.encode()) for n, t in enumerate(topics)]
     off = np.concatenate([np.subtract(predicted[name], measured[name]) for name in predicted])
-    in_use = sum(1 << bit for bit in (2, 3, 4, 5, 9))  # not the height of fixes
+    in_use = sum(
+        1 << bit for bit in (2, 3, 4, 5, 9, 10, 12, 14, 15, 19, 24, 34)
+    )  # not the height of fixes
 
     def row(number: int, stamp: int, body: bytes) -> bytes:
         return message("D", struct.pack("<HQQ", number, stamp + LATER_US, stamp) + body)
@@ -348,6 +370,13 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         "heading": [-0.2],  # counterclockwise from east: 90 deg less PX4's
         "magnetometer": [0.1, -0.05, -0.05],
         "flow": [0.05, -0.1],
+        "range": [2],
+        "vision_position": [1, 3, 4],
+        "vision_velocity": [0.25, 0.5, 0.5],
+        "gnss_velocity": [0.5, 0.25, 0.75],
+        "gravity": [0.1, -0.05, -0.05],
+        "airspeed": [1],
+        "sideslip": [0.2],
     }
     for name, once in expected.items():
         innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]

@@ -8,23 +8,13 @@ import pytest
 from matplotlib.colors import rgb_to_hsv
 from scipy.stats import chi2
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.scores import Matcher, score_stream
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from recorders.log import make_stream, schemas
 from replay.timeline.drawing.canvas import PALETTE, WRONG
 from replay.timeline.families.ais import track_colours
 from replay.timeline.show import Drawing
-from tests.replay.timeline.making import ESTIMATORS, columns, drawn, logged_late, of_both, record
+from tests.replay.timeline.made_runs import SECOND, own, samples, scores, sets, vessels
+from tests.replay.timeline.making import ESTIMATORS, columns, drawn, of_both, record
 from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
-
-SECOND = 10**9
-PLANE = {"components": "x_m,y_m", "kinds": "linear,linear"}
-
-
-def own(scenario: str, *streams: object) -> MemorySource:
-    """A run of streams that are made."""
-    return logged_late(memory_source(Recording([*streams]), RunMetadata(scenario, epoch_ns=SECOND)))
 
 
 def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:
@@ -33,30 +23,7 @@ def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:
     square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
     hole = 1.0 + 0.25 * square[::-1]
     rings = [square, square + 1.0, hole + 1.0]
-    truth = make_stream(
-        "/robot1/truth", schemas.TRUTH_STATE, stamps, metadata=PLANE, state=np.ones((3, 2))
-    )
-    made = [
-        make_stream(
-            "/estimates/one/robot1/set",
-            schemas.SET_ESTIMATE,
-            np.repeat(stamps[[0, 2, 2]], 4),
-            metadata=PLANE,
-            ring_id=np.repeat([0, 0, 1], 4),
-            vertex=np.concatenate(rings),
-        ),
-        make_stream(
-            "/estimates/one/robot1/size",
-            schemas.ESTIMATE_SIZE,
-            stamps,
-            metadata=PLANE,
-            elements=[4, 0, 8],
-        ),
-    ]
-    marks = make_stream(
-        "/landmarks", schemas.LANDMARK, [SECOND], landmark_id=[1], position_m=[[2.0, 2.0]]
-    )
-    run = drawn(tmp_path, own("relative-bearings", truth, marks), made)
+    run = drawn(tmp_path, *sets(rings))
     closed = np.stack([np.concatenate([ring, ring[:1]]) for ring in rings])
     wanted = {
         "/map/robot1/one": Wanted("lines", stamps[[0, 2, 2]], closed),
@@ -69,29 +36,18 @@ def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:
 
 def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path: Path) -> None:
     """Four probes, one of which is taken for another user; genuine is what is of one user."""
-    matchers = (Matcher(name="left", modality="finger"), Matcher(name="right", modality="finger"))
-    users, arrivals = np.arange(4), SECOND * np.arange(1, 5)
+    arrivals = SECOND * np.arange(1, 5)
     rng = np.random.default_rng(1)
-    scores = rng.uniform(0.0, 1.0, (4, 4, 2)) + 2.0 * np.eye(4)[:, :, None]
-    scores[2, 3] += 3.0
-    source = own("biometric-scores", score_stream(matchers, scores, arrivals))
-    sums = scores.sum(axis=2)
-    fused = make_stream(
-        "/estimates/one/finger/score",
-        schemas.SCORE_VECTOR,
-        np.repeat(arrivals, 4),
-        metadata={"components": "log_likelihood_ratio", "threshold": "3.0"},
-        probe_id=np.repeat(users, 4),
-        gallery_id=np.tile(users, 4),
-        scores=sums.reshape(-1, 1),
-    )
-    run = drawn(tmp_path, source, [fused])
+    given = rng.uniform(0.0, 1.0, (4, 4, 2)) + 2.0 * np.eye(4)[:, :, None]
+    given[2, 3] += 3.0
+    sums = given.sum(axis=2)
+    run = drawn(tmp_path, *scores(given, arrivals))
     wanted = {}
     others = np.where(np.eye(4) > 0, -np.inf, 1.0)
     for plot, own_scores in (
         ("fusion/finger/one/scores", sums),
-        ("matchers/finger/left", scores[:, :, 0]),
-        ("matchers/finger/right", scores[:, :, 1]),
+        ("matchers/finger/left", given[:, :, 0]),
+        ("matchers/finger/right", given[:, :, 1]),
     ):
         greatest = np.where(others > 0, own_scores, -np.inf).max(axis=1)
         wanted[f"/{plot}/genuine"] = Wanted("curve", arrivals, np.diag(own_scores))
@@ -140,30 +96,7 @@ def test_reports_are_where_they_were_and_vessels_are_counted(tmp_path: Path) -> 
     numbers = np.array([7, 8, 7, 8, 8])
     places = np.stack([10.0 * np.arange(5), -5.0 * np.arange(5)], axis=1)
     degrees = np.stack([50.0 + 1e-4 * np.arange(5), -1.0 - 2e-4 * np.arange(5)], axis=1)
-    moves = {"course_rad": np.zeros(5), "speed_mps": np.ones(5)}
-    source = own(
-        "ais",
-        make_stream("/reports", schemas.COURSE_FIX, stamps, position_m=places, **moves),
-        make_stream("/identity", schemas.IDENTITY, stamps, thing_id=numbers),
-        make_stream(
-            "/geodetic",
-            schemas.GEODETIC_FIX,
-            stamps,
-            latitude_deg=degrees[:, 0],
-            longitude_deg=degrees[:, 1],
-            altitude_m=np.zeros(5),
-        ),
-    )
-    tracks = make_stream(
-        "/estimates/one/track",
-        schemas.TRACK_ESTIMATE,
-        stamps,
-        metadata={"components": "x_m,y_m", "kinds": "linear,linear"},
-        track_id=[1, 2, 1, 3, 2],
-        mean=places,
-        covariance=np.tile(np.eye(2).ravel(), (5, 1)),
-    )
-    run = drawn(tmp_path, source, [tracks])
+    run = drawn(tmp_path, *vessels(stamps, numbers, [1, 2, 1, 3, 2], places, degrees))
     heard = SECOND * np.array([1, 10, 620, 630, 900])
     live = SECOND * np.array([1, 10, 30, 610, 620, 630, 900])
     wanted = {
@@ -188,24 +121,14 @@ def test_reports_are_where_they_were_and_vessels_are_counted(tmp_path: Path) -> 
 
 def test_samples_have_the_area_of_their_weight_in_the_circle_of_most(tmp_path: Path) -> None:
     places, weights = np.array([[0.0, 0.5], [1.0, -1.0], [-2.0, 0.25]]), np.array([1.2, 0.3, -0.5])
-    made = make_stream(
-        "/estimates/one/sample",
-        schemas.DENSITY_ESTIMATE,
-        [SECOND] * 3,
-        metadata=PLANE,
-        weight=weights,
-        mean=places,
-        covariance=np.zeros((3, 4)),
-    )
-    source = MemorySource({}, RunMetadata("lcd-sampling", epoch_ns=SECOND), "samples")
-    run = drawn(tmp_path, source, [made])
-    samples = run.picture.still["/map/one/samples"]
-    np.testing.assert_allclose(samples["Points2D:positions"][0], places)
+    run = drawn(tmp_path, *samples(places, weights))
+    dots = run.picture.still["/map/one/samples"]
+    np.testing.assert_allclose(dots["Points2D:positions"][0], places)
     np.testing.assert_allclose(
-        np.square(samples["Points2D:radii"][0]), 14.0**2 * np.abs(weights), rtol=1e-5
+        np.square(dots["Points2D:radii"][0]), 14.0**2 * np.abs(weights), rtol=1e-5
     )
     packed = [int.from_bytes(bytes((*colour, 255)), "big") for colour in (PALETTE[0], PALETTE[0], WRONG)]
-    assert samples["Points2D:colors"][0] == packed
+    assert dots["Points2D:colors"][0] == packed
     circle = np.array(run.picture.still["/map/one/circle"]["LineStrips2D:strips"][0][0])
     np.testing.assert_allclose(np.sum(circle**2, axis=1), chi2.ppf(0.95, 2), rtol=1e-5)
     assert [(view.name, view.roots) for view in run.picture.views] == [("one, 3 samples", ["map/one"])]

@@ -46,6 +46,9 @@ def sensors() -> Iterator[str]:
     for size, turn in ((1.0, 2.0), (1 / 9.8, 200.0), (30.0, 0.2)):
         rates = {f"gyro_{axis}": turn * (0.5 + BEND) for axis in "xyz"}
         yield from _guessed(**clock, **{name: size * each for name, each in force.items()}, **rates)
+    in_units = {f"acc_{axis} [g]": 0.5 + BEND for axis in "xyz"}
+    in_units |= {f"gyro_{axis} [deg/s]": 2.0 + BEND for axis in "xyz"}
+    yield from _guessed(**clock, **in_units)
     for size in (25.0, 0.25, 1000.0):
         yield from _guessed(**clock, **{f"mag_{axis}": size * (1.0 + BEND) for axis in "xyz"})
     yield from _guessed(**clock, landmark_id=ROWS % 5, range_ft=10.0 + BEND, bearing=BEND)

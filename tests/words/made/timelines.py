@@ -1,6 +1,8 @@
-"""Timelines in words: how views are laid out, and of every entity how it looks and when it moves.
+"""Timelines in words: how views are laid out; of every entity how it looks, when it moves, and numbers.
 
-Estimates are made; what values are drawn is tested in `tests/replay/timeline`.
+Estimates are made, and so is what other families are of (`boards`). Of the numbers that are drawn the
+first, the last and the root mean square are told; what they should be is tested in
+`tests/replay/timeline`.
 """
 
 import json
@@ -15,12 +17,15 @@ import rerun.chunk as rc
 
 from recorders.log import Stream, make_stream, schemas
 from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource
+from replay.judging.errors.evaluation import Floats
 from replay.judging.judge import Judge
 from replay.timeline.drawing.curves import CurvePanel, save_curves
 from replay.timeline.drawing.plane import Stroke
 from replay.timeline.show import show
 from tests.replay.timeline.making import estimate, record
 from tests.replay.timeline.test_timeline import Columns, read
+from tests.words.made import boards
 
 # By scenario, parameters of a short run, and whose estimates are made.
 FAMILIES: Mapping[str, tuple[dict[str, Any], tuple[str, ...]]] = {
@@ -33,20 +38,25 @@ FAMILIES: Mapping[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "landmarks": ({"duration_s": 1.0, "landmarks": 3}, ("robot1",)),
     "navigation": ({"duration_s": 12.0}, ()),
     "optical-los": ({}, ("",)),
-    "orientation": ({"steps": 4}, ("",)),
+    "orientation": ({"steps": 4}, ("", "left")),
     "relative-bearings": ({"looks": 4}, ()),
     "torus-headings": ({"steps": 4}, ("",)),
     "vehicles": ({"duration_s": 2.0, "vehicles": 2}, ("vehicle1", "vehicle2", "infrastructure")),
 }
 OTHER = "of no family"  # the robots' log, by schema
 KINDS = {1: "tabs", 2: "side by side", 3: "one below the other", 4: "a grid"}
-# What is drawn is tested elsewhere, and is long.
 LOOKS = ("colors", "labels", "level", "radii", "text")
-DATA = ("positions", "strips", "centers", "half_sizes", "quaternions", "buffer", "line_strings")
+# What is drawn, of which a few numbers are told.
+DATA = (
+    *("positions", "strips", "centers", "half_sizes", "quaternions", "quaternion", "buffer"),
+    *("line_strings", "origins", "vectors", "scalars", "values", "variances", "abscissa"),
+    *("translation", "mat3x3", "scale"),
+)
+MOST = 6  # numbers of a row
 
 
 def in_words(folder: Path) -> Iterator[str]:
-    """The layout and the entities of a short run of every family."""
+    """The layout and the entities of a short run of every family, whose truth ends a stamp early."""
     recorded = {name: (record(name, **given), cases) for name, (given, cases) in FAMILIES.items()}
     robots, cases = recorded["landmarks"]
     receiver = _receiver(robots.epoch_ns)
@@ -56,24 +66,45 @@ def in_words(folder: Path) -> Iterator[str]:
     for scenario, (source, cases) in recorded.items():
         common = source.streams.get("/truth")
         truths = {case: source.streams.get(f"/{case}/truth", common) for case in cases}
-        made = [estimate("one", case, truth) for case, truth in truths.items() if truth is not None]
-        beside = [stream for each in made for stream in _beside(each)]
-        outputs = {each.topic: gather([each]) for each in [*made, *beside]}
-        errors = Judge([source], {}, gap_limit_s=2.0).add(outputs).errors
-        path = folder / f"{scenario}.rrd"
-        show(source, outputs, [each for each in errors if each is not None], save=path)
+        known = {case: truth for case, truth in truths.items() if truth is not None}
+        of_one = [_broken(estimate("one", case, truth)) for case, truth in known.items()]
+        beside = [stream for each in of_one for stream in _beside(each)]
+        of_two = [_broken(estimate("two", case, truth)) for case, truth in list(known.items())[:1]]
+        ending = {truth.topic: truth.take(slice(None, -1)) for truth in known.values() if len(truth) > 2}
+        ended = replace(source, streams={**source.streams, **ending})
         yield f"# {scenario}"
-        yield from _layout(path)
-        moving, still = read(path), read(path, static=True)
-        alike: dict[str, list[str]] = defaultdict(list)
-        for entity in sorted({*moving, *still}):
-            told = ", ".join([*_looks(still.get(entity, {})), *_moves(moving.get(entity, {}))])
-            alike[told].append(entity)
-        for told, entities in alike.items():
-            yield from entities[:-1]
-            yield f"{entities[-1]}: {told}"
+        yield from _drawn(ended, [*of_one, *beside, *of_two], folder / f"{scenario}.rrd")
+        yield ""
+    for title, source, made in boards.boards():
+        yield f"# {title}"
+        yield from _drawn(source, made, folder / f"{title.replace(' ', '_')}.rrd")
         yield ""
     yield from _curves(folder / "curves.rrd")
+
+
+def _drawn(source: MemorySource, made: list[Stream], path: Path) -> Iterator[str]:
+    """The layout and the entities of a run and of what is made of it."""
+    outputs = {each.topic: gather([each]) for each in made}
+    errors = Judge([source], {}, gap_limit_s=2.0).add(outputs).errors
+    show(source, outputs, [each for each in errors if each is not None], save=path)
+    yield from _layout(path)
+    moving, still = read(path), read(path, static=True)
+    alike: dict[str, list[str]] = defaultdict(list)
+    for entity in sorted({*moving, *still}):
+        told = [*_looks(still.get(entity, {})), *_moves(moving.get(entity, {}))]
+        # errors of all families are compared with the judge's
+        if not entity.rpartition("/")[0].rpartition("/")[2].startswith(("error_", "nees_")):
+            told += [*_numbers(still.get(entity, {})), *_numbers(moving.get(entity, {}))]
+        alike[", ".join(told)].append(entity)
+    for line, entities in alike.items():
+        yield from entities[:-1]
+        yield f"{entities[-1]}: {line}"
+
+
+def _broken(states: Stream) -> Stream:
+    """The same, the covariance of whose second estimate is none."""
+    states["covariance"][1:2, 0] *= -1.0
+    return states
 
 
 def _receiver(epoch_ns: int) -> Stream:
@@ -100,7 +131,7 @@ def _curves(path: Path) -> Iterator[str]:
     yield from _layout(path)
     still = read(path, static=True)
     for entity in sorted(still):
-        yield f"{entity}: {', '.join(_looks(still[entity]))}"
+        yield f"{entity}: {', '.join([*_looks(still[entity]), *_numbers(still[entity])])}"
 
 
 def _beside(state: Stream) -> Iterator[Stream]:
@@ -150,6 +181,9 @@ def _layout(path: Path) -> Iterator[str]:
         parts[f"{part}/{number}"] |= named
     within = {each for part in parts.values() for each in part.get("ContainerBlueprint:contents", ())}
     [root] = [each for each in parts if each.startswith("container/") and each not in within]
+    for name in sorted(each for each in parts if "_panel/" in each):
+        told = " ".join(map(str, parts[name].get("PanelBlueprint:state", ())))
+        yield from [f"{name.strip('/')}: state {told}"] if told else []
     yield from (f"time: {each}" for each in parts["time_panel/"].get("TimePanelBlueprint:timeline", ()))
     yield from _board(parts, root, 1)
 
@@ -192,6 +226,38 @@ def _looks(columns: Columns) -> Iterator[str]:
         if what == "colors":
             values = list(dict.fromkeys(f"#{each:08x}" for each in values))
         yield f"{what} {' '.join(map(_short, values[:8]))}"
+
+
+def _numbers(columns: Columns) -> Iterator[str]:
+    """Of what is drawn the first numbers, the last, the root mean square; of pictures that alone."""
+    for name in sorted(columns):
+        what = name.partition(":")[2]
+        values = _flat(columns[name] if what in DATA else [])
+        known = values[np.isfinite(values)]
+        if not len(known):
+            continue
+        values[np.abs(values) < 1e-6 * np.abs(known).max()] = 0.0
+        ends = [values] if len(values) <= 2 * MOST else [values[:MOST], values[-MOST:]]
+        told = " to ".join(" ".join(map(_digits, end)) for end in ends)
+        told = "" if what == "buffer" else f"{told}, "
+        yield f"{what} {told}{len(values)} with rms {np.sqrt(np.mean(known**2)):.4g}"
+
+
+def _digits(number: float) -> str:
+    """Four digits, with zeros: what is compared may differ by one of the last."""
+    return f"{number:.4g}" if number == round(number) else f"{number:#.4g}"
+
+
+def _flat(value: Any) -> Floats:
+    """All numbers within lists and their buffers."""
+    if isinstance(value, Mapping):
+        return _flat(value["buffer"])
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8).astype(float)
+    try:
+        return np.array(value, float).ravel()
+    except (TypeError, ValueError):  # lists of different lengths, or of buffers
+        return np.concatenate([_flat(each) for each in value])
 
 
 def _short(value: Any) -> str:
