@@ -32,6 +32,7 @@ SMALL = 1e-6  # what is far below is rounding
 PLACES = (gettempdir(), str(Path(__file__).parents[3]), os.environ.get("FUSELOG_DATA", "<none>"))
 OF_ONE_RUN = re.compile(f"(?:{'|'.join(map(re.escape, PLACES))})[^\\s:]*")
 BY_THE_CLOCK = re.compile("cpu|step_ms|growth|factor_per|^power$|^work$", re.IGNORECASE)
+SINGULAR = ("powers", "products")  # estimators of which rounding decides, see `store.py`
 
 Numbers = dict[str, float]
 
@@ -79,7 +80,8 @@ def hold_recording(kind: str, settings: Any, recording: Recording) -> None:
 
 
 def _short(settings: Any) -> str:
-    return f"{zlib.crc32(repr(_leaves_of(settings)).encode()):08x}"
+    words = [each if isinstance(each, str) else f"{each:.4g}" for each in _leaves_of(settings)]
+    return f"{zlib.crc32(' '.join(words).encode()):08x}"
 
 
 def of_recording(recording: Recording) -> Numbers:
@@ -99,22 +101,24 @@ def of_outcome(outcome: Outcome) -> Numbers:
     Without what the clock decides.
     """
     found: dict[str, float] = {}
-    steady = [key for key in sorted(outcome.metrics) if not BY_THE_CLOCK.search(key.partition(".")[2])]
+    parted = {key: key.partition(".") for key in sorted(outcome.metrics)}
+    steady = [key for key, (_, _, of) in parted.items() if not BY_THE_CLOCK.search(of)]
     for key in steady:
-        estimator = key.partition(".")[0]
+        estimator = parted[key][0]
         value = _number_of(_leaves_of([key, outcome.metrics[key]]))
         found[estimator] = found.get(estimator, 0.0) + value * (1.0 + 0.1 * len(key))
     for name, table in outcome.tables.items():
-        kept = table[[each for each in table.columns if not BY_THE_CLOCK.search(str(each))]]
+        rows = table[~table["estimator"].isin(SINGULAR)] if "estimator" in table else table
+        kept = rows[[each for each in table.columns if not BY_THE_CLOCK.search(str(each))]]
         found[f"table {name}"] = _total([kept.columns.tolist(), *map(_column, kept.items())])
     for name, figure in outcome.figures.items():
         if isinstance(figure, Chart):
             panels = [each for each in figure.panels if not BY_THE_CLOCK.search(each.y.label)]
             found[f"figure {name}"] = _number_of(_leaves_of([figure.title, *panels]))
-    for name in ("bounds", "intervals", "alarms", "causes", "stress", "claims"):
+    for name in ("bounds", "intervals", "alarms", "causes", "stress"):
         if (of := getattr(outcome, name)) and len(steady) == len(outcome.metrics):
             found[name] = _number_of(_leaves_of(of))
-    return found
+    return {name: value for name, value in found.items() if name not in SINGULAR}
 
 
 def _column(named: tuple[Any, "pd.Series[Any]"]) -> Any:
