@@ -21,9 +21,22 @@ from pipeline.output.results import Outcome, Result, write_outcome
 from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
 from tests.conftest import without_drawing
+from tests.goldens import numbers
 from tests.words import studies
 
 SHORT = ["--set", "duration_s=2"]
+# the modules whose outcomes become folders
+WRITERS = (
+    "pipeline.api.estimates",
+    "pipeline.api.replays",
+    "pipeline.api.trajectories",
+    "pipeline.calibrating.ellipsoid",
+    "pipeline.comparing.comparing",
+    "pipeline.diagnosing.diagnosis",
+    "pipeline.runs.experiment",
+    "pipeline.sensing.outcome",
+    "pipeline.tuning.outcome",
+)
 
 
 class Said(NamedTuple):
@@ -65,16 +78,23 @@ def fuselog() -> Callable[..., Said]:
 
 @pytest.fixture(scope="module", autouse=True)
 def reviewed_names(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What a study finds in a test of studies, or tuning in any, has names that were reviewed."""
+    """What a study finds in a test of studies, or tuning in any, has names that were reviewed.
+
+    What any command finds has the numbers that it had.
+    """
     of_studies = "stud" in request.module.__name__
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
-        if of_studies or settings["study"].startswith("tuning"):
-            studies.hold(settings["study"], list(settings.get("estimators", {})), outcome)
+        study = settings.get("study", "")
+        if of_studies or study.startswith("tuning"):
+            studies.hold(study, list(settings.get("estimators", {})), outcome, settings)
+        else:
+            numbers.hold_outcome(name, settings, outcome)
         return write_outcome(folder, name, settings, outcome)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.runs.experiment.write_outcome", written)
+        for module in WRITERS:
+            patch.setattr(f"{module}.write_outcome", written)
         yield
 
 

@@ -13,8 +13,9 @@ import pytest
 
 from recorders.errors import BadInput
 from recorders.parameters import build, merge, nested
-from recorders.recording import Recorder, Simulator, record_run
+from recorders.recording import Recorder, Recording, Simulator, record_run
 from recorders.registry import available, load
+from tests.goldens import numbers
 from tests.pipeline.moves import bounds_of, moved, settable, switched_on, value_of
 
 SCENARIOS = {
@@ -112,9 +113,13 @@ def base_of(name: str) -> dict[str, Any]:
     return merge(switched_on(SCENARIOS[name].parameters), CASES.get(name, Case()).base)
 
 
-def fingerprint(name: str, settings: Mapping[str, Any]) -> str:
+def recorded(name: str, settings: Mapping[str, Any]) -> Recording:
+    """A run of the scenario."""
+    return record_run(name, settings, seed=3)[0]
+
+
+def fingerprint(recording: Recording) -> str:
     """Of all that a log would hold of a run but the parameters that its metadata repeats."""
-    recording, _ = record_run(name, settings, seed=3)
     digest = hashlib.sha256(repr((recording.epoch_ns, dict(recording.notes))).encode())
     for stream in recording.streams:
         digest.update(repr((stream.topic, sorted(stream.metadata.items()))).encode())
@@ -127,13 +132,16 @@ def fingerprint(name: str, settings: Mapping[str, Any]) -> str:
 def test_every_parameter_changes_what_is_recorded(name: str):
     case, kind, same = CASES.get(name, Case()), SCENARIOS[name].parameters, set()
     usual = base_of(name)
+    numbers.hold(f"recordings/{name}", "as it is", numbers.of_recording(recorded(name, usual)))
     for each in settable(kind):
         base = merge(usual, case.under.get(each.name, {}))
         if each.name in case.values:
             other = merge(base, nested(each.name, case.values[each.name]))
         else:
             other = moved(kind, base, each)
-        if fingerprint(name, other) == fingerprint(name, base):
+        found = recorded(name, other)
+        numbers.hold(f"recordings/{name}", each.name, {"all": sum(numbers.of_recording(found).values())})
+        if fingerprint(found) == fingerprint(recorded(name, base)):
             same.add(each.name)
     assert same == set(case.nothing)
 
@@ -144,7 +152,7 @@ def test_bounds_of_parameters_are_kept(name: str):
     for each in settable(kind):
         accepted, refused = bounds_of(each)
         for value in () if each.name in slow else accepted:
-            fingerprint(name, merge(base, nested(each.name, value)))
+            recorded(name, merge(base, nested(each.name, value)))
         for value in refused:
             with pytest.raises(BadInput, match=f"^scenario: parameter '{each.name}' is .*; it should"):
                 build(kind, merge(base, nested(each.name, value)), "scenario")
@@ -160,7 +168,7 @@ def test_one_entry_more_is_refused_or_recorded(name: str):
         if isinstance(value, list | tuple) and value and isinstance(value[0], float):
             longer = merge(base, nested(each.name, [*value, value[-1]]))
             try:
-                if fingerprint(name, longer) == fingerprint(name, base):
+                if fingerprint(recorded(name, longer)) == fingerprint(recorded(name, base)):
                     ignored.append(each.name)
             except BadInput:
                 continue

@@ -1,19 +1,42 @@
-"""Derivatives to machine precision: a step of 1e-30 in the imaginary direction.
+"""What tests of recorders share: recordings whose numbers are kept, and derivatives without rounding."""
 
-NumPy has no arctan2, hypot or remainder for complex numbers; this array continues them analytically.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from recorders import recording
+from recorders.log import RunMetadata
+from recorders.parameters import Parameters
+from recorders.recording import Blocks, Recording
+from tests.goldens import numbers
+
 STEP = 1e-30
 
 
+@pytest.fixture(scope="module", autouse=True)
+def kept_numbers() -> Iterator[None]:
+    """What is recorded or imported has the numbers that it had."""
+    describe = recording._metadata
+
+    def described(
+        name: str, parameters: Parameters, seed: int | None, run: int, found: Recording | Blocks
+    ) -> RunMetadata:
+        if isinstance(found, Recording):
+            numbers.hold_recording(name, [parameters, seed, run], found)
+        return describe(name, parameters, seed, run, found)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "_metadata", described)
+        yield
+
+
 class ComplexStep(np.ndarray):
-    """Complex numbers that also know arctan2 and hypot."""
+    """Complex numbers that also know arctan2 and hypot; NumPy's do not.
+
+    A step of 1e-30 in the imaginary direction gives derivatives to machine precision.
+    """
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         plain = [np.asarray(value) for value in inputs]

@@ -1,25 +1,30 @@
 """What studies call what they find: tables with columns, figures with axes and curves, metrics.
 
 What a study gives in a test is held to the lines that are kept of it in `studies.txt`: none may be new.
-`KEEP_STUDIES=1 pytest tests/pipeline/test_*stud*.py` adds what is, and keeps what is there.
+`KEEP_FOUND=1 pytest tests/pipeline/test_*stud*.py` adds what is, and keeps what is there.
 """
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from pipeline.output.charts import Chart
 from pipeline.output.results import Outcome
+from tests.goldens import numbers
 
 PATH = Path(__file__).with_name("studies.txt")
 
 
-def hold(study: str, labels: list[str], outcome: Outcome) -> None:
-    """Raise AssertionError where an outcome has names that nobody has reviewed."""
+def hold(
+    study: str, labels: list[str], outcome: Outcome, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Raise AssertionError where an outcome has names that nobody has reviewed, or other numbers."""
+    numbers.hold_outcome(study, settings or {}, outcome)
     kept = _kept()
     new = set(_named(labels, outcome)) - kept.get(study, set())
-    if new and os.environ.get("KEEP_STUDIES"):
+    if new and os.environ.get("KEEP_FOUND"):
         kept[study] = kept.get(study, set()) | new
         lines = [line for name in sorted(kept) for line in [f"[{name}]", *sorted(kept[name]), ""]]
         PATH.write_text("\n".join(lines), encoding="utf-8")
