@@ -26,6 +26,7 @@ UNREFERENCED_M = 50.0
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
 NONE = -1
+VELOCITY = ("vx_mps", "vy_mps")
 
 
 class TracksAt(NamedTuple):
@@ -102,7 +103,7 @@ def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0)
     """Return a run's tracks at instants: the last told until then, moved on by their velocities.
 
     `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
-    of each one `delay_ns` after its stamp.
+    of each one `delay_ns` after its stamp. Tracks that have no velocities stay where they are.
 
     Args:
         sizes: of the sets of tracks, a message per scan.
@@ -111,7 +112,7 @@ def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0)
         delay_ns: how long after its stamp a scan is told of.
     """
     names = tracks.components
-    place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
+    place, velocity = ([names.index(each) for each in of if each in names] for of in (PLANE, VELOCITY))
     ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
     found = []
     for time_ns, last in zip(
@@ -120,7 +121,7 @@ def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0)
         rows = slice(ends[last - 1], ends[last]) if last else slice(0, 0)
         later_s = (time_ns - sizes.publish_time_ns[last - 1]) * 1e-9 if last else 0.0
         mean = tracks["mean"][rows]
-        moved = mean[:, place] + later_s * mean[:, velocity]
+        moved = mean[:, place] + (later_s * mean[:, velocity] if velocity else 0.0)
         found.append(TracksAt(tracks["track_id"][rows].astype(np.int64), moved))
     return found
 

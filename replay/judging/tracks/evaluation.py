@@ -23,6 +23,7 @@ from replay.judging.tracks.errors import (
     CUTOFF_M,
     NONE,
     PERIOD_S,
+    VELOCITY,
     Judged,
     TracksAt,
     as_trajectories,
@@ -33,7 +34,6 @@ from replay.judging.tracks.errors import (
 
 # Of a run that is shorter than four burn-ins, tracks have a quarter to begin.
 BURN_IN_SHARE = 0.25
-VELOCITY = ("vx_mps", "vy_mps")
 
 
 class TrackBlock(NamedTuple):

@@ -101,7 +101,10 @@ def test_switches_breaks_and_what_has_no_reference():
 
 
 def test_what_is_told_later_is_predicted_for_longer():
-    """A track at 2 m/s, told every second; at 3.5 s with a delay of 1 s the one of 2 s is known."""
+    """A track at 2 m/s, told every second; at 3.5 s with a delay of 1 s the one of 2 s is known.
+
+    One that has no velocity stays where it is.
+    """
     seconds = np.arange(5)
     sizes = make_stream("/set", schemas.ESTIMATE_SIZE, seconds * 10**9, elements=np.ones(5, np.int64))
     tracks = make_stream(
@@ -118,6 +121,16 @@ def test_what_is_told_later_is_predicted_for_longer():
         [told] = tracks_at(sizes, tracks, at_ns, round(delay_s * 1e9))
         assert told.place.tolist() == [[x_m, 0.0]]
     assert len(tracks_at(sizes, tracks, at_ns, 4 * 10**9)[0].number) == 0
+    still = make_stream(
+        "/track",
+        schemas.TRACK_ESTIMATE,
+        tracks.publish_time_ns,
+        metadata=state_metadata(PLANE_MOTION[:1] + PLANE_MOTION[2:3]),
+        track_id=tracks["track_id"],
+        mean=tracks["mean"][:, [0, 2]],
+        covariance=np.zeros((5, 4)),
+    )
+    assert tracks_at(sizes, still, at_ns)[0].place.tolist() == [[9.0, 0.0]]
 
 
 def test_a_replay_is_judged_wherever_there_are_truths_and_tracks() -> None:
