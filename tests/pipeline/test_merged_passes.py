@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.output.outputs import check_outputs
 from pipeline.output.report.kinds import _forest
-from pipeline.runs.ensemble import Pass
+from pipeline.runs.ensemble import RUNS_AT_ONCE, Pass, cut_in_parts
 from recorders.errors import BadInput
 from recorders.simulators import landmarks
 from recorders.simulators.landmarks_parameters import LandmarksParameters
@@ -29,6 +29,24 @@ def test_what_became_of_messages_is_the_sum_over_passes() -> None:
     first = _pass(ekf=1, ukf=5)
     first.merge(_pass(ekf=2, iekf=7))
     assert {name: usage.used for name, usage in first.usages.items()} == {"ekf": 3, "ukf": 5, "iekf": 7}
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3, 4])
+def test_a_part_says_whether_it_is_all_the_runs(blocks: int) -> None:
+    count = blocks * RUNS_AT_ONCE
+    parts = list(cut_in_parts([SimpleNamespace()] * count, []))  # type: ignore[list-item]
+    assert [each.first_run for each in parts] == list(range(0, count, RUNS_AT_ONCE))
+    assert [each.is_all for each in parts] == [blocks == 1] * blocks
+
+
+def test_differences_are_in_percent_of_what_their_margin_is_of() -> None:
+    """A margin of .1 is 2 % of 5: a difference of .25 with .05 to either side is 4 to 6 %."""
+    row = {"first": "ekf", "second": "ukf", "quantity": "position_rmse_m", "case": "robot1"}
+    row |= {"low": 0.2, "difference": 0.25, "high": 0.3, "margin": 0.1}
+    found = _forest(pd.DataFrame([row]), 0.02)
+    assert found is not None
+    *_, ends, middle = found.panels[0].series
+    assert (ends.x[:2], middle.x) == (pytest.approx([4.0, 6.0]), pytest.approx([5.0]))
 
 
 def test_cases_are_named_where_there_are_several() -> None:

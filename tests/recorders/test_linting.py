@@ -19,6 +19,7 @@ import fuselog as fl
 from pipeline.command_line import main
 from recorders.linting.lint import lint
 from recorders.linting.magnetic import FIELD, units
+from recorders.linting.names import frames
 from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
 from recorders.recording import import_run
 
@@ -314,6 +315,16 @@ def test_clean_logs_have_no_finding() -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found(name: str) -> None:
     assert missed(name, 1) == ""
+
+
+def test_a_frames_name_says_how_its_axes_are_turned() -> None:
+    for frame, ours, mend in (
+        ("base_link_frd", "forward, left, up", "mounting_deg = [180, 0, 0]"),
+        ("odom_ned", "east, north, up", "exchange north and east"),
+    ):
+        [found] = frames(replace(clean(1)[IMU], metadata={"frame_id": frame}), {})
+        assert found.words.endswith(f"fuselog have {ours}"), frame
+        assert mend in found.mapping, frame
 
 
 def test_the_share_that_is_lost_is_the_sheets() -> None:

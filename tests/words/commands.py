@@ -1,6 +1,7 @@
 """What the commands print: one script over a few small logs, its output by command."""
 
 import io
+import json
 import logging
 import os
 import re
@@ -17,7 +18,7 @@ from pipeline.command_line import main
 from pipeline.output import terminal
 from pipeline.sensing import study as noise_study
 from pipeline.sensing.terms import Terms
-from tests.words.results import result_in_words
+from tests.words.results import chart_in_words, result_in_words
 
 ROOT = Path(__file__).parents[2]
 # In this order: what a line writes, later ones read. Of a line that is wrong its error is kept.
@@ -71,6 +72,7 @@ run landmarks --runs 2 --set duration_s=5 --out result
 report result -o page.html
 info result
 sweep landmarks --runs 2 --set duration_s=5 --over range_bearing.sigma_range_m=0.1,0.2 --out swept
+report compared diagnosed swept -o pages.html
 view run.mcap --save view.rrd
 view view.rrd --start 1
 scenarios
@@ -98,7 +100,9 @@ def texts(folder: Path) -> dict[str, str]:
             place = Path(others[others.index("--out") + 1] if "--out" in others else f"out/{command}")
             if (place / "result.json").exists():
                 found[command].append(result_in_words(place))
-        found["report"].append(_page(Path("page.html").read_text(encoding="utf-8")))
+        pages = [Path(name).read_text(encoding="utf-8") for name in ("page.html", "pages.html")]
+        found["report"].append(_page(pages[0]))
+        found["report"] += [_charts(page) for page in pages]
     return {command: "\n".join(sections) for command, sections in found.items()}
 
 
@@ -149,6 +153,12 @@ def _page(page: str) -> str:
     cells = re.sub(r"\s*</t[dh]>\s*", "  ", text)
     lines = (re.sub(r"<[^>]*>", "", line).strip() for line in cells.splitlines())
     return "\n".join(["# the page", *filter(None, map(_masked, lines))]) + "\n"
+
+
+def _charts(page: str) -> str:
+    """What a page's charts hold."""
+    data = re.findall(r"<script[^>]*application/json[^>]*>(.*?)</script>", page, re.DOTALL)
+    return "\n".join(["# charts of a page", *(chart_in_words(json.loads(each)) for each in data)]) + "\n"
 
 
 def _write_files() -> None:
