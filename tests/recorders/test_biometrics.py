@@ -72,6 +72,10 @@ def test_a_declared_distance_is_negated_for_fusion_and_stays_as_it_was_in_the_lo
     (stream,) = read(folder, ScoreMatricesParameters(matchers=matchers)).streams
     assert stream["scores"][0, 1] == 0.0
     assert comparisons_of(stream).scores[0, 1, 1] == -1.0
+    write(folder, "finger", np.eye(3))
+    declared = 'as distance, but .* are higher than those of others; declare score = "similarity"$'
+    with pytest.raises(BadInput, match=declared):
+        read(folder, ScoreMatricesParameters(matchers=matchers))
 
 
 def test_matchers_are_named_in_the_folder_where_the_parameters_name_none(folder):
