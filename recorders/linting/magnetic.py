@@ -16,6 +16,7 @@ EARTH_UT = (22.0, 67.0)
 UNITS_UT = {"G": 100.0, "T": 1e6, "mT": 1e3, "mG": 0.1, "nT": 1e-3}
 SECTORS = 12  # of a turn, each of which has to be seen
 FLAT = 0.05  # of the second spread, that the third may be of a turn about one axis
+ROUNDING = 1e-6  # of the radius: less is no offset
 HARD, SOFT = 0.2, 1.1  # the centre in radii; the ratio of the axes
 SCATTER = 0.1  # about the ellipse, of the radius
 
@@ -56,7 +57,8 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         return
     share = float(np.linalg.norm(circle.centre)) / circle.radius
     if share > HARD:
-        offsets = ", ".join(f"{-each:.4g}" for each in circle.centre)
+        is_off = np.abs(circle.centre) > ROUNDING * circle.radius
+        offsets = ", ".join(f"{each:.4g}" for each in np.where(is_off, -circle.centre, 0.0))
         axis = int(np.argmax(np.abs(circle.centre)))
         yield Finding(
             "magnetometer",

@@ -27,7 +27,8 @@ from recorders.recording import Recording
 FOLDER = Path(__file__).with_name("numbers")
 TOLERANCE = 1e-5  # what another CPU's rounding may leave
 STEP = 2.39996  # rad between the weights of rows: no two are alike
-SMALL = 1e-6  # what is far below is rounding
+SMALL = 1e-6  # what is far below counts for little
+ROUNDING = 2e-6  # of what a command finds: an angle between alike directions, in degrees, has as much
 # paths of one run: what is in a folder for the time being, beside the checkout or in that of real data
 PLACES = (gettempdir(), str(Path(__file__).parents[3]), os.environ.get("FUSELOG_DATA", "<none>"))
 OF_ONE_RUN = re.compile(f"(?:{'|'.join(map(re.escape, PLACES))})[^\\s:]*")
@@ -80,7 +81,8 @@ def hold_recording(kind: str, settings: Any, recording: Recording) -> None:
 
 
 def _short(settings: Any) -> str:
-    words = [each if isinstance(each, str) else f"{each:.4g}" for each in _leaves_of(settings)]
+    given = _leaves_of(settings)
+    words = [x if isinstance(x, str) else f"{x if abs(x) > 1e-9 else 0.0:.4g}" for x in given]
     return f"{zlib.crc32(' '.join(words).encode()):08x}"
 
 
@@ -105,19 +107,19 @@ def of_outcome(outcome: Outcome) -> Numbers:
     steady = [key for key, (_, _, of) in parted.items() if not BY_THE_CLOCK.search(of)]
     for key in steady:
         estimator = parted[key][0]
-        value = _number_of(_leaves_of([key, outcome.metrics[key]]))
+        value = _number_of(_leaves_of([key, outcome.metrics[key]]), ROUNDING)
         found[estimator] = found.get(estimator, 0.0) + value * (1.0 + 0.1 * len(key))
     for name, table in outcome.tables.items():
         rows = table[~table["estimator"].isin(SINGULAR)] if "estimator" in table else table
         kept = rows[[each for each in table.columns if not BY_THE_CLOCK.search(str(each))]]
-        found[f"table {name}"] = _total([kept.columns.tolist(), *map(_column, kept.items())])
+        found[f"table {name}"] = _total([kept.columns.tolist(), *map(_column, kept.items())], ROUNDING)
     for name, figure in outcome.figures.items():
         if isinstance(figure, Chart):
             panels = [each for each in figure.panels if not BY_THE_CLOCK.search(each.y.label)]
-            found[f"figure {name}"] = _number_of(_leaves_of([figure.title, *panels]))
+            found[f"figure {name}"] = _number_of(_leaves_of([figure.title, *panels]), ROUNDING)
     for name in ("bounds", "intervals", "alarms", "causes", "stress"):
         if (of := getattr(outcome, name)) and len(steady) == len(outcome.metrics):
-            found[name] = _number_of(_leaves_of(of))
+            found[name] = _number_of(_leaves_of(of), ROUNDING)
     return {name: value for name, value in found.items() if name not in SINGULAR}
 
 
@@ -151,17 +153,20 @@ def _leaves(value: Any) -> Iterator[float | str]:
         yield OF_ONE_RUN.sub("", str(value))
 
 
-def _total(columns: Iterable[Any]) -> float:
+def _total(columns: Iterable[Any], least: float = 0.0) -> float:
     """One number for several columns; it matters which is which."""
-    return sum((1.0 + 0.1 * place) * _number_of(each) for place, each in enumerate(columns))
+    return sum((1.0 + 0.1 * place) * _number_of(each, least) for place, each in enumerate(columns))
 
 
-def _number_of(values: Any) -> float:
-    """One number for a column of numbers, or of numbers and words: how large they are, how they vary."""
+def _number_of(values: Any, least: float = 0.0) -> float:
+    """One number for a column of numbers, or of numbers and words: how large they are, how they vary.
+
+    What is smaller than the least is taken for zero.
+    """
     if isinstance(values, list):
         values = [zlib.crc32(x.encode()) / 2.0**32 if isinstance(x, str) else x for x in values]
     flat = np.ravel(np.asarray(values, dtype=float))
-    finite = np.where(np.isfinite(flat), flat, 0.0)
+    finite = np.where(np.isfinite(flat) & (np.abs(flat) >= least), flat, 0.0)
     weighted = np.cos(STEP * np.arange(len(flat))) * finite
     size = np.log1p(np.abs(finite).sum() / SMALL / max(len(flat), 1))
     lacking = np.cos(STEP * np.flatnonzero(~np.isfinite(flat))).sum()

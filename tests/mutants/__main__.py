@@ -20,6 +20,7 @@ from pipeline.output.terminal import print_table
 from tests.mutants.drawn import DRAWN
 from tests.mutants.faults import FAULTS, Fault, faulty
 from tests.mutants.fresh import FRESH
+from tests.mutants.newest import NEWEST
 from tests.mutants.redrawn import REDRAWN
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +33,7 @@ TESTS_FAILED = 1  # pytest's exit code; others say that it could not run them
 def main() -> None:
     """Try the faults and print which were caught; exit code 1 where fewer than wanted were."""
     words = sys.argv[1:]
-    every = FAULTS + DRAWN + REDRAWN + FRESH
+    every = FAULTS + DRAWN + REDRAWN + FRESH + NEWEST
     chosen = [each for each in every if not words or any(word in " ".join(each) for word in words)]
     cores = os.cpu_count() or 1
     deadline = time.monotonic() + WHOLE_LIMIT_S

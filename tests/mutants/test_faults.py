@@ -9,6 +9,7 @@ import pytest
 from tests.mutants.drawn import DRAWN
 from tests.mutants.faults import FAULTS, Fault, faulty
 from tests.mutants.fresh import FRESH
+from tests.mutants.newest import NEWEST
 from tests.mutants.redrawn import REDRAWN
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +23,9 @@ def sound(path: str) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize(
-    "fault", FAULTS + DRAWN + REDRAWN + FRESH, ids=lambda fault: f"{fault.path}:{fault.old[:40]!r}"
+    "fault",
+    FAULTS + DRAWN + REDRAWN + FRESH + NEWEST,
+    ids=lambda fault: f"{fault.path}:{fault.old[:40]!r}",
 )
 def test_a_fault_stands_in_its_file_and_is_python(fault: Fault):
     text, syntax = sound(fault.path)
@@ -31,7 +34,7 @@ def test_a_fault_stands_in_its_file_and_is_python(fault: Fault):
 
 
 def test_faults_are_many_and_in_all_rooms():
-    for faults in (FAULTS, DRAWN, REDRAWN, FRESH):
+    for faults in (FAULTS, DRAWN, REDRAWN, FRESH, NEWEST):
         assert len(set(faults)) == len(faults) >= 60
         assert {"recorders", "replay", "pipeline"} <= {fault.path.partition("/")[0] for fault in faults}
     with pytest.raises(ValueError, match=r"README.md has 'no such text' 0 times; state it anew"):

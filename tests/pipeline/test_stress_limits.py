@@ -1,5 +1,6 @@
 """Stress of what is no plain filter: copies that fail, no covariances, random samples, what bends."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +49,9 @@ def test_a_copy_that_fails_and_a_change_that_bends() -> None:
     assert stressed.verdict("parameters") == "sensitive"
     assert stressed.tried["parameters"].largest / stressed.halves["parameters"].largest < 1.7
     assert 1.9 < stressed.ratio("parameters") < 2.1
+    half, quarter = re.findall(r"(0\.\d+) of", stressed._shrinking("parameters"))
+    assert 0.59 < float(half) < 1.0
+    assert 0.47 < float(quarter) < 0.53
     assert stressed.worst == stressed.verdict("stamps") == "discontinuous or chaotic"
     said = "stamps moved by up to 1 us: the copy fails at 4.000 s: a stamp is not one of whole"
     assert said in stressed.sentences[0]

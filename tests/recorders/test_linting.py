@@ -317,6 +317,13 @@ def test_each_fault_is_found(name: str) -> None:
     assert missed(name, 1) == ""
 
 
+def test_rows_that_are_there_twice_are_counted() -> None:
+    twice = np.r_[0:50, 49, 50:70, 69, 70:80]
+    [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.cause == "stamps"]
+    assert found.value == 2.0
+    assert "2 of its 82 messages are there twice" in found.words
+
+
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:
     for frame, ours, mend in (
         ("base_link_frd", "forward, left, up", "mounting_deg = [180, 0, 0]"),

@@ -389,6 +389,17 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     assert set(stream.log_time_ns - stream.publish_time_ns) == {1000 * LATER_US}
     assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
 
+    # of the first sample PX4 says that it was out of the gate, of the last it says nothing
+    ratios, number = "estimator_innovation_test_ratios", 23
+    subscribed.append(message("A", struct.pack("<BH", 0, number) + ratios.encode()))
+    rows += row(number, 1_000_000, np.full(len(off), 2.0, "<f4").tobytes())
+    path = tmp_path / "ratios.ulg"
+    path.write_bytes(by_hand(*subscribed, formats=(*formats, f"{ratios}:{stamps}{fields}"), last=rows))
+    streams = streams_of(path)
+    for name in ("barometer", "heading", "airspeed"):
+        accepted = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["accepted"]
+        assert accepted.tolist() == [0, 1], name
+
 
 @pytest.mark.parametrize(("count", "turned"), [(24, [0.04, 0.08, 0.12]), (23, [0.02, 0.03, 0.04])])
 def test_states_are_in_our_axes_with_the_variances_of_old_and_new_firmware(
