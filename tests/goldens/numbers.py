@@ -29,8 +29,10 @@ TOLERANCE = 1e-5  # what another CPU's rounding may leave
 STEP = 2.39996  # rad between the weights of rows: no two are alike
 SMALL = 1e-6  # what is far below counts for little
 ROUNDING = 2e-6  # of what a command finds: an angle between alike directions, in degrees, has as much
-# paths of one run: what is in a folder for the time being, beside the checkout or in that of real data
-PLACES = (gettempdir(), str(Path(__file__).parents[3]), os.environ.get("FUSELOG_DATA", "<none>"))
+# paths of one run: what is in a folder for the time being, in the checkout or in that of real data
+ROOT = Path(__file__).parents[2]
+DATA = os.environ.get("FUSELOG_DATA", str(ROOT.parent / "shared"))
+PLACES = (gettempdir(), str(ROOT), DATA)
 OF_ONE_RUN = re.compile(f"(?:{'|'.join(map(re.escape, PLACES))})[^\\s:]*")
 BY_THE_CLOCK = re.compile("cpu|step_ms|growth|factor_per|^power$|^work$", re.IGNORECASE)
 SINGULAR = ("powers", "products")  # estimators of which rounding decides, see `store.py`
