@@ -112,7 +112,8 @@ def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0)
         delay_ns: how long after its stamp a scan is told of.
     """
     names = tracks.components
-    place, velocity = ([names.index(each) for each in of if each in names] for of in (PLANE, VELOCITY))
+    moving = VELOCITY if {*VELOCITY} <= {*names} else ()
+    place, velocity = ([names.index(each) for each in of] for of in (PLANE, moving))
     ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
     found = []
     for time_ns, last in zip(
