@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench deployed faults docs docs-claims format clean
+.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench deployed faults docs docs-claims keep-numbers format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -87,6 +87,10 @@ docs: .venv/with-test
 docs-claims: .venv/with-test
 	$(BIN)/python -m tests.claims run $(NAMES)
 	$(BIN)/python -m tests.claims render
+
+# stores the numbers that tests find, and prints what changed: of all tests that hold some, or of TESTS
+keep-numbers: .venv/with-test
+	$(BIN)/pytest --keep-numbers $(or $(TESTS),tests/recorders tests/pipeline)
 
 format: .venv/with-test
 	$(BIN)/ruff format .

@@ -16,6 +16,8 @@ from hypothesis import settings
 from recorders.recording import import_run
 from replay.engine.streams.sources import MemorySource, memory_source
 
+pytest_plugins = ["tests.goldens.keeping"]
+
 # The same examples in every run: a red test is red for everyone, and stays so until it is mended.
 settings.register_profile("fuselog", deadline=None, derandomize=True)
 settings.load_profile("fuselog")

@@ -1,175 +1,216 @@
-"""Numbers that tests hold to what they were: of what is recorded, imported and found by commands.
+"""Turns recordings and outcomes into quantities: named numbers that a person can read.
 
-Each stands for a whole column: it moves where a value, a sign or the order of rows does. They are kept
-in `numbers/*/*.json` by what was asked for; finding others fails the test that finds them.
-`KEEP_FOUND=1 pytest ...` keeps what is found beside what is there.
+A column of a stream, a table or a chart becomes its mean, its standard deviation, its mean step from one
+row to the next, and its last value. Together they notice another value or sign, swapped columns, another
+order of rows, and a lost row. `tests/goldens/keeping.py` stores and compares them.
 """
 
-import json
 import os
 import re
-import zlib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
-from functools import lru_cache
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from pydantic import BaseModel
+from numpy.typing import ArrayLike, NDArray
 
-from pipeline.output.charts import Chart
-from pipeline.output.results import Outcome
+from pipeline.output.charts import Band, Chart, Panel
+from pipeline.output.results import MetricValue, Outcome, split_metric
+from recorders.log import Stream
 from recorders.recording import Recording
 
-FOLDER = Path(__file__).with_name("numbers")
-TOLERANCE = 1e-5  # what another CPU's rounding may leave
-STEP = 2.39996  # rad between the weights of rows: no two are alike
-SMALL = 1e-6  # what is far below counts for little
-ROUNDING = 2e-6  # of what a command finds: an angle between alike directions, in degrees, has as much
-# paths of one run: what is in a folder for the time being, in the checkout or in that of real data
+SPREAD = ("std", "step", "last")
+LEAST = 2e-6  # of an outcome: angles between equal directions, in degrees, have as much rounding
+MOST_CASES = 2  # of a metric that are stated one by one
+LONGEST = 60  # letters of a text that is stated
+WIDEST = 12  # components that are stated one by one
+BY_THE_CLOCK = re.compile("cpu|step_ms|growth|factor_per|^power$|^work$", re.IGNORECASE)
+SINGULAR = ("powers", "products")  # estimators that rounding decides, see `store.py`
+# paths differ between machines and runs: temporary folders, the checkout, the folder of real data
 ROOT = Path(__file__).parents[2]
 DATA = os.environ.get("FUSELOG_DATA", str(ROOT.parent / "shared"))
-PLACES = (gettempdir(), str(ROOT), DATA)
-OF_ONE_RUN = re.compile(f"(?:{'|'.join(map(re.escape, PLACES))})[^\\s:]*")
-BY_THE_CLOCK = re.compile("cpu|step_ms|growth|factor_per|^power$|^work$", re.IGNORECASE)
-SINGULAR = ("powers", "products")  # estimators of which rounding decides, see `store.py`
+PATHS = re.compile(f"(?:{'|'.join(map(re.escape, (gettempdir(), str(ROOT), DATA)))})[^\\s:]*")
+NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.]*[A-Za-z_])")
 
-Numbers = dict[str, float]
+Statistics = dict[str, float | str]
 
 
-def hold(kind: str, name: str, found: Numbers) -> None:
-    """Raise AssertionError where these numbers are none of those that are kept under the name."""
-    path = FOLDER / f"{kind}.json"
-    known = _kept(path).get(name, [])
-    if any(not _moved(found, each) for each in known):
-        return
-    if os.environ.get("KEEP_FOUND"):
-        _kept.cache_clear()  # a lane beside this one may have kept some
-        kept = _kept(path)
-        kept[name] = [*kept.get(name, []), {key: round(value, 7) for key, value in found.items()}]
-        lines = [f"{json.dumps(name)}: {json.dumps(kept[name])}" for name in sorted(kept)]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-        return
-    differing = min((_moved(found, each) for each in known), key=len, default=list(found))
-    raise AssertionError(f"{kind}, {name}: {', '.join(differing)}\nwhere it is meant: {__name__}")
+class Name(NamedTuple):
+    """Names a quantity: the topic, table, chart or estimator that it is of, and its own name."""
+
+    of: str
+    column: str = ""
 
 
-@lru_cache
-def _kept(path: Path) -> dict[str, list[Numbers]]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+Quantities = dict[Name, Statistics]
 
 
-def _moved(found: Mapping[str, float], kept: Mapping[str, float]) -> list[str]:
-    """The names under which two of them differ."""
-    return [
-        key
-        for key in sorted({*found, *kept})
-        if not abs(found.get(key, np.inf) - kept.get(key, np.inf)) <= TOLERANCE
-    ]
+def of_recording(recording: Recording) -> Quantities:
+    """Return the numbers of a recording; a column that is zero in all rows has none.
 
-
-def hold_outcome(kind: str, settings: Mapping[str, Any], outcome: Outcome) -> None:
-    """Raise AssertionError where an outcome has other numbers than under these settings it had."""
-    hold(f"outcomes/{kind}", _short(settings), of_outcome(outcome))
-
-
-def hold_recording(kind: str, settings: Any, recording: Recording) -> None:
-    """Raise AssertionError where a recording has other numbers than under these settings it had."""
-    hold(f"recordings/{kind}", _short(settings), of_recording(recording))
-
-
-def _short(settings: Any) -> str:
-    given = _leaves_of(settings)
-    words = [x if isinstance(x, str) else f"{x if abs(x) > 1e-9 else 0.0:.4g}" for x in given]
-    return f"{zlib.crc32(' '.join(words).encode()):08x}"
-
-
-def of_recording(recording: Recording) -> Numbers:
-    """A number for each topic, of its columns, its stamps and its metadata; one for all notes."""
-    found = {"notes": _number_of(_leaves_of(recording.notes))} if recording.notes else {}
+    Stamps are stated in s: the publish time since the run's time zero, others since the publish time.
+    """
+    found: Quantities = {}
+    for name, note in recording.notes.items():
+        short = name if len(name) <= LONGEST else f"{name[:LONGEST]}... ({len(name)} letters)"
+        found[Name("notes", short)] = _numbers_in(note)
     for stream in recording.streams:
-        stamps = (stream.publish_time_ns, stream.log_time_ns)
-        words = [stream.schema.full_name, *stream.columns, *_leaves_of(dict(stream.metadata))]
-        since = [each - recording.epoch_ns for each in stamps]
-        found[stream.topic] = _total([*since, *stream.columns.values(), words])
+        found.update(_of_stream(stream, recording.epoch_ns))
     return found
 
 
-def of_outcome(outcome: Outcome) -> Numbers:
-    """A number for the metrics of each estimator, for each table, chart and list of findings.
+def _of_stream(stream: Stream, epoch_ns: int) -> Quantities:
+    of = stream.topic
+    columns = {name: each for name, each in stream.columns.items() if not name.endswith("_time_ns")}
+    stamps = {name: each for name, each in stream.columns.items() if name not in columns}
+    found: Quantities = {Name(of): {"rows": float(len(stream))}}
+    for key, text in {"schema": stream.schema.full_name, **stream.metadata}.items():
+        found[Name(of, key if key == "schema" else f"metadata {key}")] = _text(text)
+    found[Name(of, "publish_time_s")] = statistics((stream.publish_time_ns - epoch_ns) / 1e9)
+    for name, values in {"log_time_ns": stream.log_time_ns, **stamps}.items():
+        after_s = (values - stream.publish_time_ns) / 1e9
+        found[Name(of, f"{name.removesuffix('_ns')}_s - publish_time_s")] = statistics(after_s)
+    for name, values in columns.items():
+        parts = {Name(of, each): statistics(x) for each, x in _components(name, values, stream)}
+        first, *others = parts.values() or [{}]
+        found.update(parts if any(each != first for each in others) else {Name(of, name): first})
+    return {name: each for name, each in found.items() if each != {"mean": 0.0}}
 
-    Without what the clock decides.
-    """
-    found: dict[str, float] = {}
-    parted = {key: key.partition(".") for key in sorted(outcome.metrics)}
-    steady = [key for key, (_, _, of) in parted.items() if not BY_THE_CLOCK.search(of)]
-    for key in steady:
-        estimator = parted[key][0]
-        value = _number_of(_leaves_of([key, outcome.metrics[key]]), ROUNDING)
-        found[estimator] = found.get(estimator, 0.0) + value * (1.0 + 0.1 * len(key))
+
+def _components(name: str, values: NDArray[Any], stream: Stream) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield a column's components with their names; a wide column stays whole."""
+    width = values.shape[1] if values.ndim == 2 else 1
+    if values.ndim == 1 or width > WIDEST:
+        yield name, values
+        return
+    names = stream.components
+    pairs = [f"{one} {other}" for one in names for other in names]
+    of_width = {len(pairs): pairs, len(names): names}
+    for place, each in enumerate(of_width.get(width, map(str, range(width)))):
+        yield f"{name} {each}", values[:, place]
+
+
+def of_outcome(outcome: Outcome) -> Quantities:
+    """Return the numbers of what a command found, without what depends on the clock or on rounding."""
+    found: Quantities = {}
+    found.update(_of_metrics("metrics", outcome.metrics))
+    for kind in ("bounds", "intervals"):
+        for end, place in (("low", 0), ("high", 1)):
+            ends = {key: each[place] for key, each in getattr(outcome, kind).items()}
+            for name, each in _of_metrics(kind, ends).items():
+                value = each.get("", each.get("mean", np.nan))
+                found[name] = {**found.get(name, {}), end: value}
     for name, table in outcome.tables.items():
-        rows = table[~table["estimator"].isin(SINGULAR)] if "estimator" in table else table
-        kept = rows[[each for each in table.columns if not BY_THE_CLOCK.search(str(each))]]
-        found[f"table {name}"] = _total([kept.columns.tolist(), *map(_column, kept.items())], ROUNDING)
+        if name != "summary":  # it repeats the metrics
+            found.update(_of_table(f"table {name}", table))
     for name, figure in outcome.figures.items():
         if isinstance(figure, Chart):
-            panels = [each for each in figure.panels if not BY_THE_CLOCK.search(each.y.label)]
-            found[f"figure {name}"] = _number_of(_leaves_of([figure.title, *panels]), ROUNDING)
-    for name in ("bounds", "intervals", "alarms", "causes", "stress"):
-        if (of := getattr(outcome, name)) and len(steady) == len(outcome.metrics):
-            found[name] = _number_of(_leaves_of(of), ROUNDING)
-    return {name: value for name, value in found.items() if name not in SINGULAR}
+            found[Name(f"figure {name}")] = {"panels": float(len(figure.panels))}
+            for place, panel in enumerate(figure.panels, 1):
+                if not BY_THE_CLOCK.search(panel.y.label):
+                    found.update(_of_panel(Name(f"figure {name}", f"panel {place}"), panel))
+    for alarm in outcome.alarms:
+        name = " ".join(filter(None, (alarm.kind, alarm.estimator, alarm.case)))
+        found[Name("alarms", name)] = {"excess": _number(alarm.excess), **_numbers_in(alarm.words)}
+    for cause in outcome.causes:
+        found[Name("causes", cause.estimator)] = _numbers_in(f"{cause.setting} {cause.words}")
+    for stress in outcome.stress:
+        moved = {key: _number(value) for key, value in stress.moved.items()}
+        found[Name("stress", stress.estimator)] = {"verdict": stress.verdict, **moved}
+    return {name: each for name, each in found.items() if not _is_uncertain(name)}
 
 
-def _column(named: tuple[Any, "pd.Series[Any]"]) -> Any:
-    values = named[1].to_numpy()
-    return values if values.dtype.kind in "fiub" else _leaves_of(values.tolist())
+def _of_metrics(kind: str, metrics: Mapping[str, MetricValue]) -> Quantities:
+    """Return an estimator's metrics; those of many cases, and lists, are stated as columns."""
+    cases: dict[Name, dict[str, MetricValue]] = defaultdict(dict)
+    for key, value in metrics.items():
+        estimator, quantity, case = split_metric(key)
+        cases[Name(f"{kind} {estimator}".strip(), quantity)][case] = value
+    found: Quantities = {}
+    for name, values in cases.items():
+        if len(values) > MOST_CASES or any(isinstance(each, list) for each in values.values()):
+            flat = np.hstack([np.asarray(each, dtype=float) for each in values.values()])
+            found[name] = {"cases": float(len(values)), **statistics(flat, LEAST)}
+        else:
+            for case, value in values.items():
+                found[Name(name.of, f"{name.column} {case}".strip())] = {"": _number(value)}
+    return found
 
 
-def _leaves_of(value: Any) -> list[float | str]:
-    """The numbers and the words that something holds, without paths."""
-    return list(_leaves(value))
+def _is_uncertain(name: Name) -> bool:
+    """Return whether a quantity depends on the clock, or on rounding alone."""
+    return bool(BY_THE_CLOCK.search(name.column)) or name.of.split(" ")[-1] in SINGULAR
 
 
-def _leaves(value: Any) -> Iterator[float | str]:
-    if isinstance(value, BaseModel):
-        value = {name: getattr(value, name) for name in type(value).model_fields}
-    elif is_dataclass(value):
-        value = {each.name: getattr(value, each.name) for each in fields(value)}
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            yield OF_ONE_RUN.sub("", str(key))
-            yield from _leaves(each)
-    elif isinstance(value, list | tuple):
-        for each in value:
-            yield from _leaves(each)
-    elif isinstance(value, np.ndarray):
-        yield from _leaves(value.ravel().tolist())
-    elif isinstance(value, int | float | np.number):
-        yield float(value)
-    else:
-        yield OF_ONE_RUN.sub("", str(value))
+def _of_table(of: str, table: pd.DataFrame) -> Quantities:
+    rows = table[~table["estimator"].isin(SINGULAR)] if "estimator" in table else table
+    columns = {Name(of, str(name)): statistics(rows[name], LEAST) for name in rows.columns}
+    return {Name(of): {"rows": float(len(rows))}, **columns}
 
 
-def _total(columns: Iterable[Any], least: float = 0.0) -> float:
-    """One number for several columns; it matters which is which."""
-    return sum((1.0 + 0.1 * place) * _number_of(each, least) for place, each in enumerate(columns))
+def _of_panel(name: Name, panel: Panel) -> Quantities:
+    """Return the numbers of a panel: of what is drawn, one after the other, and of where that is."""
+    drawn = [*panel.series, *panel.bands]
+    values = [[each.low, each.high] if isinstance(each, Band) else [each.y] for each in drawn]
+    x = statistics([each for one in drawn for each in one.x], LEAST)
+    y = statistics([each for several in values for one in several for each in one], LEAST)
+    labels = _text(" ".join(each.label for each in drawn))
+    return {
+        Name(name.of, f"{name.column}, x {panel.x.label}"): x,
+        Name(name.of, f"{name.column}, y {panel.y.label}"): labels | y,
+    }
 
 
-def _number_of(values: Any, least: float = 0.0) -> float:
-    """One number for a column of numbers, or of numbers and words: how large they are, how they vary.
+def statistics(values: ArrayLike | Iterable[Any], least: float = 0.0) -> Statistics:
+    """Return what states a column: of numbers, or else its different words.
 
-    What is smaller than the least is taken for zero.
+    Numbers that are missing or infinite are counted. A column of one value has only its mean.
+
+    Args:
+        values: of any shape; None is a missing number.
+        least: what is smaller is taken for zero.
     """
-    if isinstance(values, list):
-        values = [zlib.crc32(x.encode()) / 2.0**32 if isinstance(x, str) else x for x in values]
-    flat = np.ravel(np.asarray(values, dtype=float))
-    finite = np.where(np.isfinite(flat) & (np.abs(flat) >= least), flat, 0.0)
-    weighted = np.cos(STEP * np.arange(len(flat))) * finite
-    size = np.log1p(np.abs(finite).sum() / SMALL / max(len(flat), 1))
-    lacking = np.cos(STEP * np.flatnonzero(~np.isfinite(flat))).sum()
-    return float(size + weighted.sum() / (np.abs(weighted).sum() + 1e-3 * SMALL) + lacking + len(flat))
+    try:
+        flat = np.ravel(np.asarray(values, dtype=float))
+    except (TypeError, ValueError):
+        words = list(dict.fromkeys(PATHS.sub("", str(each)) for each in values))  # type: ignore[union-attr]
+        return {"different": float(len(words)), **_text(" ".join(words))}
+    finite = flat[np.isfinite(flat)]
+    finite = np.where(np.abs(finite) < least, 0.0, finite)
+    found: Statistics = {} if len(finite) == len(flat) else {"missing": float(len(flat) - len(finite))}
+    if len(finite):
+        found["mean"] = float(finite.mean())
+        if np.ptp(finite) > max(least, 1e-9 * np.abs(finite).max()):
+            found["std"] = float(finite.std())
+            found["step"] = float(np.abs(np.diff(finite)).mean())
+            found["last"] = float(finite[-1])
+    return found
+
+
+def _text(text: str) -> Statistics:
+    """Return a text, or the length of a long one: prose and formats are held elsewhere."""
+    text = PATHS.sub("", text)
+    return {"": text} if len(text) <= LONGEST else {"letters": float(len(text))}
+
+
+def _numbers_in(text: str) -> Statistics:
+    """Return the numbers of a sentence by their place in it; a short text without numbers as it is."""
+    numbers = NUMBER.findall(PATHS.sub("", text))
+    return {f"{place}.": float(each) for place, each in enumerate(numbers, 1)} or _text(text)
+
+
+def _number(value: float | None) -> float:
+    value = np.nan if value is None else float(value)
+    return 0.0 if abs(value) < LEAST else value
+
+
+def brief(quantities: Mapping[Name, Statistics]) -> Quantities:
+    """Return the least that states a run: means of columns; no charts, bounds or words of tables."""
+    return {
+        name: {key: value for key, value in each.items() if key not in SPREAD}
+        for name, each in quantities.items()
+        if not name.of.startswith(("figure ", "bounds ")) and "different" not in each
+    }

@@ -348,7 +348,7 @@ def index() -> str:
             "What the estimators gave when these were made: `tests/replay/test_goldens.py` replays",
             "and compares, as `fuselog check` does. `recipes.py` says what each is of, `store.py`",
             "what may differ. `python -m tests.goldens --data FOLDER [NAME ...]` makes them anew, and",
-            "this page.",
+            "this page. `numbers` has what other tests find, see `CONTRIBUTING.md`.",
             "",
             "| estimator | goldens |",
             "|---|---|",

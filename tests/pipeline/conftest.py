@@ -21,8 +21,7 @@ from pipeline.output.results import Outcome, Result, write_outcome
 from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
 from tests.conftest import without_drawing
-from tests.goldens import numbers
-from tests.words import studies
+from tests.goldens import keeping
 
 SHORT = ["--set", "duration_s=2"]
 # the modules whose outcomes become folders
@@ -37,6 +36,8 @@ WRITERS = (
     "pipeline.sensing.outcome",
     "pipeline.tuning.outcome",
 )
+# modules of tests that look at something else than numbers, by commands that others hold
+ABOUT_OTHERS = ("campaigns", "checkpoints", "faults", "json", "outputs", "report")
 
 
 class Said(NamedTuple):
@@ -77,19 +78,15 @@ def fuselog() -> Callable[..., Said]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def reviewed_names(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What a study finds in a test of studies, or tuning in any, has names that were reviewed.
-
-    What any command finds has the numbers that it had.
-    """
-    of_studies = "stud" in request.module.__name__
+def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hold what any command finds to the numbers that are kept of it; those of studies in full."""
+    in_full = "stud" in request.module.__name__
+    if request.module.__name__.rpartition("test_")[2] in ABOUT_OTHERS:
+        yield
+        return
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
-        study = settings.get("study", "")
-        if of_studies or study.startswith("tuning"):
-            studies.hold(study, list(settings.get("estimators", {})), outcome, settings)
-        else:
-            numbers.hold_outcome(name, settings, outcome)
+        keeping.hold_outcome(name, settings, outcome, in_full=in_full)
         return write_outcome(folder, name, settings, outcome)
 
     with pytest.MonkeyPatch.context() as patch:

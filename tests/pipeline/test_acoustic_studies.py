@@ -25,7 +25,7 @@ from recorders.errors import BadInput
 from recorders.recording import import_run, record_run
 from replay.engine.streams.sources import memory_source
 from replay.judging.errors.evaluation import Errors
-from tests.words import studies
+from tests.goldens import keeping
 
 
 def test_a_shot_is_where_it_was_fired_and_when_it_was_heard_last():
@@ -159,7 +159,7 @@ def test_simulated_sounds_have_errors_and_regions_by_their_noise(monkeypatch: py
     outcome = Outcome()
     table = recordings.simulate(runner, wanted, "ekf")
     recordings._judge_simulated(table, "ekf", outcome)
-    studies.hold("acoustic-recordings", ["ekf"], outcome)
+    keeping.hold_outcome("acoustic-recordings", {}, outcome)
     recorded = [{"height_m": 3.0, "snr_db": noise} for noise in (10.0, 2.5)]
     assert asked == [("sound-source", parameters, 7, 4) for parameters in recorded]
     assert list(table) == ["snr_db", "run", "error_m", "nees", "inside", "coordinates"]

@@ -30,7 +30,7 @@ from pipeline.tuning.information import information
 from pipeline.tuning.objective import in_memory
 from recorders.models.inertial import from_mounting
 from replay.engine.replaying.estimator import bind
-from tests.words import studies
+from tests.goldens import keeping
 
 A_V, A_W, B_W = TRUTH[:3]
 # the sheet's noise is that of the motion, ours that of the readings, which are its times the scales
@@ -201,7 +201,7 @@ def test_the_study_counts_what_intervals_hold_and_what_motions_leave_open(
         options=study.CalibrationOptions(seeds=(1,)), progress=lambda each, *_: each
     )
     outcome = study.study(experiment, setting)
-    studies.hold("calibration", ["ekf"], outcome)
+    keeping.hold_outcome("calibration", {}, outcome)
     found = outcome.metrics
     assert {found[f"ekf.covered.0-{name}"] for name in NAMES} == {2.0}
     assert found["ekf.spread.0-lever_x_m"] == pytest.approx(0.1 / (0.3 / 3.919928))

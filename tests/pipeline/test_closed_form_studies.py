@@ -29,7 +29,7 @@ from pipeline.studies.vehicles.cases import score_set
 from pipeline.studies.vehicles.scaling import growth_of
 from recorders.log import RunMetadata
 from replay.engine.streams.sources import MemorySource
-from tests.words import studies
+from tests.goldens import keeping
 
 # Two runs of two steps, one of which failed; errors of 5, 13 and 17 m.
 MADE: Any = SimpleNamespace(
@@ -176,7 +176,7 @@ def test_grades_are_told_by_the_largest_error_of_their_drives(monkeypatch: pytes
     setting: Any = SimpleNamespace(options=SimpleNamespace(grades={"phone": "a", "tactical": "b"}))
     experiment: Any = None
     outcome = imu_grades.study(experiment, setting)
-    studies.hold("imu-grades", ["ekf"], outcome)
+    keeping.hold_outcome("imu-grades", {}, outcome)
     metrics = outcome.metrics
     lengths_m = {"10s": np.hypot(10.0, 1.0), "20s": np.hypot(20.0, 1.0)}
     assert metrics == pytest.approx(

@@ -13,8 +13,8 @@ from pipeline.altering.sources import alter
 from pipeline.calibrating import ellipsoid_study as study
 from pipeline.calibrating.ellipsoid_fit import NAMES
 from pipeline.tuning.confidence import QUANTILE
+from tests.goldens import keeping
 from tests.pipeline.conftest import Said
-from tests.words import studies
 
 
 def readings(log: fl.MemorySource, field: str = study.FIELD) -> np.ndarray:
@@ -111,7 +111,7 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     options = study.EllipsoidOptions(seeds=(7, 17))  # none of the second block holds
     setting = SimpleNamespace(options=options, progress=lambda each, *_: each)
     outcome = study.study(SimpleNamespace(runs=3), setting)
-    studies.hold("ellipsoid", [], outcome)
+    keeping.hold_outcome("ellipsoid", {}, outcome)
     found = outcome.metrics
     for block, held in enumerate((2.0, 0.0)):
         own = [each for key, each in found.items() if key.startswith(f"ellipsoid.covered.{block}-")]

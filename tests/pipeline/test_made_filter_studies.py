@@ -19,8 +19,8 @@ from pipeline.studies.sampling.lrkf_dimension import RATED, _measure_moments
 from recorders.log import RunMetadata, make_stream, schemas
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import MemorySource
+from tests.goldens import keeping
 from tests.pipeline.test_made_studies import S, names
-from tests.words import studies
 
 
 def test_news_are_beside_intervals_of_equal_bandwidth() -> None:
@@ -132,7 +132,7 @@ def test_winds_are_judged_in_their_second_half(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(torus_real, "hash_streams", lambda _: "")
     setting: Any = names(options=torus_real.Options(grid_cells=16, block_hours=2))
     outcome = torus_real.study(names(estimators={}), setting)
-    studies.hold("torus-real", [], outcome)
+    keeping.hold_outcome("torus-real", {}, outcome)
     metrics = outcome.metrics
     assert learnt == [10, 10]
     assert metrics["persistence.error_rad.wind"] == pytest.approx(0.2)

@@ -23,8 +23,8 @@ from pipeline.sensing.preparing import Drift, find_drift, find_vibration, sample
 from pipeline.sensing.terms import Terms
 from pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
+from tests.goldens import keeping
 from tests.pipeline.conftest import Said
-from tests.words import studies
 
 STEP_S = 0.02
 ALL = Terms(1e-3, 1e-4, 4e-4, 20.0, 2e-5)
@@ -297,7 +297,7 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     experiment = SimpleNamespace(runs=4)
     setting = SimpleNamespace(options=study.NoiseOptions(seeds=(5,)), progress=lambda each, *_: each)
     outcome = study.study(experiment, setting)
-    studies.hold("sensor-noise", [], outcome)
+    keeping.hold_outcome("sensor-noise", {}, outcome)
     found = outcome.metrics
     assert found["noise.covered.0-white"] == 3.0
     assert found["noise.covered.0-walk"] == 0.0

@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.parameters import build, merge, nested
 from recorders.recording import Recorder, Recording, Simulator, record_run
 from recorders.registry import available, load
-from tests.goldens import numbers
+from tests.goldens import keeping, numbers
 from tests.pipeline.moves import bounds_of, moved, settable, switched_on, value_of
 
 SCENARIOS = {
@@ -133,7 +133,7 @@ def test_every_parameter_changes_what_is_recorded(name: str):
     case, kind, same = CASES.get(name, Case()), SCENARIOS[name].parameters, set()
     usual = base_of(name)
     as_it_is = recorded(name, usual)
-    numbers.hold(f"recordings/{name}", "as it is", numbers.of_recording(as_it_is))
+    keeping.hold(name, {}, numbers.of_recording(as_it_is), name)
     for each in settable(kind):
         base = merge(usual, case.under.get(each.name, {}))
         if each.name in case.values:
@@ -141,7 +141,8 @@ def test_every_parameter_changes_what_is_recorded(name: str):
         else:
             other = moved(kind, base, each)
         found = recorded(name, other)
-        numbers.hold(f"recordings/{name}", each.name, {"all": sum(numbers.of_recording(found).values())})
+        value = value_of(other, each.name)
+        keeping.hold(name, nested(each.name, value), numbers.of_recording(found), name)
         before = as_it_is if base == usual else recorded(name, base)
         if fingerprint(found) == fingerprint(before):
             same.add(each.name)

@@ -1,4 +1,4 @@
-"""What tests of recorders share: recordings whose numbers are kept, and derivatives without rounding."""
+"""What tests of recorders share: imports whose numbers are kept, and derivatives without rounding."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,21 +10,22 @@ from recorders import recording
 from recorders.log import RunMetadata
 from recorders.parameters import Parameters
 from recorders.recording import Blocks, Recording
-from tests.goldens import numbers
+from tests.goldens import keeping, numbers
 
 STEP = 1e-30
 
 
 @pytest.fixture(scope="module", autouse=True)
 def kept_numbers() -> Iterator[None]:
-    """What is recorded or imported has the numbers that it had."""
+    """Hold what is imported to its kept numbers; `test_scenario_options.py` holds what is simulated."""
     describe = recording._metadata
 
     def described(
         name: str, parameters: Parameters, seed: int | None, run: int, found: Recording | Blocks
     ) -> RunMetadata:
-        if isinstance(found, Recording):
-            numbers.hold_recording(name, [parameters, seed, run], found)
+        if isinstance(found, Recording) and seed is None:
+            settings = parameters.model_dump(mode="json", exclude_defaults=True)
+            keeping.hold(name, settings, numbers.of_recording(found))
         return describe(name, parameters, seed, run, found)
 
     with pytest.MonkeyPatch.context() as patch:

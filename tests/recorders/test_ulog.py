@@ -16,7 +16,7 @@ from recorders.importers.ulog.file import MAGIC, UlogFile
 from recorders.importers.ulog.importer import ULOG, UlogParameters
 from recorders.importers.ulog.settings import carried, stated_noise
 from recorders.models.orientation import rotate
-from tests.goldens import numbers
+from tests.goldens import keeping, numbers
 
 # Of the sheet, section 6: streams, rows, changed parameters, defaults, texts, dropouts and their ms.
 FILES = {
@@ -52,7 +52,7 @@ def columns_of(file: UlogFile) -> dict:
 
 def streams_of(path: Path) -> dict:
     recording = ULOG.read(path, UlogParameters()).together()
-    numbers.hold("recordings/ulog", path.name, numbers.of_recording(recording))
+    keeping.hold("ulog", {"path": path.name}, numbers.of_recording(recording))
     return {stream.topic: stream for stream in recording.streams}
 
 
