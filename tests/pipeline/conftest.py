@@ -37,7 +37,7 @@ WRITERS = (
     "pipeline.tuning.outcome",
 )
 # modules of tests that look at something else than numbers, by commands that others hold
-ABOUT_OTHERS = ("campaigns", "checkpoints", "faults", "json", "outputs", "report")
+ABOUT_OTHERS = ("bad_input", "campaigns", "checkpoints", "faults", "json", "outputs", "report")
 
 
 class Said(NamedTuple):
