@@ -157,10 +157,13 @@ def _of_panel(name: Name, panel: Panel) -> Quantities:
     values = [[each.low, each.high] if isinstance(each, Band) else [each.y] for each in drawn]
     x = statistics([each for one in drawn for each in one.x], LEAST)
     y = statistics([each for several in values for one in several for each in one], LEAST)
-    labels = _text(" ".join(each.label for each in drawn))
+    labels = [PATHS.sub("", each.label) for each in drawn]
+    words = (
+        " ".join(labels) if len(" ".join(labels)) <= LONGEST else " ... ".join([labels[0], labels[-1]])
+    )
     return {
         Name(name.of, f"{name.column}, x {panel.x.label}"): x,
-        Name(name.of, f"{name.column}, y {panel.y.label}"): labels | y,
+        Name(name.of, f"{name.column}, y {panel.y.label}"): {"": words, **y},
     }
 
 

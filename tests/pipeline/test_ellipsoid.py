@@ -111,7 +111,7 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     options = study.EllipsoidOptions(seeds=(7, 17))  # none of the second block holds
     setting = SimpleNamespace(options=options, progress=lambda each, *_: each)
     outcome = study.study(SimpleNamespace(runs=3), setting)
-    keeping.hold_outcome("ellipsoid", {}, outcome)
+    keeping.hold_outcome("study ellipsoid", {}, outcome)
     found = outcome.metrics
     for block, held in enumerate((2.0, 0.0)):
         own = [each for key, each in found.items() if key.startswith(f"ellipsoid.covered.{block}-")]
