@@ -28,6 +28,9 @@ FOLDER = Path(__file__).with_name("numbers")
 TESTS = Path(__file__).parents[1]
 RELATIVE = 1e-5  # of the largest of a column's statistics: other CPUs round differently
 ABSOLUTE = 1e-12
+DIFFERING = (
+    1e-3  # by so much a run differs from the first one: rounding must not decide which columns do
+)
 MOST_RUNS = 4  # of one command that a file has, unless it is of a part of a test
 MOST_COLUMNS = 1  # of a topic or table by which a run differs from the first one
 MOST_GROUPS = 6  # topics, tables and estimators by which it differs
@@ -41,7 +44,12 @@ Runs = dict[str, Quantities]
 Value = float | str | None
 
 
-def difference(run: str, kept: Mapping[Name, Statistics], found: Mapping[Name, Statistics]) -> list[str]:
+def difference(
+    run: str,
+    kept: Mapping[Name, Statistics],
+    found: Mapping[Name, Statistics],
+    relative: float = RELATIVE,
+) -> list[str]:
     """Return a line for each number that moved, with its kept value, its new value and the difference.
 
     >>> kept, found = {Name("/truth", "x_m"): {"mean": 1.0}}, {Name("/truth", "x_m"): {"mean": -1.0}}
@@ -56,15 +64,15 @@ def difference(run: str, kept: Mapping[Name, Statistics], found: Mapping[Name, S
         )
         for key in dict.fromkeys([*old, *new]):
             before, now = old.get(key), new.get(key)
-            if not _equal(before, now, scale if key in ("mean", *SPREAD) else 0.0):
+            if not _equal(before, now, scale if key in ("mean", *SPREAD) else 0.0, relative):
                 where = " | ".join(filter(None, (run, name.of, f"{name.column} {key}".strip())))
                 lines.append(f"{where}: {_text(before)} -> {_text(now)}{_distance(before, now)}")
     return lines
 
 
-def _equal(before: Value, now: Value, scale: float) -> bool:
+def _equal(before: Value, now: Value, scale: float, relative: float) -> bool:
     if isinstance(before, float) and isinstance(now, float) and isfinite(before):
-        return abs(now - before) <= RELATIVE * max(scale, abs(before)) + ABSOLUTE
+        return abs(now - before) <= relative * max(scale, abs(before)) + ABSOLUTE
     return str(before) == str(now)
 
 
@@ -94,7 +102,7 @@ def beside(base: Quantities, found: Quantities) -> Quantities:
     base, found = brief(base), brief(found)
     moved: dict[str, dict[Name, Statistics]] = defaultdict(dict)
     for name in {**base, **found}:
-        if difference("", {name: base.get(name, {})}, {name: found.get(name, {})}):
+        if difference("", {name: base.get(name, {})}, {name: found.get(name, {})}, DIFFERING):
             moved[name.of][name] = found.get(name, NONE)
     lost = {name.of for name in base} - {name.of for name in found}
     present = {of: columns for of, columns in moved.items() if of not in lost}
