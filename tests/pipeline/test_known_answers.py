@@ -19,6 +19,7 @@ from scipy.stats import chi2, norm, t
 from tests.pipeline import known
 from tests.pipeline.conftest import run_here
 from tests.pipeline.known import COVARIANCES, ERRORS, ROWS, SIZES, STEP_NS, STEPS
+from tests.pipeline.printed import Row, printed
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -26,7 +27,6 @@ RUNS = len(SIZES)
 MEAN_SQUARE = float(np.mean(SIZES**2))
 DEGREES = 2 * STEPS - int(known.BEARING_LACKS.sum())  # of the innovations of a run
 TIMES_S = 0.1 * ROWS
-Table = dict[str, dict[str, str]]
 
 
 def metrics() -> dict[str, float]:
@@ -93,27 +93,6 @@ def result(place: Path) -> tuple[Path, str]:
     return place / "result", said.out
 
 
-def printed(text: str, heading: str) -> Table:
-    """The table under a title, by row and heading: a cell begins, or ends, where its heading does."""
-    lines = text.splitlines()
-    at = next(row for row, line in enumerate(lines) if line.strip() == heading)
-    columns = [(each.start(), each.end(), each[0]) for each in _cells(lines[at + 1])]
-    found: Table = {}
-    for line in lines[at + 3 :]:
-        if not line.startswith(" "):
-            break
-        first, *others = _cells(line)
-        own = found.setdefault(first[0], {})
-        for cell in others:
-            [name] = [each for b, e, each in columns if cell.start() == b or cell.end() == e]
-            own[name] = cell[0]
-    return found
-
-
-def _cells(line: str) -> list[re.Match[str]]:
-    return list(re.finditer(r"\S+(?: \S+)*", line))
-
-
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -124,7 +103,7 @@ def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def test_the_terminal_has_each_number_under_its_estimator(result: tuple[Path, str]) -> None:
-    table = printed(result[1], "car")
+    table = {row.pop(""): row for row in printed(result[1], "car")}
     for key, value in metrics().items():
         label, quantity, _ = key.split(".")
         ends = bounds().get(key)
@@ -265,9 +244,9 @@ def page_of(place: Path, *names: str) -> str:
     return (place / f"{'-'.join(names)}.html").read_text(encoding="utf-8")
 
 
-def sheet(page: str) -> Table:
+def sheet(page: str) -> dict[str, Row]:
     """The first table of a page: by row, and estimator."""
-    found: Table = {}
+    found: dict[str, Row] = {}
     text = re.search(r"<table.*?</table>", page, re.DOTALL)
     assert text is not None
     columns: list[str] = []
@@ -327,7 +306,8 @@ def test_a_comparison_is_of_the_second_less_the_first_whichever_comes_first(plac
     for first, second, verdict in (("one", "two", "better"), ("two", "one", "worse")):
         said = run_here("compare", first, second, "--out", f"{first}-{second}")
         assert said.code == 0, said.err
-        table = printed(said.out, f"car {second} against {first}")
+        rows = printed(said.out, f"car {second} against {first}")
+        table = {row["metric"]: row for row in rows}
         values = {name: known.rmse(name, 0, 1) * SIZES for name in ERRORS}
         means = [float(values[name].mean()) for name in (first, second)]
         row = table["position_rmse_m"]
