@@ -4,10 +4,11 @@ What is expected follows from `known` alone, with NumPy and SciPy: no number com
 """
 
 import csv
+import io
 import json
 import re
 from collections.abc import Iterator
-from contextlib import chdir
+from contextlib import chdir, redirect_stdout
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm, t
 
+from pipeline.output.terminal import print_metrics, print_pose_errors
 from tests.pipeline import known
 from tests.pipeline.conftest import run_here
 from tests.pipeline.known import COVARIANCES, ERRORS, ROWS, SIZES, STEP_NS, STEPS
@@ -409,3 +411,42 @@ def test_the_description_of_a_log_counts_its_messages(place: Path) -> None:
         ("/estimates/two/car/rewound", "fuselog.Rewound", 2),
     ):
         assert rows[topic] == [schema, str(count), f"{count / last_s:.4g}"]
+
+
+def test_of_many_cases_there_is_the_median_under_each_estimator() -> None:
+    """Of `two` one case lacks its number: the median is of the others."""
+    found: dict[str, float | None] = {
+        f"one.rmse_m.case{number}": float(number) for number in range(1, 8)
+    }
+    found |= {f"two.rmse_m.case{number}": 10.0 * number for number in range(1, 7)}
+    found["two.rmse_m.case7"] = None
+    out = io.StringIO()
+    with redirect_stdout(out):
+        print_metrics(found, {}, details="--json")
+    [row] = printed(out.getvalue(), "one")
+    assert row == {"": "rmse_m", "one": "4 (1 to 7)", "two": "35 (10 to 60)"}
+
+
+def test_pose_errors_have_their_statistics_in_their_columns() -> None:
+    """The same names for every error, whose unit is in its row."""
+    names = ("rmse", "mean", "median", "std", "min", "max")
+    errors = (
+        "ape_translation_{}_m",
+        "ape_rotation_{}_deg",
+        "rpe_translation_{}_m",
+        "rpe_rotation_{}_deg",
+    )
+    found = {
+        error.format(name): float(10 * row + column)
+        for row, error in enumerate(errors)
+        for column, name in enumerate(names)
+    }
+    out = io.StringIO()
+    with redirect_stdout(out):
+        print_pose_errors({**found, "poses": 5.0, "rpe_pairs": 4.0})
+    rows = printed(out.getvalue(), "rmse")
+    wanted = ("APE translation (m)", "APE rotation (deg)", "RPE translation (m)", "RPE rotation (deg)")
+    for number, (row, title) in enumerate(zip(rows, wanted, strict=True)):
+        cells = {name: f"{10 * number + column:.4g}" for column, name in enumerate(names)}
+        assert row == {"": title, **cells}
+    assert out.getvalue().splitlines()[-1] == "5 poses, 4 rpe pairs"
