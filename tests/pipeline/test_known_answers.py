@@ -17,7 +17,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm, t
 
+import fuselog as fl
+from pipeline.exploring.curves import BIN_S, cases_of, ellipse
+from pipeline.exploring.verdict import numbers_of
 from pipeline.output.terminal import print_metrics, print_pose_errors
+from recorders.log import RunMetadata
+from replay.engine.streams.blocks import gather
+from replay.judging.judge import Judge
 from tests.pipeline import known
 from tests.pipeline.conftest import run_here
 from tests.pipeline.known import COVARIANCES, ERRORS, ROWS, SIZES, STEP_NS, STEPS
@@ -450,3 +456,35 @@ def test_pose_errors_have_their_statistics_in_their_columns() -> None:
         cells = {name: f"{10 * number + column:.4g}" for column, name in enumerate(names)}
         assert row == {"": title, **cells}
     assert out.getvalue().splitlines()[-1] == "5 poses, 4 rpe pairs"
+
+
+def test_the_explorer_draws_and_says_the_numbers_of_the_run() -> None:
+    """NIS in spans of time has the bounds of the components that were measured in each."""
+    size = 0.8
+    made = {each.topic: gather([each]) for each in known.estimated(size) if "/one/" in each.topic}
+    run = RunMetadata("own", epoch_ns=known.EPOCH_NS)
+    log = fl.MemorySource({each.topic: each for each in known.sensed()}, run, "own")
+    errors = [each for each in Judge([log], {}, gap_limit_s=0.2).add(made).errors if each is not None]
+    case = cases_of(made, errors, known.EPOCH_NS)["car"]
+    assert case.path is not None
+    mean = known.TRUTH + size * ERRORS["one"]
+    np.testing.assert_allclose(case.path.points, mean[:, :2])
+    np.testing.assert_allclose(case.path.time_s, TIMES_S, atol=1e-12)
+    np.testing.assert_allclose(case.sigma, np.sqrt(np.diag(COVARIANCES["one"]))[None].repeat(STEPS, 0))
+    np.testing.assert_allclose(case.covariance, COVARIANCES["one"][None, :2, :2].repeat(STEPS, 0))
+    span = np.floor(TIMES_S / BIN_S + 1e-9).astype(int)
+    degrees = np.bincount(span, np.where(known.BEARING_LACKS, 1, 2))
+    count = np.bincount(span)
+    assert case.nis is not None
+    np.testing.assert_allclose(case.nis.time_s, (np.arange(len(count)) + 0.5) * BIN_S)
+    np.testing.assert_allclose(case.nis.mean, known.NIS * count / degrees)
+    np.testing.assert_allclose(case.nis.low, chi2.ppf(0.025, degrees) / degrees)
+    np.testing.assert_allclose(case.nis.high, chi2.ppf(0.975, degrees) / degrees)
+    assert case.nees_interval == pytest.approx(chi2.ppf([0.025, 0.975], 3))
+    said = numbers_of(case)
+    assert said["error, RMS"] == (pytest.approx(size * known.rmse("one", 0, 1)), "m")
+    assert said["NEES, aim 3"] == (pytest.approx(size**2 * known.nees("one")), "")
+    assert case.log_likelihood == pytest.approx(known.LIKELIHOOD * (~known.GATED).sum())
+    outline = ellipse(np.array([1.0, 2.0]), np.array([[4.0, 1.0], [1.0, 2.0]]), 0.9) - [1.0, 2.0]
+    squared = np.einsum("ni,ij,nj->n", outline, np.linalg.inv([[4.0, 1.0], [1.0, 2.0]]), outline)
+    np.testing.assert_allclose(squared, chi2.ppf(0.9, 2))
