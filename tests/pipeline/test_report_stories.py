@@ -542,7 +542,13 @@ def test_a_comparison_is_judged_case_by_case_by_the_means_of_both_sides() -> Non
 
 @pytest.mark.parametrize(
     ("values", "looks"),
-    [({"a": 1.0, "b": 3.0}, ["best", ""]), ({"a": 3.0, "b": 1.0}, ["", "best"]), ({"a": 1.0}, ["", ""])],
+    [
+        ({"a": 1.0, "b": 3.0}, ["best", ""]),
+        ({"a": 3.0, "b": 1.0}, ["", "best"]),
+        ({"a": 1.0, "b": 1.019}, ["best", "best"]),  # within 2 %
+        ({"a": 1.021, "b": 1.0}, ["", "best"]),
+        ({"a": 1.0}, ["", ""]),
+    ],
 )
 def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[str]) -> None:
     table = MetricTable("", ["a", "b"], {"position_rmse_m": {k: Measured(v) for k, v in values.items()}})

@@ -1,6 +1,7 @@
 """Stress of what is no plain filter: copies that fail, no covariances, random samples, what bends."""
 
 import re
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.stressing.partings import partings
+from pipeline.stressing.sums import StressSums
 from pipeline.stressing.verdicts import Tried
 from recorders.errors import BadInput
 from tests.pipeline.test_stressing import EPOCH_NS, LINE, VECTOR, line
@@ -94,3 +96,19 @@ def test_without_covariances_metres_are_told() -> None:
     [parting] = partings(one, other, 0)
     tried = Tried("start", parting)
     assert (tried.far, tried.largest, tried.size) == ("at most 0.5 m", 0.0, 0.5)
+
+
+def test_what_a_change_moves_is_the_mean_over_runs_of_each_case_and_of_all() -> None:
+    """Of each metric the change that moves it most counts, whichever way that is."""
+    sums = StressSums("ekf")
+    runs = (
+        {"stamps": {("car", "rmse_m"): 0.3, ("bus", "rmse_m"): 0.1}, "ulp": {("car", "rmse_m"): -0.5}},
+        {"stamps": {("car", "rmse_m"): 0.1, ("bus", "rmse_m"): 0.3}, "ulp": {("car", "rmse_m"): -0.7}},
+    )
+    for run in runs:
+        moved = {name: {key: (by, 1) for key, by in of.items()} for name, of in run.items()}
+        said = {"harmless": (0.0, ["said"])}
+        sums.merge(StressSums("ekf", Counter({"harmless": 1}), said, moved))
+    found = sums.summary
+    assert found.moved == pytest.approx({"rmse_m": 0.6, "rmse_m.car": 0.6, "rmse_m.bus": 0.2})
+    assert found.words == ["ekf over 2 runs: harmless in 2", "said"]
