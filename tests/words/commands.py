@@ -15,8 +15,6 @@ from importlib.metadata import version
 from pathlib import Path
 from unittest.mock import patch
 
-from pipeline.api.api import write
-from pipeline.calibrating import ellipsoid_study
 from pipeline.command_line import main
 from pipeline.output import terminal
 
@@ -46,7 +44,6 @@ deploy run.mcap -e smoother:ekf -o never
 noise run.mcap
 ellipsoid car.mcap --field /body/inertial.specific_force_mps2
 ellipsoid car.mcap --field /body/inertial
-ellipsoid turned.mcap --field /imu.magnetic_field_ut --out turned
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
 check other.mcap --against ekf.golden.xz
@@ -135,8 +132,7 @@ def _page(page: str) -> Iterator[str]:
 
 
 def _write_files() -> None:
-    """Trajectories, a table, and the log of a unit that is turned, which commands of the script read."""
-    write(Path("turned.mcap"), ellipsoid_study.recorded("magnetometer", 1))
+    """Trajectories and a table that commands of the script read."""
     for name, apart in (("line.tum", 0.0), ("shifted.tum", 0.01)):
         rows = (f"{time} {time + apart * (time % 3) ** 2} {apart} 0 0 0 0 1\n" for time in range(9))
         Path(name).write_text("".join(rows), encoding="utf-8")
