@@ -18,6 +18,7 @@ import pytest
 from scipy.stats import chi2, norm, t
 
 import fuselog as fl
+from pipeline.diagnosing.consistency import nis_charts
 from pipeline.exploring.curves import BIN_S, cases_of, ellipse
 from pipeline.exploring.verdict import numbers_of
 from pipeline.output.terminal import print_metrics, print_pose_errors
@@ -488,3 +489,16 @@ def test_the_explorer_draws_and_says_the_numbers_of_the_run() -> None:
     outline = ellipse(np.array([1.0, 2.0]), np.array([[4.0, 1.0], [1.0, 2.0]]), 0.9) - [1.0, 2.0]
     squared = np.einsum("ni,ij,nj->n", outline, np.linalg.inv([[4.0, 1.0], [1.0, 2.0]]), outline)
     np.testing.assert_allclose(squared, chi2.ppf(0.9, 2))
+
+
+def test_a_diagnosis_draws_nis_per_measured_component() -> None:
+    """The mean of each sixtieth of the run in which something was measured, at its middle."""
+    stream = known.innovations()
+    [(name, drawn)] = nis_charts("one", {stream.topic: stream}, known.EPOCH_NS).items()
+    [panel] = drawn.panels
+    assert (name, panel.y.label, panel.x.label) == ("nis-car", "NIS per component", "time (s)")
+    series, aim = panel.series
+    assert series.label == "one"
+    assert series.y == pytest.approx(known.NIS / np.where(known.BEARING_LACKS, 1, 2))
+    assert np.abs(np.array(series.x) - TIMES_S).max() <= 0.51 * TIMES_S[-1] / 60
+    assert set(aim.y) == {1.0}
