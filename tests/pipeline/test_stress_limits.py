@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import fuselog as fl
 from pipeline.stressing.partings import partings
@@ -96,6 +97,35 @@ def test_without_covariances_metres_are_told() -> None:
     [parting] = partings(one, other, 0)
     tried = Tried("start", parting)
     assert (tried.far, tried.largest, tried.size) == ("at most 0.5 m", 0.0, 0.5)
+
+
+def test_estimates_part_by_metres_by_degrees_and_by_sigmas_of_the_first() -> None:
+    """3 m and 4 m are 5 m; across +-180 degrees it is 6 degrees; each sigma of the other is 10 % more.
+
+    Sigmas are 1 m, 2 m, 3 degrees and 0.5 of what has no unit: A^2 is the mean of 9, 4, 4 and 4.
+    """
+
+    def estimate(stamps_ms: list[int], mean: list[float], larger: float) -> fl.Stream:
+        sigmas = larger * np.array([1.0, 2.0, np.radians(3.0), 0.5])
+        return fl.make_stream(
+            "/estimates/own/state",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            np.array(stamps_ms) * 10**6,
+            metadata={"components": "x_m,y_m,heading_rad,scale", "kinds": "linear,linear,angle,linear"},
+            mean=[[*mean[:2], np.radians(mean[2]), mean[3]]] * len(stamps_ms),
+            covariance=[np.diag(sigmas**2).ravel()] * len(stamps_ms),
+        )
+
+    one = {"own": estimate([100, 200, 300], [1.0, 2.0, 177.0, 5.0], 1.0)}
+    other = {"own": estimate([104, 206, 296], [4.0, 6.0, -177.0, 6.0], 1.1)}
+    [parting] = partings(one, other, 5 * 10**6)
+    assert (parting.stamps_ns // 10**6).tolist() == [100, 300]
+    assert parting.metres == pytest.approx([5.0, 5.0])
+    assert parting.degrees == pytest.approx([6.0, 6.0])
+    assert parting.amplification == pytest.approx([np.sqrt((9 + 4 + 4 + 4) / 4)] * 2)
+    assert parting.spread == pytest.approx(0.1)
+    [less] = partings(one, other, 5 * 10**6, has_less=True)
+    assert less.explained == pytest.approx([np.sqrt(0.21 * chi2.isf(0.0005, 4) / 4)] * 2)
 
 
 def test_what_a_change_moves_is_the_mean_over_runs_of_each_case_and_of_all() -> None:
