@@ -172,16 +172,3 @@ def made_claims() -> Iterator[Made]:
                 made = Made(name, one, kept.metrics, numbers)
                 if made.decided(kept.metrics):
                     yield made
-
-
-def in_words() -> Iterator[str]:
-    """Claims, and what decides each: the side on which it is confirmed, of every metric that counts."""
-    for made, found in all_limits():
-        claim = made.decided(made.metrics)
-        if claim is None:
-            continue
-        yield f"{made.experiment}: {claim.claim}"
-        yield f"  paper: {claim.paper}; {claim.verdict}: {claim.ours}"
-        for limit in found:
-            with_interval = ", with an interval" if limit.width else ""
-            yield f"  {limit.moved}: {limit.below}, from {limit.at:.4g} on {limit.above}{with_interval}"

@@ -37,7 +37,16 @@ WRITERS = (
     "pipeline.tuning.outcome",
 )
 # modules of tests that look at something else than numbers, by commands that others hold
-ABOUT_OTHERS = ("bad_input", "campaigns", "checkpoints", "faults", "json", "outputs", "report")
+ABOUT_OTHERS = (
+    "bad_input",
+    "campaigns",
+    "checkpoints",
+    "faults",
+    "json",
+    "known_answers",
+    "outputs",
+    "report",
+)
 
 
 class Said(NamedTuple):

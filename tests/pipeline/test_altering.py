@@ -16,6 +16,7 @@ from pipeline.altering import alterations as put
 from pipeline.altering.sources import alter
 from pipeline.diagnosing.battery.car import car
 from recorders.log.streams import concatenate
+from recorders.models.orientation import heading
 from recorders.parameters import parse_settings
 from tests.pipeline.test_python import robot
 
@@ -89,6 +90,97 @@ def test_units_signs_axes_and_clocks_are_mended_as_people_write_them(
     faulty = put.altered(run, topic, fault, by)
     assert nis(faulty)[0] > nis(run)[2]
     assert nis(faulty, **{f"{topic}.{setting}": undoes}) == pytest.approx(nis(run), rel=1e-5)
+
+
+# Readings with two rows, 2 s apart: of every kind that can be set.
+BEGIN_NS, PLACES = 10**18, np.array([[1.0, 2.0, 3.0], [4.0, 6.0, 5.0]])
+SPREAD = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 0.2], [0.5, 0.2, 1.0]])
+TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # by a quarter, clockwise
+SWAP = np.eye(3)[[1, 0, 2]]
+
+
+def _readings() -> fl.MemorySource:
+    stamps = BEGIN_NS + np.array([0, 2 * 10**9])
+    covariances = np.tile(SPREAD.ravel(), (2, 1))
+    headings = np.array([0.3, 3.0])
+    turned = np.stack([np.cos(headings / 2), 0 * headings, 0 * headings, np.sin(headings / 2)], axis=1)
+    identifiers = {"target_id": [3, 9], "range_m": [10.0, 20.0], "bearing_rad": [0.5, -0.5]}
+    made = [
+        fl.make_stream(
+            "/fix", fl.schemas.POSITION_FIX, stamps, position_m=PLACES, covariance_m2=covariances
+        ),
+        fl.make_stream(
+            "/compass",
+            fl.schemas.ORIENTATION,
+            stamps,
+            metadata={"covariance_rad2": "0.5"},
+            quaternion=turned,
+        ),
+        fl.make_stream("/seen", fl.schemas.RANGE_BEARING, stamps, **identifiers),
+    ]
+    run = fl.record("landmarks", duration_s=1.0).run
+    return fl.MemorySource({each.topic: each for each in made}, run, "readings")
+
+
+@pytest.mark.parametrize(
+    ("what", "value", "field", "wanted"),
+    [
+        ("/fix.position_m_scale", 2, "position_m", 2.0 * PLACES),
+        ("/fix.position_x_bias", "50 cm", "position_m", PLACES - [0.5, 0.0, 0.0]),
+        ("/fix.position_y_drift", 0.25, "position_m", PLACES - [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]]),
+        ("/fix.position_axes", "yxz", "position_m", PLACES @ SWAP.T),
+        ("/fix.position_axes", "yxz", "covariance_m2", SWAP @ SPREAD @ SWAP.T),
+        ("/fix.position_turn", "90 deg", "position_m", PLACES @ TURN.T),
+        ("/fix.position_turn", "90 deg", "covariance_m2", TURN @ SPREAD @ TURN.T),
+        (
+            "/fix.position_matrix",
+            "1,2,3,0,1,0,0,0,1",
+            "position_m",
+            PLACES @ [[1, 0, 0], [2, 1, 0], [3, 0, 1]],
+        ),
+        ("/fix.origin", "1,2,3", "position_m", np.add(PLACES, [1.0, 2.0, 3.0])),
+        ("/fix.covariance_scale", 4, "covariance_m2", 4.0 * SPREAD),
+        ("/seen.range_bias", 1.5, "range_m", [8.5, 18.5]),
+        ("/seen.bearing_scale", -1, "bearing_rad", [-0.5, 0.5]),
+        ("/seen.exchanged", "3,9", "target_id", [9, 3]),
+        ("/compass.heading_bias", "0.2", "heading", [0.1, 2.8]),
+        ("/compass.heading_scale", -1, "heading", [-0.3, -3.0]),
+        ("/compass.heading_drift", 0.1, "heading", [0.3, 2.8]),
+        ("/compass.heading_convention", "north", "heading", [np.pi / 2 - 0.3, np.pi / 2 - 3.0]),
+        ("/fix.delay_s", "300 ms", "stamps", [-300_000_000, 1_700_000_000]),
+        ("/fix.clock_gain", 0.25, "stamps", [0, 1_600_000_000]),
+    ],
+)
+def test_what_is_set_undoes_its_fault_in_the_columns(
+    what: str, value: Any, field: str, wanted: Any
+) -> None:
+    """By hand, with units, and nothing else of the topic changes."""
+    topic = what.partition(".")[0]
+    before = _readings().streams[topic]
+    after = alter(_readings(), {what: value}).read([topic])[topic]
+    found = {
+        **after.columns,
+        "stamps": after.publish_time_ns - BEGIN_NS,
+        **({"heading": heading(after["quaternion"])} if "quaternion" in after.columns else {}),
+    }
+    wanted = np.reshape(np.broadcast_to(wanted, (2, 3, 3)), (2, 9)) if "covariance" in field else wanted
+    np.testing.assert_allclose(found[field], wanted, rtol=1e-9, atol=1e-9)
+    moved = {"heading": "quaternion"}.get(field, field)
+    turns = ("position_m", "covariance_m2") if "axes" in what or "turn" in what else ()
+    for name, column in before.columns.items():
+        if name not in (moved, "sensor_time_ns", *turns):
+            np.testing.assert_array_equal(after[name], column)
+
+
+def test_stated_variances_and_exchanged_topics() -> None:
+    scaled = alter(_readings(), {"/compass.covariance_scale": 4})
+    assert scaled.read(["/compass"])["/compass"].metadata["covariance_rad2"] == "2.0"
+    source = _readings()
+    other = replace(source.streams["/fix"], topic="/other")
+    both = replace(source, streams={**source.streams, "/other": put.shifted("position_m")(other, 7.0)})
+    found = alter(both, {"/fix.exchanged": "/other"}).read(["/fix", "/other"])
+    np.testing.assert_array_equal(found["/fix"]["position_m"], PLACES + 7.0)
+    np.testing.assert_array_equal(found["/other"]["position_m"], PLACES)
 
 
 @pytest.mark.paper

@@ -110,6 +110,10 @@ def test_kalibr_is_told_what_sensors_measure() -> None:
     in_sensor = np.array(told["inertial"]["T_sensor_body"]) @ [*in_body, 1.0]
     assert in_sensor == pytest.approx([*point, 1.0], abs=1e-5)
     assert np.array(told["fix"]["T_sensor_body"]) @ [1.2, 0.0, 0.0, 1.0] == pytest.approx([0, 0, 0, 1])
+    east = np.array(
+        yaml.safe_load(kalibr_yaml({"bias_heading_rad": 0.5}, []))["heading"]["T_sensor_body"]
+    ) @ [1.0, 0.0, 0.0, 1.0]
+    assert east == pytest.approx([np.cos(0.5), -np.sin(0.5), 0.0, 1.0], abs=1e-5)
     assert told["velocity"] == {"timeshift_sensor_body": -0.1}
     assert told["errors"] == {"turn_scale": 1.02}
 

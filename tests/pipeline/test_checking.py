@@ -226,3 +226,59 @@ def test_a_checksum_tells_bits_apart() -> None:
     before, after = checksums({"mean": values}), checksums({"mean": changed})
     assert np.array_equal(before[:500], after[:500])
     assert np.mean(before[500:] != after[500:]) > 0.99
+
+
+def _stream(mean: np.ndarray, covariance: np.ndarray) -> dict[str, Any]:
+    """A stream as a golden keeps it, of which all rows are kept."""
+
+    def column(values: np.ndarray) -> dict[str, Any]:
+        return {
+            "kept": values.tolist(),
+            "sum": values.sum(axis=0).tolist(),
+            "sum_of_squares": np.square(values).sum(axis=0).tolist(),
+            "missing": np.zeros(values.shape[1]).tolist(),
+        }
+
+    return {
+        "rows": len(mean),
+        "publish_times": "a",
+        "log_times": "b",
+        "metadata": {"components": "x_m,heading_rad", "kinds": "linear,angle"},
+        "columns": {"mean": column(mean), "covariance": column(covariance)},
+    }
+
+
+@pytest.mark.parametrize(
+    ("column", "entry", "by", "apart", "component"),
+    [
+        ("mean", 0, 2e-3, 1e-3, "x_m"),  # of its root mean square, which is 2
+        ("mean", 1, 2e-3, 2e-3, "heading_rad"),  # of a radian, however small the angle is
+        ("covariance", 1, 6e-3, 1e-3, "x_m and heading_rad"),  # of the product of the deviations
+        ("covariance", 3, 9e-3, 1e-3, "heading_rad"),
+        ("metric", 0, 0.5, 2.5e-3, ""),  # of the metric, which is 200
+    ],
+)
+def test_how_far_apart_a_number_is_goes_by_its_own_size(
+    column: str, entry: int, by: float, apart: float, component: str
+) -> None:
+    mean, covariance = np.tile([2.0, 0.01], (4, 1)), np.tile([4.0, 0.1, 0.1, 9.0], (4, 1))
+    metric = 200.0
+
+    def golden() -> dict[str, Any]:
+        streams = {"/estimates/ekf/state": _stream(mean, covariance)}
+        run = {"input": "same", "recorded": True, "streams": streams}
+        return {
+            "arithmetic": "here",
+            "tolerances": {},
+            "metrics": {"ekf.rmse_m": metric},
+            "runs": {"a": run},
+        }
+
+    before = golden()
+    if column == "metric":
+        metric += by
+    else:
+        {"mean": mean, "covariance": covariance}[column][2, entry] += by
+    [one] = discrepancies(before, Replayed(golden(), {"a": {}}))
+    assert one.apart == pytest.approx(apart, rel=1e-2)
+    assert (one.component, one.row) == (component, None if column == "metric" else 2)

@@ -39,6 +39,21 @@ VALUES = Values(METRICS, INTERVALS, {"runs": exactly(100)})
         ("count(by_noise[ekf, 1] > [0, 2, 3])", (2.0, 2.0, 2.0)),
         ("abs(gain[ekf, ukf] - 0.2)", (0.1, 0.0, 0.3)),
         ("deviation(by_noise[ekf, 1])", (math.sqrt(7 / 3),) * 3),
+        ("-gain[ekf, ukf]", (-0.3, -0.5, -0.1)),
+        ("abs(-gain[ekf, ukf])", (0.3, 0.1, 0.5)),
+        ("0.5 - gain[ekf, ukf] ** 2", (0.41, 0.25, 0.49)),
+        ("-2 * gain[ekf, ukf]", (-0.6, -1.0, -0.2)),
+        ("low(gain[ekf, ukf]) + high(nees[ekf, robot1])", (2.6, 2.6, 2.6)),
+        ("mean([gain[ekf, ukf], nees[ekf, robot1]])", (1.15, 0.8, 1.5)),
+        ("median(by_noise[ekf, 1])", (2.0, 2.0, 2.0)),
+        ("min(gain[ekf, ukf], 0.4)", (0.3, 0.1, 0.4)),
+        ("sum(by_noise[ekf, 1]) - len(by_noise[ekf, 1])", (4.0, 4.0, 4.0)),
+        ("sqrt(gain[ekf, ukf])", (math.sqrt(0.3), math.sqrt(0.1), math.sqrt(0.5))),
+        ("log(gain[ekf, ukf])", (math.log(0.3), math.log(0.1), math.log(0.5))),
+        ("degrees(rmse_m[ekf])", (math.degrees(0.5),) * 3),
+        ("plus_minus(rmse_m[ekf], 0.2)", (0.5, 0.3, 0.7)),
+        ("chi_square(0.95, 3)", (7.814728,) * 3),
+        ("consistent(2, 50)", (2.0, 1.484439, 2.591224)),  # chi-square of 100 degrees, over 50
     ],
 )
 def test_expressions_carry_intervals(expression: str, value: tuple[float, ...]) -> None:

@@ -21,10 +21,12 @@ from pipeline.calibrating.ellipsoid_study import recorded
 from pipeline.checking.stored import read
 from pipeline.checking.stored import write as store
 from pipeline.command_line.group import fuselog
+from pipeline.output.terminal import format_value
 from recorders.log import schemas
 from tests.pipeline.conftest import run_here
 from tests.pipeline.json_cases import CASES, POSITIVE, QUARTER, Case
 from tests.pipeline.json_of_files import leaves
+from tests.pipeline.printed import printed
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -103,9 +105,39 @@ def _write_inputs() -> None:
     store(Path("surer.golden.xz"), surer)
 
 
+# By command, which of its JSON is printed as a table, and its headings with what they are of there.
+INTERVAL = {"value": "value", "95 % from": "low", "to": "high"}
+TABLES = {
+    "compare": (
+        "differences",
+        "metric",
+        {"metric": "quantity", "aim": "aim", "ekf": "first_mean", "ukf": "second_mean"}
+        | {"difference": "difference", "95 % from": "low", "to": "high", "verdict": "verdict"}
+        | {"sure": "sure", "runs": "runs"},
+    ),
+    "diagnose": (
+        "components",
+        "component",
+        {"mean": "mean", "mean square": "mean_square", "beyond 3 sigma": "beyond_3_sigma"}
+        | {"next": "next_correlation", "white by chance": "probability_white"},
+    ),
+    "tune": ("parameters", "parameter", {"start": "start", **INTERVAL}),
+    "calibrate": ("parameters", "parameter", {"start": "start", **INTERVAL}),
+    "ellipsoid": ("parameters", "parameter", {"parameter": "parameter", **INTERVAL}),
+    "noise": ("numbers", "column", {"column": "column", "term": "term", **INTERVAL}),
+    "stress": (
+        "changes",
+        "change",
+        {"verdict": "verdict", "sigmas": "amplification", "m": "metres", "deg": "degrees"}
+        | {"growth": "growth", "for half": "halved", "part at (s)": "parted_s", "by": "topic"},
+    ),
+}
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.line)
 @pytest.mark.usefixtures("place")
 def test_what_is_printed_is_what_was_found(case: Case) -> None:
+    """By `--json`, and in tables under the headings that name it."""
     results = list[Any]()
     with ExitStack() as stack:
         if case.calls:
@@ -119,6 +151,17 @@ def test_what_is_printed_is_what_was_found(case: Case) -> None:
             stack.enter_context(patch(case.calls, keep))
         said = run_here(*case.line.split(), "--json")
     check(said.json, case.wanted(*results))
+    if case.calls and (table := TABLES.get(case.line.split()[0])):
+        with patch(case.calls, lambda *_, **__: results[0]):
+            check_table(run_here(*case.line.split()).out, said.json, *table)
+
+
+def check_table(text: str, found: Any, key: str, named: str, headings: dict[str, str]) -> None:
+    rows = printed(text, named)
+    assert len(rows) == len(found[key])
+    for row, wanted in zip(rows, found[key], strict=True):
+        for heading, name in headings.items():
+            assert row.get(heading, "") == format_value(wanted[name]), (row, heading)
 
 
 def test_every_command_that_prints_json_is_above() -> None:

@@ -163,6 +163,36 @@ def test_growth_of_a_difference_is_from_the_least_clutter_to_the_most() -> None:
     assert autoferry._last_late_ns(source) == 7
 
 
+def test_only_who_waits_for_late_scans_knows_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each way is replayed in the order of arrival, and tracks of who waits 0.5 s are judged so late."""
+    asked: list[Any] = []
+
+    def replayed(*_: Any, order: str, late: Any) -> Any:
+        asked.append((order, late.policy, late.window_ns))
+        return {}
+
+    def tabled(outputs: Any, labels: list[str], runs: Any, delay_s: float) -> pd.DataFrame:
+        return pd.DataFrame({"estimator": labels, "run": [*runs], "delay_s": delay_s})
+
+    monkeypatch.setattr(autoferry, "replay_in_memory", replayed)
+    monkeypatch.setattr(autoferry, "table_of", tabled)
+    monkeypatch.setattr(autoferry, "_farthest", lambda *given: float(given[-1]))
+    monkeypatch.setattr(autoferry, "_last_late_ns", lambda source: source + 7)
+    options = autoferry.AutoferryOptions(
+        late=("wait:0.5", "rewind:2", "drop"), late_estimators=("jpda", "not run")
+    )
+    experiment: Any = names(estimators={"jpda": {}, "gnn": {}})
+    found = autoferry._late_table(experiment, options, [1], {}, {"one": SimpleNamespace()})
+    assert asked == [
+        ("log_time", "wait", S // 2),
+        ("log_time", "rewind", 2 * S),
+        ("log_time", "drop", 0),
+    ]
+    assert found["policy"].tolist() == ["wait", "rewind", "drop"]
+    assert found["delay_s"].tolist() == [0.5, 0.0, 0.0]
+    assert found["from_in_order_m"].tolist() == [8.0] * 3
+
+
 def test_vessels_are_drawn_best_first_and_those_heard_of_late_are_counted() -> None:
     """Shares of vessels that are heard often alone; a vessel is live for 30 s, a track as well."""
     shares = {"a": [0.2, 0.9, 0.5, 0.7, 1.0], "b": [0.3, 0.1, 0.4, 0.6, 1.0]}

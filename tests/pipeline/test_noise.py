@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.sensing import study
+from pipeline.sensing import exports, study
 from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
 from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from pipeline.sensing.likelihood import Samples, likelihood
@@ -239,6 +239,42 @@ def test_the_command_writes_what_others_read(
     drawn = {name.rpartition("/")[2].replace("\\", "") for name in shown if "/curves/5/" in name}
     assert {"measured", "95 % from", "95 % to", "fitted model"} <= drawn
     assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
+
+
+def test_every_file_has_each_density_where_its_program_looks_for_it() -> None:
+    """Force and rate, white noise and walk: four numbers, and a fifth for the rate of the samples."""
+    force, rate = exports.Density(2.0, 3.0, 0.01), exports.Density(5.0, 7.0, 0.01)
+    fields = {"specific_force_mps2": force, "turn_rate_radps": rate}
+    told = exports.Densities("/imu", fields, ["doubtful"])
+    texts = {name: write(told) for name, write in exports.FILES.items()}
+    wanted = {
+        "settings.toml": {
+            "force_noise_density": 2, "force_bias_density": 3,
+            "gyro_noise_density": 5, "gyro_bias_density": 7,
+        },
+        "kalibr-imu.yaml": {
+            "update_rate": 100,
+            "accelerometer_noise_density": 2, "accelerometer_random_walk": 3,
+            "gyroscope_noise_density": 5, "gyroscope_random_walk": 7,
+        },
+        "px4.params": {
+            "EKF2_ACC_NOISE": 20, "EKF2_ACC_B_NOISE": 30, "EKF2_GYR_NOISE": 50, "EKF2_GYR_B_NOISE": 70,
+        },
+        "gtsam.cpp": {
+            "setAccelerometerCovariance": 4, "setBiasAccCovariance": 9,
+            "setGyroscopeCovariance": 25, "setBiasOmegaCovariance": 49,
+        },
+        "robot_localization.yaml": {
+            "linear_acceleration_covariance": 400, "angular_velocity_covariance": 2500,
+            "turn rate": 49, "specific force": 9,
+        },
+    }  # fmt: skip
+    assert texts.keys() == wanted.keys()
+    for name, numbers in wanted.items():
+        assert "doubtful" in texts[name].splitlines()[0]
+        for word, value in numbers.items():
+            [found] = re.findall(rf"\b{word}\W+(?:I_3x3 \* )?([\d.]+)", texts[name])
+            assert float(found) == value, (name, word)
 
 
 @pytest.mark.paper

@@ -2,15 +2,19 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import fuselog as fl
 from pipeline.runs.experiment import load_experiment, run_experiment
 from pipeline.runs.runner import Runner
-from pipeline.studies.ranging.ranging import Recording, Replayed
+from pipeline.studies.ranging import uwb_outdoor, uwb_pose
+from pipeline.studies.ranging.ranging import Recording, Replayed, mean_nis
 from pipeline.studies.ranging.uwb_outdoor import Window, printed, published_rmse, scored_truth
 from recorders.errors import BadInput
+from recorders.log import RunMetadata, Stream, make_stream
 from recorders.recording import import_run
 from replay.engine.streams.sources import memory_source
 
@@ -117,3 +121,98 @@ def test_a_path_without_a_window_is_not_held_to_errors_of_a_part_of_it(
     assert [claim.claim.partition(": ")[2] for claim in result.claims] == [
         "robust filters of ranges alone are better than the published tracks"
     ]
+
+
+SECOND = 10**9
+ROWS = np.arange(10)
+STAMPS = SECOND + SECOND * ROWS
+
+
+def _states(topic: str, schema: Any, components: str, states: np.ndarray, **columns: Any) -> Stream:
+    kinds = ",".join(
+        "quaternion" if "orientation" in each else "linear" for each in components.split(",")
+    )
+    field = "mean" if "covariance" in columns else "state"
+    metadata = {"components": components, "kinds": kinds}
+    return make_stream(topic, schema, STAMPS, metadata=metadata, **{field: states}, **columns)
+
+
+def _replayed(streams: list[Stream], **outputs: dict[str, Stream]) -> Replayed:
+    source = fl.MemorySource({each.topic: each for each in streams}, RunMetadata("made"), "made")
+    return Replayed(Recording("made", Path("made")), source, outputs)
+
+
+def _innovations(squares: np.ndarray) -> Stream:
+    return make_stream(
+        "/estimates/ekf/innovation",
+        fl.schemas.INNOVATION,
+        STAMPS,
+        target_id=0 * ROWS,
+        accepted=1 + 0 * ROWS,
+        innovation=np.ones((10, 1)),
+        covariance=np.ones((10, 1)),
+        normalised_innovation_squared=squares,
+        log_likelihood=np.zeros(10),
+    )
+
+
+def test_a_window_is_scored_from_where_a_path_enters_it_at_its_level() -> None:
+    """Of a published track the errors are in the plane, then in space."""
+    path = np.stack([ROWS, 2.0 * ROWS, np.where(ROWS == 5, 9.0, 1.0)], axis=1)
+    truth = _states("/truth", fl.schemas.TRUTH_STATE, "x_m,y_m,z_m", path)
+    off = _states(
+        "/published/LS", fl.schemas.TRUTH_STATE, "x_m,y_m,z_m", np.add(path, [3.0, -4.0, 12.0])
+    )
+    of = _replayed([truth, off])
+    window = uwb_outdoor.Window(
+        begin=uwb_outdoor.Place(x_above_m=1.5, y_below_m=9.0), end=uwb_outdoor.Place(y_above_m=13.0)
+    )
+    reference, begin_ns, end_ns = uwb_outdoor.scored_truth(of, window, 0.5)
+    assert (begin_ns, end_ns) == (STAMPS[2], STAMPS[7])
+    assert reference.time_ns.tolist() == np.delete(STAMPS, 5).tolist()
+    between = reference.at(STAMPS[[5]])  # linear where the row is at another height
+    np.testing.assert_allclose(between, [[5.0, 10.0, 1.0]])
+    plane, space = uwb_outdoor.published_rmse(of, "LS", reference, STAMPS[6], STAMPS[7])
+    assert (plane, space) == pytest.approx((5.0, 13.0))
+    assert mean_nis(_innovations(1.0 * ROWS), STAMPS[2], STAMPS[5]) == pytest.approx(3.5)
+
+
+def test_poses_err_by_direction_and_about_their_mean() -> None:
+    """The truth turns past half a turn, and its frame is turned by 90 degrees against the tags'."""
+    yaw = 2.9 + 0.1 * ROWS
+    turned = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
+    names = "x_m,y_m,z_m,orientation_w,orientation_x,orientation_y,orientation_z"
+    path = np.column_stack([ROWS, 0 * ROWS, 0 * ROWS, turned])
+    truth = _states("/truth", fl.schemas.TRUTH_STATE, names, path)
+    side = np.where(ROWS % 2, 1.0, -1.0)
+    error = np.column_stack([0.3 + 0.1 * side, np.full(10, -0.4), np.full(10, 0.2)])
+    mean = np.column_stack([ROWS, 0 * ROWS, yaw + np.pi / 2]) + error
+    mean[:, 2] = np.angle(np.exp(1j * mean[:, 2]))
+    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.25]])
+    spread = np.tile(covariance.ravel(), (10, 1))
+    state = _states(
+        "/estimates/ekf/state",
+        fl.schemas.GAUSSIAN_ESTIMATE,
+        "x_m,y_m,heading_rad",
+        mean,
+        covariance=spread,
+    )
+    of = _replayed([truth], ekf={"state": state, "innovation": _innovations(1.0 * ROWS)})
+    options = uwb_pose.UwbPoseOptions(skip_s=2.0, mounting_yaw_deg=90.0)
+    figures, stamps, errors = uwb_pose.figures_of(of, "ekf", options)
+    assert stamps.tolist() == STAMPS[2:].tolist()
+    np.testing.assert_allclose(errors, error[2:], atol=1e-9)
+    around = error[2:] - error[2:].mean(axis=0)
+    inverse = np.linalg.inv(covariance)
+    assert figures == pytest.approx(
+        {
+            "position_rmse_m": np.sqrt(0.3**2 + 0.1**2 + 0.4**2),
+            "heading_rmse_deg": np.degrees(0.2),
+            "position_spread_m": 0.1,
+            "heading_spread_deg": 0.0,
+            "nis": 5.5,
+            "nees": np.mean(np.einsum("ni,ij,nj->n", error[2:], inverse, error[2:])),
+            "nees_around_mean": np.mean(np.einsum("ni,ij,nj->n", around, inverse, around)),
+        },
+        abs=1e-9,
+    )

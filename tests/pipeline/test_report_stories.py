@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from pipeline.output.alarms import Alarm
 from pipeline.output.claims import Claim
 from pipeline.output.report import _named, kinds, sheet, sweeps
-from pipeline.output.report.evidence import findings
+from pipeline.output.report.evidence import Consistency, Spread, findings
+from pipeline.output.report.gauge import gauge
 from pipeline.output.report.kinds import how_many_differ, opening
 from pipeline.output.report.naming import title_of
 from pipeline.output.report.sheet import table_of_pairs
@@ -542,7 +543,13 @@ def test_a_comparison_is_judged_case_by_case_by_the_means_of_both_sides() -> Non
 
 @pytest.mark.parametrize(
     ("values", "looks"),
-    [({"a": 1.0, "b": 3.0}, ["best", ""]), ({"a": 3.0, "b": 1.0}, ["", "best"]), ({"a": 1.0}, ["", ""])],
+    [
+        ({"a": 1.0, "b": 3.0}, ["best", ""]),
+        ({"a": 3.0, "b": 1.0}, ["", "best"]),
+        ({"a": 1.0, "b": 1.019}, ["best", "best"]),  # within 2 %
+        ({"a": 1.021, "b": 1.0}, ["", "best"]),
+        ({"a": 1.0}, ["", ""]),
+    ],
 )
 def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[str]) -> None:
     table = MetricTable("", ["a", "b"], {"position_rmse_m": {k: Measured(v) for k, v in values.items()}})
@@ -556,3 +563,23 @@ def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[
     assert [each.small for each in row.cells] == [
         "0.50 to 4.00" if label in values else "" for label in "ab"
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "place", "state", "factor"),
+    [(2.0, 32.3, "honest", 1.0), (6.0, 64.6, "too sure", 3**0.5), (0.2, 0.0, "too careful", 0.1**0.5)],
+)
+def test_a_gauge_goes_by_the_logarithm_and_a_state_by_chance(
+    value: float, place: float, state: str, factor: float
+) -> None:
+    """The scale goes from a third of what is right to ten times it; the grey box holds 10 % at least."""
+    by = Consistency("NEES", Spread(value, 0.9 * value, 1.1 * value), 2.0, (1.9, 2.4))
+    drawn = gauge(by)
+    assert (drawn.aim, drawn.value) == pytest.approx((32.3, place), abs=0.01)
+    assert drawn.honest == pytest.approx((29.2, 37.66), abs=0.01)
+    if value == 6.0:
+        assert drawn.spread == pytest.approx((61.5, 67.4), abs=0.01)
+        assert drawn.words.startswith("NEES 6.00, 95 % 5.40 to 6.60; 2 is right")
+    assert drawn.is_beyond == (value == 0.2)
+    assert by.state == state
+    assert by.factor == pytest.approx(factor)

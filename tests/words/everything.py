@@ -1,27 +1,21 @@
-"""All texts: what commands print, with made cases of sentences; claims, models, logs and timelines."""
+"""All texts: the help, the sentences that commands print, and made cases of those they may print."""
 
 from collections.abc import Callable, Iterable, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 
-from tests.claims import limits
-from tests.words import commands
+from tests.words import commands, helps
 from tests.words.made import (
     alarms,
     claims,
     comparing,
-    defaults,
     deploying,
     diagnosing,
     edges,
     guessing,
-    modelled,
     page,
     plausibility,
-    recorded,
     reporting,
     sensing,
-    timelines,
     tuning,
 )
 
@@ -31,6 +25,7 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
     "compare": comparing.COMPARED,
     "deploy": deploying.DEPLOYED,
     "diagnose": diagnosing.DIAGNOSED,
+    "explore": page.EXPLORED,
     "import": guessing.GUESSED,
     "info": plausibility.FOUND,
     "lint": edges.EDGES,
@@ -43,17 +38,11 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
 
 
 def everything(folder: Path) -> dict[str, str]:
-    """The text of every command, and what no command prints; an empty folder takes files."""
+    """The sentences of every command, and the help of all; an empty folder takes files."""
     found = commands.texts(folder)
     for command, cases in MADE.items():
         for case in cases:
             lines = [f"# {case.__doc__}", *case()]
-            found[command] += "\n" + "\n".join(lines) + "\n"
-    found["claims"] = "\n".join(limits.in_words()) + "\n"
-    found["defaults"] = "\n".join(defaults.in_words()) + "\n"
-    found["modelled"] = "\n".join(modelled.in_words()) + "\n"
-    if find_spec("bokeh"):
-        found["page"] = "\n".join(page.in_words()) + "\n"
-    found["recorded"] = "\n".join(recorded.in_words()) + "\n"
-    found["timelines"] = "\n".join(timelines.in_words(folder)) + "\n"
+            found[command] = "\n".join([*filter(None, [found.get(command)]), *lines]) + "\n"
+    found["help"] = "\n".join(helps.in_words()) + "\n"
     return found

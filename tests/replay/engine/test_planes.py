@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from recorders.log import make_stream, schemas
 from recorders.log.planes import Origin
@@ -86,3 +87,54 @@ def test_what_is_flat_lies_in_its_own_plane() -> None:
     found = into_plane_of(flat, THERE)["state"]
     assert_allclose(found, np.transpose(into_tangent_plane(level.T, THERE))[:, :2], atol=5e-3)
     assert_allclose(found[0], into_tangent_plane(HERE, THERE)[:2], atol=1e-6)
+
+
+def test_what_has_a_direction_turns_with_the_axes() -> None:
+    """Courses are clockwise from north; both blocks of a pose's covariance turn as vectors."""
+    turn = tangent_axes(*THERE[:2]) @ tangent_axes(*HERE[:2]).T
+    course = np.array([0.3, 3.0, 0.001])
+    metadata = HERE.metadata
+    report = make_stream(
+        "/ais",
+        schemas.COURSE_FIX,
+        STAMPS,
+        metadata=metadata,
+        position_m=PLACES[:, :2],
+        course_rad=course,
+        speed_mps=course,
+    )
+    found = into_plane_of(report, THERE)["course_rad"]
+    ahead = np.column_stack([np.sin(course), np.cos(course), np.zeros(3)]) @ turn.T
+    assert_allclose(found, np.arctan2(ahead[:, 0], ahead[:, 1]) % (2.0 * np.pi), atol=1e-4)
+    assert abs(found - course).min() > 0.01
+
+    speed = make_stream(
+        "/speed",
+        schemas.VELOCITY_FIX,
+        STAMPS,
+        metadata=metadata,
+        velocity_mps=PLACES,
+        covariance_m2ps2=np.tile([1.0, 9.0, 4.0], (3, 1)),
+    )
+    moved = into_plane_of(speed, THERE)
+    assert_allclose(moved["velocity_mps"], PLACES @ turn.T)
+    assert_allclose(moved["covariance_m2ps2"][1].reshape(3, 3), turn @ np.diag([1.0, 9.0, 4.0]) @ turn.T)
+
+    spread = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    spread[0, 4] = spread[4, 0] = 0.25  # east with the turn about north
+    body = Rotation.from_euler("zyx", [0.4, 0.2, -0.1])
+    pose = make_stream(
+        "/pose",
+        schemas.POSE,
+        STAMPS,
+        metadata=metadata,
+        position_m=PLACES,
+        quaternion=np.tile(body.as_quat(scalar_first=True), (3, 1)),
+        covariance=np.tile(spread.ravel(), (3, 1)),
+    )
+    moved = into_plane_of(pose, THERE)
+    both = np.kron(np.eye(2), turn)
+    assert_allclose(moved["position_m"], over_the_earth(PLACES), atol=1e-6)
+    assert_allclose(moved["covariance"][2].reshape(6, 6), both @ spread @ both.T, atol=1e-12)
+    turned = Rotation.from_quat(moved["quaternion"][0], scalar_first=True).as_matrix()
+    assert_allclose(turned, turn @ body.as_matrix(), atol=1e-12)

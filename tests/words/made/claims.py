@@ -1,9 +1,9 @@
-"""What `run` prints of claims, and of metrics that have many cases."""
+"""What `run` prints of claims."""
 
 from collections.abc import Iterator
 
 from pipeline.output.claims import Claim
-from pipeline.output.terminal import print_claims, print_metrics, print_pose_errors
+from pipeline.output.terminal import print_claims
 from tests.words.made.printing import printed
 
 
@@ -18,25 +18,4 @@ def claims() -> Iterator[str]:
     yield from printed(print_claims, [*made, elsewhere])
 
 
-def cases() -> Iterator[str]:
-    """Six cases, each with its table, and seven, as one of medians."""
-    for count in (6, 7):
-        metrics = {f"ekf.rmse_m.case{number}": 0.1 * number for number in range(1, count + 1)}
-        metrics["ukf.rmse_m.case1"] = 0.7
-        yield from printed(print_metrics, metrics, {"ekf.rmse_m.case1": (0.05, 0.2)})
-
-
-def poses() -> Iterator[str]:
-    """Errors of a trajectory."""
-    metrics = {
-        "ape_translation_rmse_m": 1.0,
-        "ape_translation_max_m": 2.0,
-        "rpe_rotation_rmse_deg": 3.0,
-        "rpe_rotation_max_deg": 4.0,
-        "poses": 7.0,
-        "pairs_of_poses": 6.0,
-    }
-    yield from printed(print_pose_errors, metrics)
-
-
-CLAIMED = (claims, cases, poses)
+CLAIMED = (claims,)

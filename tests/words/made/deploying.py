@@ -25,7 +25,7 @@ def lost() -> Iterator[str]:
 
 
 def written() -> Iterator[str]:
-    """Of three filters the page, and what their other files say that no earlier one said."""
+    """The sentences of the pages of three filters, those of an earlier one left out."""
     memory = certificate.Memory("a compiler", 1234, 567)
     single = certificate.Single(2.5e-6, 89, None, None)
     said: set[str] = set()
@@ -41,11 +41,10 @@ def written() -> Iterator[str]:
             out, options = folder / place / "own", {"single": place == "root", "model": model}
             with patch.object(certificate, "_compiled", lambda *_, found=found: found):
                 deploy(folder / f"{log}.mcap", label, out, **options)
-            page = (out / "README.md").read_text(encoding="utf-8")
-            yield from filter(None, _DIGEST.sub("DIGEST", page).splitlines())
-            lines = dict.fromkeys(line for line in _beside(out) if line not in said)
+            page = _DIGEST.sub("DIGEST", (out / "README.md").read_text(encoding="utf-8"))
+            lines = dict.fromkeys(line for line in page.splitlines() if line and line[0] != "|")
+            yield from (line for line in lines if line not in said)
             said |= lines.keys()
-            yield from lines
 
 
 def unreplayed() -> Iterator[str]:
@@ -67,16 +66,6 @@ def unreplayed() -> Iterator[str]:
         )
         made: Any = SimpleNamespace(filtering=filtering, is_interpolated=interpolated)
         yield f"{name}: {why_no_replay(made) or 'nothing'}"
-
-
-def _beside(folder: Path) -> Iterator[str]:
-    """What the other files say to who reads them or builds with them."""
-    for path in sorted(folder.iterdir()):
-        text = _DIGEST.sub("DIGEST", path.read_text(encoding="utf-8"))
-        if path.suffix in (".txt", ".json"):
-            yield from filter(None, text.splitlines())
-        elif path.name != "fuselog_filter.h":
-            yield from (" ".join(each.split()) for each in re.findall(r"/\*.*?\*/", text, re.DOTALL))
 
 
 DEPLOYED = (lost, unreplayed, written)

@@ -1,7 +1,11 @@
-"""What is guessed of tables: a mapping whose every line has its reason, for columns of every kind."""
+"""What is guessed of tables, for columns of every kind: the lines that state a reason.
+
+A comment that stands by itself is told once.
+"""
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import wraps
 from pathlib import Path
 
 import numpy as np
@@ -93,10 +97,25 @@ def folders() -> Iterator[str]:
         _write(place / "gnss.csv", {**stamps, "lat": 48.1 + 1e-5 * ROWS, "lon": 11.5 + 1e-5 * ROWS})
         _write(place / "my truth.csv", {**stamps, "x": EAST, "y": NORTH, "heading": BEND})
         (place / "notes.csv").write_text("remark\nnone\n")
-        yield from guess([place]).replace(folder, "").splitlines()
+        yield from (f"  {line}" for line in guess([place]).replace(folder, "").splitlines())
 
 
-GUESSED = (drives, sensors, clocks, folders)
+def _reasons(case: Callable[[], Iterable[str]]) -> Callable[[], Iterator[str]]:
+    """Leave out what states no reason, and comments that were told."""
+
+    @wraps(case)
+    def told() -> Iterator[str]:
+        said: set[str] = set()
+        for line in case():
+            if line[:1] != " " or (" #" in line and line not in said):
+                yield line
+            if line.lstrip().startswith("#"):
+                said.add(line)
+
+    return told
+
+
+GUESSED = tuple(map(_reasons, (drives, sensors, clocks, folders)))
 
 
 def _guessed(file: str = "drive.csv", **columns: NDArray | list[str]) -> Iterator[str]:
@@ -106,10 +125,9 @@ def _guessed(file: str = "drive.csv", **columns: NDArray | list[str]) -> Iterato
         _write(path, columns)
         yield f"{'; '.join(columns)}:"
         try:
-            lines = guess([path]).splitlines()[4:]
+            yield from (f"  {line}" for line in guess([path]).splitlines()[4:])
         except BadInput as error:
-            lines = [str(error).replace(f"{folder}/", "")]
-        yield from (f"  {line}" for line in lines if line not in ("", "[[tables.streams]]"))
+            yield str(error).replace(f"{folder}/", "")
 
 
 def _write(path: Path, columns: Mapping[str, NDArray | list[str]]) -> None:

@@ -5,13 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.output.terminal import print_table
 from pipeline.sensing import study
 from pipeline.sensing.noise import noise
 from pipeline.sensing.terms import Terms
 from recorders.log import RunMetadata, make_stream, schemas
 from replay.engine.streams.sources import MemorySource
-from tests.words.made.printing import printed
 
 STEP_S, SIZE = 0.04, 3000
 TIMES_S = STEP_S * np.arange(SIZE)
@@ -50,7 +48,7 @@ def _said(
     lost: slice = slice(0, 0),
     taus: list[float] | None = None,
 ) -> Iterator[str]:
-    """The table and the sentences of the command."""
+    """The sentences of the command."""
     is_there = np.ones(SIZE, bool)
     is_there[lost] = False
     stream = make_stream(
@@ -63,7 +61,4 @@ def _said(
     ).take(is_there)
     source = MemorySource({stream.topic: stream}, RunMetadata("made", {}), "made")
     found = noise(source, sheet=SHEET, taus=taus or ())
-    yield from printed(
-        print_table, ("column", "term", "value", "95 % from", "to"), found.table.to_numpy()
-    )
     yield from (f"  {note}" for note in found.notes)
