@@ -30,11 +30,10 @@ test-fast: .venv/with-test
 	$(MAKE) -j3 fast-replay-lane fast-rooms-lane lint
 
 fast-rooms-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/mutants tests/pipeline
+	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/pipeline
 
 fast-replay-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/mutants \
-		--ignore=tests/pipeline
+	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
 	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py \
@@ -51,7 +50,7 @@ pipeline-lane: .venv/with-test
 		--ignore-glob='*test_command_*.py'
 
 rooms-lane: .venv/with-test
-	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
+	$(BIN)/pytest tests/claims tests/docs tests/house tests/recorders tests/words \
 		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py tests/pipeline/test_command_*.py
 
 # what no test runs, by lines and branches; kernels are machine code, of which no line is seen
@@ -67,8 +66,9 @@ lint: .venv/with-test
 wheel: .venv/with-test
 	$(BIN)/python -m build --outdir dist
 
-mutants: .venv/with-test
-	$(BIN)/python -m tests.mutants
+# mutation testing by cosmic-ray, of changed lines or ON=replay/inference; see tests/mutation.py
+mutants: .venv/with-mutation
+	ON="$(ON)" TESTS="$(TESTS)" COUNT="$(or $(COUNT),100)" $(BIN)/python -m tests.mutation
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
@@ -104,6 +104,10 @@ clean:
 	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[docs,test]'
 	@touch .venv/with-fuselog
+	@touch $@
+
+.venv/with-mutation: .venv/with-test
+	$(INSTALL) --editable '.[mutation]'
 	@touch $@
 
 .venv/with-bench: .venv/with-fuselog
