@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench deployed faults docs docs-claims keep-numbers format clean
+.PHONY: demo test test-fast all-tests fast-tests coverage lint wheel mutants bench deployed faults docs docs-claims keep-numbers format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -21,38 +21,19 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-# all tests, in four lanes of like length, and the linters, side by side; what is about one family is in
-# one lane, so that what its kernels share is compiled once: studies are with the estimators
+# all tests and the linters, side by side. A file of tests stays with one process for each core, so that what
+# its fixtures make is made once; kernels are kept on disk, and compiled by whoever comes first
 test: .venv/with-test
-	$(MAKE) -j5 pipeline-lane estimators-lane inference-lane rooms-lane lint
+	$(MAKE) -j2 all-tests lint
 
 test-fast: .venv/with-test
-	$(MAKE) -j3 fast-replay-lane fast-rooms-lane lint
+	$(MAKE) -j2 fast-tests lint
 
-fast-rooms-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/mutants tests/pipeline
+all-tests: .venv/with-test
+	$(BIN)/pytest -n logical --dist loadfile
 
-fast-replay-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/mutants \
-		--ignore=tests/pipeline
-
-estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py \
-		tests/pipeline/test_deploying.py
-
-inference-lane: .venv/with-test
-	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py tests/pipeline/test_campaigns.py \
-		--ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
-
-pipeline-lane: .venv/with-test
-	$(BIN)/pytest tests/pipeline --ignore-glob='*stud*.py' --ignore=tests/pipeline/test_faults.py \
-		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py \
-		--ignore=tests/pipeline/test_campaigns.py --ignore=tests/pipeline/test_deploying.py \
-		--ignore-glob='*test_command_*.py'
-
-rooms-lane: .venv/with-test
-	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
-		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py tests/pipeline/test_command_*.py
+fast-tests: .venv/with-test
+	$(BIN)/pytest -n logical --dist loadfile -m "not paper"
 
 # what no test runs, by lines and branches; kernels are machine code, of which no line is seen
 coverage: .venv/with-test
@@ -67,8 +48,9 @@ lint: .venv/with-test
 wheel: .venv/with-test
 	$(BIN)/python -m build --outdir dist
 
-mutants: .venv/with-test
-	$(BIN)/python -m tests.mutants
+# mutation testing by cosmic-ray, of changed lines or ON=replay/inference; see tests/mutation.py
+mutants: .venv/with-mutation
+	ON="$(ON)" TESTS="$(TESTS)" COUNT="$(or $(COUNT),100)" $(BIN)/python -m tests.mutation
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
@@ -108,6 +90,10 @@ clean:
 	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[docs,test]'
 	@touch .venv/with-fuselog
+	@touch $@
+
+.venv/with-mutation: .venv/with-test
+	$(INSTALL) --editable '.[mutation]'
 	@touch $@
 
 .venv/with-bench: .venv/with-fuselog

@@ -159,7 +159,9 @@ def prepare() -> None:
             )
         ],
     )
-    write_log("turned.mcap", [*recorded("magnetometer", 1).streams.values()])
+    # every tenth reading: a search over all takes most of the audit's time
+    turned = [each.take(slice(None, None, 10)) for each in recorded("magnetometer", 1).streams.values()]
+    write_log("turned.mcap", turned)
     Path("dead.toml").write_text(EXPERIMENT)
     Path("settings.toml").write_text("")
     Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))

@@ -41,6 +41,7 @@ def _other_origin(_: Any, time: Any) -> Any:
     return np.full_like(time, 0.65), np.full_like(time, -0.3)
 
 
+@pytest.mark.paper
 def test_no_alarm_where_all_is_well(log: MemorySource) -> None:
     assert not replay(log, ["ekf", "ukf", "smoother:ekf", "smoother:iterated"]).alarms
 

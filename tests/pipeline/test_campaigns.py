@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,7 +18,7 @@ import pytest
 import fuselog as fl
 from pipeline.command_line import main
 from pipeline.output.results import TIMINGS
-from pipeline.runs import campaigns
+from pipeline.runs import campaigns, executors
 from pipeline.runs.checkpoints import checkpoints_of
 from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, version_of_code
 from pipeline.runs.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
@@ -428,14 +428,14 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
 
 
 @pytest.mark.paper
-def test_dask_workers_give_the_same_bytes(place, files):
-    """Of a cluster of its own, and of one that is there, whose worker shares no files with it."""
-    distributed = pytest.importorskip("distributed")
-    assert run(place, pool_for(None, "local:1", RUNS)) == files
-    shutil.rmtree(place)
-    loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:
+def test_dask_workers_give_the_same_bytes(place, files, monkeypatch):
+    """Of a cluster that is there, whose worker may share no files, and of the same one as `local:1`."""
+    pytest.importorskip("distributed")
+    with executors._local_cluster("local:1") as cluster:
         assert run(place, pool_for(None, cluster.scheduler_address, RUNS)) == files
+        shutil.rmtree(place)
+        monkeypatch.setattr(executors, "_local_cluster", lambda _: nullcontext(cluster))
+        assert run(place, pool_for(None, "local:1", RUNS)) == files
 
 
 def test_cells_of_a_library_that_was_compiled_again_are_not_used(tmp_path: Path) -> None:

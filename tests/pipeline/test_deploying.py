@@ -55,7 +55,9 @@ def test_estimates_are_equal_to_the_last_bit(
 ) -> None:
     """By one compiler, or all of them with sanitizers; `make deployed` has every model by all."""
     options: dict[str, Any] = {"model": "robot"} if scenario == "landmarks" else {}
-    log = recorded(tmp_path, scenario, **({"duration_s": 10.0} if scenario == "landmarks" else {}))
+    # two sensors that state different sigmas under one name
+    robot = {"duration_s": 10.0, "range": {"rate_hz": 2.0, "sigma_range_m": 0.5}}
+    log = recorded(tmp_path, scenario, **(robot if scenario == "landmarks" else {}))
     folder = fl.deploy(log, label, tmp_path / "filter_c", **options)
     assert (furthest_of_all(folder) if by_all else furthest(compiled(folder))) == 0.0
     if sys.platform == "win32":

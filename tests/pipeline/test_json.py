@@ -134,6 +134,7 @@ TABLES = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.line)
 @pytest.mark.usefixtures("place")
 def test_what_is_printed_is_what_was_found(case: Case) -> None:

@@ -43,6 +43,7 @@ def replayed(fuselog: Fuselog, out: str, *options: str) -> tuple[Streams, str]:
     return read_streams(found, list(found.topics)), said.out + said.err
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("log")
 def test_going_back_ends_where_the_replay_in_order_does(fuselog: Fuselog) -> None:
     """With a control that is late too, and messages of before the prior."""

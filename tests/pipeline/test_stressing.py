@@ -280,6 +280,7 @@ WITHOUT_FIXES = {  # x at 5, 10, 20, 30 and 60 s
 }
 
 
+@pytest.mark.paper
 def test_heading_without_fixes() -> None:
     done = fl.replay(drive_of(0, 60), {name: each for name, (each, _) in WITHOUT_FIXES.items()})
     for name, (_, at) in WITHOUT_FIXES.items():
@@ -306,6 +307,7 @@ class Expected(NamedTuple):
     by_start: float
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("settings", "compass", "expected"),
     [

@@ -130,6 +130,7 @@ def test_density_is_finite_where_it_is_narrow():
     np.testing.assert_allclose(wrapped_normal.density(narrow, x), expected, rtol=1e-9)
 
 
+@pytest.mark.paper
 @settings(deadline=None, max_examples=15)
 @given(spreads(-1.5, 1.0), spreads(-1.5, 1.0))
 def test_product_is_that_of_the_densities(first, second):

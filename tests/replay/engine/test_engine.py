@@ -92,6 +92,7 @@ def test_an_ensemble_is_its_runs_alone(
     assert np.all(np.diff(poses.offsets) > 50)
 
 
+@pytest.mark.paper
 def test_what_an_ensemble_keeps_changes_no_replay():
     """Replayed again, by either clock, with other settings between, and after it went to a worker."""
     ensemble = Ensemble([record(0, **LATE)])

@@ -279,6 +279,7 @@ def tracked(run: int, mean: Floats, covariance: Floats, noise: Floats, squared: 
         squared[run] += update(mean[run], covariance[run], difference, rows, noise, memory)
 
 
+@pytest.mark.paper
 def test_small_matrices_compile() -> None:
     compiled, plain = (
         (np.ones((2, 2)), np.stack([np.eye(2)] * 2), 0.5 * np.eye(2), np.zeros(2)) for _ in range(2)

@@ -55,6 +55,7 @@ def test_three_estimates(name, weights, quantity, value):
     assert quantity(fused.covariance) == pytest.approx(value, rel=1e-4)
 
 
+@pytest.mark.paper
 @given(st.integers(0, 2**32), st.integers(2, 5), st.sampled_from(["ci-trace", "ci-determinant"]))
 @settings(max_examples=25, deadline=None)
 def test_the_certificate_bounds_what_other_weights_gain(seed, count, name):

@@ -197,6 +197,7 @@ CASES = [
 ]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("scenario", "name"), CASES)
 def test_a_run_alone_and_in_an_ensemble_gives_the_same_bytes(scenario, name):
     """Also for a randomised sampling, whose draws may depend on the run alone."""

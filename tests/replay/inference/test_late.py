@@ -193,6 +193,7 @@ def summary(outputs: dict[str, Ragged]) -> tuple[Floats, float, float, int]:
     return states["mean"][-1], np.trace(covariance), likelihood, len(outputs.get("skipped", ()))
 
 
+@pytest.mark.paper
 def test_the_sheets_numbers() -> None:
     """The data themselves, what is dropped, and the estimates at the arrivals."""
     stamp, _, values, _, delay = messages()

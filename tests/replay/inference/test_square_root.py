@@ -44,6 +44,7 @@ def assert_equal(found: Any, wanted: Any) -> None:
             assert_allclose(*(each / scale for each in columns), rtol=0, atol=EQUAL, err_msg=name)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("scenario", "values", "label"),
     [
@@ -203,6 +204,7 @@ def apart(state: Any, means: Floats, covariances: Floats) -> tuple[float, float]
     return float((np.abs(state["mean"][: len(means)] - means) / sigma).max()), float(off.max())
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 @pytest.mark.parametrize("method", ["", "imm", "smoother"])
 def test_they_hold_where_covariances_break(method: str, name: str) -> None:
