@@ -72,7 +72,7 @@ docs-claims: .venv/with-test
 
 # stores the numbers that tests find, and prints what changed: of all tests that hold some, or of TESTS
 keep-numbers: .venv/with-test
-	$(BIN)/pytest --keep-numbers $(or $(TESTS),tests/recorders tests/pipeline)
+	$(BIN)/pytest -n logical --dist loadfile --keep-numbers $(or $(TESTS),tests/recorders tests/pipeline)
 
 format: .venv/with-test
 	$(BIN)/ruff format .

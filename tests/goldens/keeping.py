@@ -38,6 +38,7 @@ MOST_LINES = 20  # of a message
 MOST_LETTERS = 100  # of the settings in a run's name
 SETTINGS = ("seed", "runs", "record", "import", "estimators", "alterations", "options")
 NONE: Statistics = {"": "none"}
+WORKER_LINES = "lines of kept numbers"
 STATISTIC = re.compile(r'(?:([^\s"]+) )?("(?:[^"\\]|\\.)*"|[^\s",]+)(?:, |$)')
 
 Runs = dict[str, Quantities]
@@ -385,8 +386,16 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         path.write_text(written(new), encoding="utf-8", newline="\n")
         if not new:
             path.unlink()
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput[WORKER_LINES] = SESSION.lines
     if SESSION.lines and not SESSION.keeps and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take over what a process of pytest-xdist found: it had whole modules (`--dist loadfile`)."""
+    SESSION.lines += getattr(node, "workeroutput", {}).get(WORKER_LINES, [])
 
 
 def changes(old: Runs, new: Runs) -> list[str]:
