@@ -18,6 +18,7 @@ import click
 
 from pipeline.command_line.group import fuselog
 from recorders.errors import BadInput, printable
+from recorders.processes import refuse_settings_here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals():
+            refuse_settings_here()
             code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)
             print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
