@@ -197,9 +197,10 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     looks = [_chart("", begun.chart)] if begun.chart else []
     order = [card.estimator for card in begun.story.cards] or labels
     looks += _first_run(folder, order, begun.found, viewer=viewer)
-    looks += [each for name in SCENES for each in figures if each.name == name]
-    figures = [each for each in figures if each.name not in SCENES]
-    if "sweep" in result.settings or not looks or looks[-1].name == "tracks":
+    if result.made_by == "compare":
+        looks += [each for name in SCENES for each in figures if each.name == name]
+        figures = [each for each in figures if each.name not in SCENES]
+    if result.made_by == "sweep" or not looks or looks[-1].name == "tracks":
         looks, figures = [*looks, *figures[:2]], figures[2:]
     over_time = [each for each in figures if each.name.startswith("errors")][:1]
     nis = nis_chart(folder, [label for label in labels if label in begun.found.labels])
