@@ -1,7 +1,7 @@
 """Shows the page to this machine alone: a server on the loopback interface, its address a secret.
 
-Whoever does not know the token in the address is refused, also by the WebSocket, which moreover takes
-connections of the page's own origin only. When the last page is closed the server ends.
+Whoever does not know the token in the address is refused, and so is a request by another host name or
+from another origin; the WebSocket needs the page's own. When the last page is closed the server ends.
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from tornado.ioloop import IOLoop
 
+from pipeline.exploring.guarding import guard, quiet
 from pipeline.exploring.page import Page
 from pipeline.exploring.session import Session
 from pipeline.exploring.widgets import NAME_SLIDERS
@@ -92,12 +93,14 @@ class Explorer:
         origin = f"{LOOPBACK}:{server.port}"
         server._tornado.websocket_origins.clear()
         server._tornado.websocket_origins.add(origin)
+        guard(server._tornado, origin, f"/{self._token}")
         self.url = f"http://{origin}/{self._token}/"
         self._stop = lambda: loop.add_callback(loop.stop)
         server.start()
         self._is_up.set()
         try:
-            loop.start()
+            with quiet(self._token):
+                loop.start()
         finally:
             for page in self._pages.values():
                 page.end()
