@@ -173,7 +173,22 @@ def test_processes_are_started_in_known_places() -> None:
         ("replay/foreign/processes/isolation.py", "start_module"),
         ("replay/foreign/processes/orphans.py", "start_module"),
         ("replay/foreign/processes/process.py", "Popen"),  # a program that the user names
+        ("replay/engine/compiling/trial.py", "start_module"),
         ("replay/timeline/viewer.py", "start_module"),
     }
     python = {path.as_posix() for path in PATHS if "sys.executable" in text_of(path)}
     assert python == {"recorders/processes.py"}
+
+
+def test_environment_variables_are_read_in_one_place() -> None:
+    """Or handed on to a process; the text of `native.py` is in the key of every kernel, and stays."""
+    reads = {path.as_posix() for path in PATHS if re.search(r"\bos\.(environ|getenv)", text_of(path))}
+    assert reads == {
+        "fuselog/testing.py",
+        "pipeline/output/terminal.py",
+        "recorders/environment.py",
+        "recorders/processes.py",
+        "replay/engine/compiling/compile.py",
+        "replay/engine/compiling/kernels/native.py",
+        "replay/timeline/viewer.py",
+    }

@@ -642,3 +642,27 @@ def test_parameters_that_a_log_states_are_shown_with_their_channel(
     model = fuselog("models", "robot").out
     assert re.search(r"^ sigma_range_m +from the log ", model, re.MULTILINE)
     assert re.search(r"^ inflate_nis +number", model, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        (
+            "NUMBA_CPU_NAME",
+            "bogus",
+            "LLVM cannot compile for this ('bogus' is not a recognized processor",
+        ),
+        ("NUMBA_CPU_FEATURES", "+bogus", "LLVM cannot compile for this ("),
+        ("NUMBA_NUM_THREADS", "0", "expected a number of cores, from 1 on"),
+        ("SOURCE_DATE_EPOCH", "x", "expected whole seconds since 1970"),
+        ("FUSELOG_UNCOMPILED", "yes", "expected 1"),
+    ],
+)
+def test_an_environment_variable_that_cannot_be_is_named(
+    name: str, value: str, expected: str, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    said = fuselog("metrics")
+    assert said.code == 2
+    assert said.err.startswith(f"fuselog: {name}={value}: {expected}")
+    assert said.err.count("\n") == 1
