@@ -605,6 +605,16 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
 
 
 @pytest.mark.usefixtures("here")
+def test_the_run_that_a_result_shows_is_saved(world: Path, fuselog: Fuselog) -> None:
+    result = world / "result"
+    said = fuselog("view", str(result), "--save", "shown.rrd")
+    assert (said.code, said.err) == (0, "")
+    assert Path("shown.rrd").read_bytes() == (result / "timeline.rrd").read_bytes()
+    refused = fuselog("view", str(result), "--save", "shown.rrd", "--start", "1")
+    assert (refused.code, "--start, --end, --focus and --connect need a log" in refused.err) == (2, True)
+
+
+@pytest.mark.usefixtures("here")
 def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> None:
     """Defaults too, and those that were given."""
     log = str(world / "log.mcap")

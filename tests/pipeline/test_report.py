@@ -618,3 +618,19 @@ def test_an_experiment_is_not_taken_for_a_command_by_its_name_or_tables(tmp_path
         write_outcome(folder, name, {"estimators": {"ekf": {}}}, outcome)
         write_report([folder], folder / "report.html")
         assert ("is likeliest 2 m" in (folder / "report.html").read_text()) == (kind == "tune")
+
+
+def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:
+    """Wherever they stand: in a title, a text, a label, a claim, a table."""
+    bad = "a\x9b2J\x1b[2J\x07\u202e\u2028b"
+    outcome = Outcome(
+        metrics={f"{bad}.position_rmse_m": 1.0, f"{bad}.nees": 1.0},
+        tables={"names": pd.DataFrame({bad: [bad]})},
+        claims=[Claim(claim=bad, paper=bad, ours=bad, verdict="confirmed")],
+    )
+    settings = {"title": bad, "text": f"# {bad}", "estimators": {bad: {}}, "notes": [bad]}
+    write_outcome(tmp_path, bad.replace("\x1b", ""), settings, outcome)
+    write_report([tmp_path], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert {each for each in page if not each.isprintable()} <= {*"\n\t\u00a0\u2009\u202f"}
+    assert "<title>a\\x9b2J\\x1b[2J\\x07\\u202e\\u2028b: fuselog report</title>" in page

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from unicodedata import category
 from urllib.parse import unquote
 
 import pandas as pd
@@ -36,7 +37,7 @@ from pipeline.output.results import TIMINGS, Result, read_result, read_table, sp
 from pipeline.output.terminal import format_value
 from pipeline.output.words import QUANTITIES, TRACKING, label_of, quantity
 from recorders.atomic import whole_file
-from recorders.errors import BadInput
+from recorders.errors import BadInput, printable
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -113,6 +114,7 @@ def write_report(
     environment = Environment(
         loader=PackageLoader("pipeline.output.report", "."),
         autoescape=select_autoescape(),
+        finalize=_visible,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -144,6 +146,16 @@ def is_report(page: Path) -> bool:
 def _signed(page: bytes) -> bytes:
     """Sign the page with its own SHA-256 at its end."""
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
+
+
+def _visible(value: object) -> object:
+    """Show control characters of a text by their numbers, in all that the page is made of."""
+    if not isinstance(value, str) or value.isprintable():
+        return value
+    shown = "".join(
+        each if each in "\n\t" or category(each) == "Zs" else printable(each) for each in value
+    )
+    return Markup(shown) if isinstance(value, Markup) else shown
 
 
 def _asset(name: str) -> str:
