@@ -8,7 +8,7 @@ w, x, y, z, and more that is no part of the pose.
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -87,7 +87,15 @@ class _Layout(NamedTuple):
 
 def _seconds_ns(text: str) -> int:
     """Read a time exactly to the nanosecond, where a double is to a quarter of a microsecond."""
-    return round(Decimal(text).scaleb(9))
+    return round(_exact(text).scaleb(9))
+
+
+def _exact(text: str) -> Decimal:
+    """Read a number that is finite as a double; with an exponent beyond Decimal's, that is zero."""
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return Decimal(0)
 
 
 LAYOUTS: dict[Format, _Layout] = {
@@ -98,7 +106,7 @@ LAYOUTS: dict[Format, _Layout] = {
         8,
         np.inf,
         [1, 2, 3],
-        lambda text: int(Decimal(text)),
+        lambda text: int(_exact(text)),
     ),
 }
 

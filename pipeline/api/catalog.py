@@ -194,8 +194,10 @@ def _experiment(name: str, path: Path) -> Entry:
         facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
     if experiment.import_:
         facts["imports"] = f"{experiment.import_.source}; give its place with --data"
-    options = load("studies", experiment.study, Study).options
-    return Entry(name, experiment.title, facts, options, experiment.options, prefix="options.")
+    study: Study = load("studies", experiment.study, Study)
+    if study.runs != Study.runs:
+        facts["--runs"] = study.runs or "none to set"
+    return Entry(name, experiment.title, facts, study.options, experiment.options, prefix="options.")
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:

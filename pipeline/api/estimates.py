@@ -122,7 +122,7 @@ def judge_estimates(
             outcome.metrics.update(compared.metrics)
             outcome.tables["summary"] = summary_table(outcome.metrics)
             outcome.figures.update(compared.figures)
-            outcome.input_sha256 = hash_files([*estimates, *places])
+            outcome.input_sha256, outcome.kind = hash_files([*estimates, *places]), "evaluate"
             write_outcome(folder, "evaluate", settings, outcome)
     return JudgedLogs([*opened, *sources], estimators, judge, compared, coverage)
 

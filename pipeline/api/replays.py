@@ -279,6 +279,7 @@ class Replay:
         with result_folder(place) as part:
             outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
             outcome.input_sha256, outcome.timings = self.input_sha256, self.done.timings
+            outcome.kind = "replay"
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 
     @property

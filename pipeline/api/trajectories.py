@@ -127,6 +127,7 @@ class Evaluation:
             tables={"summary": summary_table(self.metrics), "poses": self.poses, "pairs": self.pairs},
             figures=trajectory_figures({"estimate": self.compared}),
             input_sha256=self._hash(),
+            kind="evaluate",
         )
         settings = {
             "title": f"{Path(names[0]).name} against {Path(names[1]).name}",

@@ -160,7 +160,8 @@ class Ellipsoid:
         """
         place = Path(folder)
         check_folder(place, {"log": [Path(name) for name in self.logs]})
-        outcome = Outcome(tables={"ellipsoid": self.table}, figures={"lengths": self.chart})
+        outcome = Outcome(figures={"lengths": self.chart}, kind="ellipsoid")
+        outcome.tables["ellipsoid"] = self.table
         for row in self.table.dropna().to_dict("records"):
             outcome.measure(f"ellipsoid.{row['parameter']}", row["value"], row["low"], row["high"])
         settings = {

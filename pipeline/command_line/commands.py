@@ -3,6 +3,7 @@
 Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
 """
 
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import source_of_estimates
 from pipeline.runs.initial_states import span_of
 from pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
-from recorders.atomic import scratch_folder
+from recorders.atomic import scratch_folder, whole_file
 from recorders.errors import BadInput
 from recorders.log import Companions, Log, open_log
 from replay.engine.streams.sources import LogSource
@@ -307,16 +308,24 @@ def view_path(
             rrd = save or folder / "timeline.rrd"
             span = (start_s, end_s)
             _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
-        elif any(given is not None for given in (start_s, end_s, focus, save, connect)):
+        elif any(given is not None for given in (start_s, end_s, focus, connect)):
             raise BadInput(
-                f"{rrd}: is a finished timeline; --start, --end, --focus, --save and --connect need a "
-                "log"
+                f"{rrd}: is a finished timeline; --start, --end, --focus and --connect need a log"
             )
+        elif save is not None:
+            _copy_timeline(rrd, save)
         if screenshot is not None:
             for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
                 warn(complaint)
         elif save is None and connect is None:
             viewer.view(rrd)
+
+
+def _copy_timeline(rrd: Path, save: Path) -> None:
+    if not rrd.is_file():
+        raise BadInput(f"{rrd}: no such file; give a result that drew a timeline, or a log")
+    with whole_file(save) as new:
+        shutil.copyfile(rrd, new)
 
 
 def _draw_log(

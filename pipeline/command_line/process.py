@@ -17,7 +17,10 @@ from types import FrameType
 import click
 
 from pipeline.command_line.group import fuselog
+from recorders import environment
 from recorders.errors import BadInput, printable
+from recorders.processes import refuse_settings_here
+from replay.engine.compiling.trial import require_processor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,6 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals():
+            refuse_settings_here()
+            environment.check()
+            require_processor()
             code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)
             print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -50,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_output()
         return 1
     except (BadInput, OSError, MemoryError) as error:
-        if os.environ.get("FUSELOG_TRACEBACK"):
+        if environment.is_set(environment.TRACEBACK):
             raise
         place = "" if _drop_output() else "standard output"
         return _fail(_sentence(error, place or f"fuselog {shlex.join(arguments or sys.argv[1:])}"))

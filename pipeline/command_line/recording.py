@@ -1,6 +1,8 @@
 """Has the commands that make logs: of simulated scenarios, and of real data."""
 
 import shlex
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -115,12 +117,7 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
-    from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
-    from recorders.linting.lint import lint_log
-    from recorders.log import open_log
-    from recorders.parameters import parse_settings
-    from recorders.recording import import_log
 
     if guess:
         if source != "table":
@@ -130,20 +127,55 @@ def import_(
             return
         check_files([(out, imported(source))], {"data": paths})
         mapping = str(out.with_suffix(".toml"))
-        _write_guess(paths, Path(mapping), is_used=True)
+        with _kept_if_used(Path(mapping)):
+            _write_guess(paths, Path(mapping), is_used=True)
+            _import(source, paths, out, {"mapping": mapping, "origin": origin}, settings)
+        return
+    chosen = {"clock": clock, "mapping": mapping, "origin": origin}
+    _import(source, paths, out, chosen, settings)
+
+
+def _import(
+    source: str,
+    paths: tuple[Path, ...],
+    out: Path | None,
+    chosen: Mapping[str, object],
+    settings: tuple[str, ...],
+) -> None:
+    """Import data and write their log."""
+    from pipeline.logs.information import worst
+    from pipeline.output.outputs import check_files, imported
+    from recorders.linting.lint import lint_log
+    from recorders.log import open_log
+    from recorders.parameters import parse_settings
+    from recorders.recording import import_log
+
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": paths})
     more = [str(path) for path in paths[1:]]
-    chosen = {"clock": clock, "mapping": mapping, "origin": origin, "more": more or None}
-    given = {name: value for name, value in chosen.items() if value is not None}
+    given = {
+        name: value for name, value in {**chosen, "more": more or None}.items() if value is not None
+    }
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
     for sentence in worst(lint_log(open_log(target), portions=1), target):
         click.echo(printable(sentence))
+
+
+@contextmanager
+def _kept_if_used(mapping: Path) -> Iterator[None]:
+    """Remove a mapping that is made meanwhile unless the import by it is whole."""
+    was_there = mapping.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there:
+            mapping.unlink(missing_ok=True)
+        raise
 
 
 def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = False) -> None:

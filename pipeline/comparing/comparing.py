@@ -136,7 +136,7 @@ class Differences:
         check_folder(place, {"input": inputs})
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
         tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
-        outcome = Outcome(tables=tables, figures=dict(self.charts()))
+        outcome = Outcome(tables=tables, figures=dict(self.charts()), kind="compare")
         for run in self.drawable[:1]:
             outcome.figures |= scene_of(self.groups[0], run, self.gap_limit_s)
         if self.coverage:

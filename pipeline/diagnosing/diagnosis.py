@@ -176,7 +176,7 @@ class Diagnosis:
         outcome = summarise(done.judge, done.coverage, done.parameters)
         outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
         outcome.figures |= self.profiles
-        outcome.input_sha256 = self.replay.input_sha256
+        outcome.input_sha256, outcome.kind = self.replay.input_sha256, "diagnose"
         settings = {
             "title": f"{self.label} diagnosed over {self.replay.logs[0].name}",
             "logs": [log.name for log in self.replay.logs],

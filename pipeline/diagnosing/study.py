@@ -49,7 +49,7 @@ class Options(Parameters):
 
     Attributes:
         battery_seed: the first seed of the battery, see `pipeline.diagnosing.battery.battery`.
-        battery_runs: of each of its cells; none unless given.
+        battery_runs: of each of its cells, and at most as many as of each fault; none unless given.
     """
 
     battery_seed: NonNegativeInt = 0
@@ -221,14 +221,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for quantity in QUANTITIES:
             outcome.metrics[f"diagnosis.{quantity}.{case}"] = summary[quantity]
     outcome.metrics |= {f"diagnosis.{name}": share for name, share in _overall(runs).items()}
-    first = setting.options.battery_seed
-    seeds = range(first, first + setting.options.battery_runs)
-    if seeds:
+    if seeds := battery_seeds(setting.options, experiment.runs):
         tables, metrics = battery.results(seeds, setting.progress)
         outcome.tables |= tables
         outcome.metrics |= metrics
     outcome.input_sha256 = hash_streams(clean)
     return outcome
+
+
+def battery_seeds(options: Options, runs: int) -> range:
+    """Return the seeds of each cell of the battery, of which there are no more than of each fault."""
+    return range(options.battery_seed, options.battery_seed + min(options.battery_runs, runs))
 
 
 def _recorded(
@@ -325,5 +328,8 @@ def _chart(faults: pd.DataFrame) -> Chart:
 
 
 DIAGNOSIS = Study(
-    "how often a diagnosis names the fault that was put into a log", study, options=Options
+    "how often a diagnosis names the fault that was put into a log",
+    study,
+    options=Options,
+    runs="runs of each fault, and at most as many of each cell of the battery",
 )

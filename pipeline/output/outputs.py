@@ -193,7 +193,7 @@ def _is_report(path: Path) -> bool:
 
 
 # A mapping is for editing: none is replaced.
-MAPPING = Kind(".toml", "a mapping to be made", lambda _: False)
+MAPPING = Kind(".toml", "a mapping that may be replaced", lambda _: False)
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
 ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)

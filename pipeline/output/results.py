@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 from urllib.parse import quote
 
 from pydantic import SerializerFunctionWrapHandler, model_serializer
@@ -40,6 +40,8 @@ RUNS = Path("tables", "runs.parquet")
 TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
+# What made a result, by which the report opens it.
+Kind = Literal["run", "sweep", "compare", "tune", "diagnose", "replay", "evaluate", "noise", "ellipsoid"]
 
 
 @dataclass
@@ -59,6 +61,7 @@ class Outcome:
         causes: why an estimator is inconsistent, where it was diagnosed.
         stress: what changes do that should not matter, where it was stressed.
         timings: the seconds and messages of each estimator.
+        kind: what made it.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -73,6 +76,7 @@ class Outcome:
     causes: list[Cause] = field(default_factory=list)
     stress: list[Stressing] = field(default_factory=list)
     timings: dict[str, dict[str, float]] = field(default_factory=dict)
+    kind: Kind = "run"
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
         """Keep the metric `key`: its `value`, and its 95 % interval from `low` to `high`."""
@@ -87,7 +91,7 @@ class Result(Parameters):
     `TIMINGS`. `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one
     lies with 95 %; `alarms` are what makes the metrics doubtful, the worst first; `causes` why
     estimators are inconsistent, by a diagnosis; `stress` what changes do that should not matter, where
-    that was asked for: else its text has none.
+    that was asked for: else its text has none. `kind` is what made it; older results do not state it.
     """
 
     format: int = FORMAT
@@ -103,11 +107,25 @@ class Result(Parameters):
     alarms: list[Alarm] = []
     causes: list[Cause] = []
     stress: list[Stressing] = []
+    kind: Kind | None = None
 
     @model_serializer(mode="wrap")
     def _as_it_is_written(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         written: dict[str, Any] = write(self)
-        return {name: value for name, value in written.items() if value or name != "stress"}
+        return {
+            name: value for name, value in written.items() if value or name not in ("stress", "kind")
+        }
+
+    @property
+    def made_by(self) -> Kind:
+        """Return what made it; of an older result, by its settings and name."""
+        if self.kind is not None:
+            return self.kind
+        if "sides" in self.settings:
+            return "compare"
+        if "sweep" in self.settings:
+            return "sweep"
+        return next((kind for kind in get_args(Kind) if kind == self.experiment), "run")
 
     @property
     def contents(self) -> list[str]:
@@ -320,6 +338,7 @@ def write_outcome(
             alarms=outcome.alarms,
             causes=outcome.causes,
             stress=outcome.stress,
+            kind=outcome.kind,
             files={
                 path.relative_to(folder).as_posix(): None if _is_by_clock(path) else hash_of(path)
                 for path in written

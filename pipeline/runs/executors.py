@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
+from recorders.processes import safe_spawning
 from replay.engine.compiling.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
@@ -117,15 +118,16 @@ def processes(count: int) -> PoolFactory:
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
         others = set(active_children())
-        pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
-        try:
-            yield WorkerPool(pool, count)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in set(active_children()) - others:
-                worker.terminate()
-            raise
-        pool.shutdown()
+        with safe_spawning():
+            pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
+            try:
+                yield WorkerPool(pool, count)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                for worker in set(active_children()) - others:
+                    worker.terminate()
+                raise
+            pool.shutdown()
 
     return begin
 
@@ -165,6 +167,7 @@ def dask(scheduler: str) -> PoolFactory:
         with ExitStack() as stack:
             address = scheduler
             if scheduler.startswith("local:"):
+                stack.enter_context(safe_spawning())
                 address = stack.enter_context(_local_cluster(scheduler))
             try:
                 client = stack.enter_context(Client(address, timeout=10))

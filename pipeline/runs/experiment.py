@@ -168,12 +168,14 @@ class Study:
         options: the type of the experiment's `options`.
         is_campaign: whether it replays by `pipeline.runs.campaigns` alone, so that others may work on
             parts of the runs.
+        runs: what the number of runs counts; empty if the study makes none.
     """
 
     summary: str
     run: Callable[[Experiment, Setting], Outcome]
     options: type[Parameters] = Parameters
     is_campaign: bool = False
+    runs: str = "recorded runs"
 
 
 class Stated(NamedTuple):
@@ -201,17 +203,15 @@ class Stated(NamedTuple):
     @property
     def _values(self) -> dict[str, Any]:
         """Return its entries; the programs that it names may be run."""
-        estimators = self.values.get("estimators")
-        if not isinstance(estimators, Mapping):
-            return dict(self.values)
-        return {**self.values, "estimators": allowed_in(estimators, self.folder)}
+        stated = self.values.get("estimators")
+        own = {"estimators": allowed_in(stated, self.folder)} if isinstance(stated, Mapping) else {}
+        return {**self.values, **own}
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
         """Return the experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
-        values = self._values
-        own = _settings_of_experiment(build(Experiment, values, where), settings)
-        experiment = build(Experiment, {**merge(values, own), **over}, where)
+        own = _settings_of_experiment(build(Experiment, self._values, where), settings)
+        experiment = build(Experiment, {**merge(self._values, own), **over}, where)
         if experiment.claims_of:
             shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
             experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
@@ -322,8 +322,7 @@ def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
 
 def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
     """Return what claims may name: the number of the runs, and the numbers of a study's options."""
-    stated = {name: value for name, value in options if isinstance(value, int | float)}
-    return {"runs": experiment.runs, **stated}
+    return {"runs": experiment.runs, **{name: of for name, of in options if isinstance(of, int | float)}}
 
 
 def require_campaign(experiment: Experiment, mend: str) -> None:
@@ -361,6 +360,8 @@ def run_experiment(
             raise BadInput(f"experiment {name} replays logs: name them in [logs], or with --data")
         experiment = experiment.model_copy(update={"runs": len(experiment.files)})
     study: Study = load("studies", experiment.study, Study)
+    if not study.runs and experiment.runs != 1:
+        raise BadInput(f"experiment {name}: study {experiment.study} makes no runs; leave out --runs")
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
     numbers = numbers_of(experiment, options)
     require_names(experiment.claims, numbers, f"experiment {name}")
@@ -391,8 +392,7 @@ def run_experiment(
         metrics = plain(outcome.metrics)
         outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers, recordings)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
-        if data is not None:
-            settings["data"] = str(data)
+        settings |= {} if data is None else {"data": str(data)}
         settings["parameters"] = outcome.parameters or {
             label: parameters.model_dump(mode="json", exclude_none=True)
             for label, (_, parameters) in configured.items()

@@ -204,7 +204,7 @@ def run_sweep(
             open_pool=open_pool,
             checkpoints=checkpoints,
         )
-        outcome = Outcome()
+        outcome = Outcome(kind="sweep")
         tables, errors = [], []
         for number, done in enumerate(judge_all(experiments, setting)):
             tables.append(point_table(number, points[number], done.judge))

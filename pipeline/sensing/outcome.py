@@ -202,7 +202,7 @@ class SensorNoise:
         """
         place = Path(folder)
         check_folder(place, {"log": [Path(self.name)]})
-        outcome = Outcome(tables={"noise": self.table, "curves": self.curves})
+        outcome = Outcome(tables={"noise": self.table, "curves": self.curves}, kind="noise")
         outcome.figures["allan"] = self.chart
         for column in self.columns:
             for name, number in column.numbers.items():

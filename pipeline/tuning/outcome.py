@@ -323,7 +323,7 @@ class Tuning:
         """
         place = Path(folder)
         check_folder(place, {"input": [path for each in self.replays for path in each.paths]})
-        outcome = Outcome(input_sha256=self.replay.input_sha256)
+        outcome = Outcome(input_sha256=self.replay.input_sha256, kind="tune")
         for each in self.replays:
             found = summarise(each.judge, each.done.coverage)
             outcome.metrics |= found.metrics

@@ -123,13 +123,13 @@ def _reports(path: Path) -> Reports:
         _refuse(path, table, name, ~numbers[name].between(low, high), f"from {low:.10g} to {high:.10g}")
     _refuse(path, table, "MMSI", numbers["MMSI"] % 1 != 0, "a whole number")
     times = pd.to_datetime(table["Time"], errors="coerce", format="ISO8601", utc=True)
-    wanted = "a date and time since 1970, such as 2016-01-12 13:02:11.218"
-    _refuse(path, table, "Time", times.isna() | (times.dt.year < 1970), wanted)
+    wanted = "a date and time from 1970 to 2261, such as 2016-01-12 13:02:11.218"
+    _refuse(path, table, "Time", times.isna() | ~times.dt.year.between(1970, 2261), wanted)
     backwards = times.diff() < pd.Timedelta(0)
     _refuse(path, table, "Time", backwards, "not before the row above; sort the rows by Time")
     mmsi, latitude, longitude, course, speed = numbers.to_numpy(float).T
     return Reports(
-        times.dt.tz_localize(None).to_numpy().astype("datetime64[ns]").astype(np.int64),
+        times.dt.tz_localize(None).dt.as_unit("ns").to_numpy().astype(np.int64),
         mmsi.astype(np.int64),
         latitude,
         longitude,

@@ -15,6 +15,7 @@ from pydantic import PositiveFloat
 
 from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
+from recorders.importers.stamps import to_ns
 from recorders.log import Stream, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import Importer, Recording
@@ -166,7 +167,7 @@ def _timed(
     table = _table(path, columns, identifiers)
     bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)
     _refuse(bad, path, pd.DataFrame(table), "expected a time in seconds since 1970")
-    times_ns = np.rint(table[:, 0] * 1e6).astype(np.int64) * 1000
+    times_ns = to_ns(np.rint(table[:, 0] * 1e6), 1000, where=str(path))
     order = np.argsort(times_ns, kind="stable")
     return times_ns[order], table[order, 1:]
 

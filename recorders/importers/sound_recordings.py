@@ -24,6 +24,7 @@ from scipy.io import wavfile
 from recorders.arrivals import HeardSound, difference_stream, microphone_stream
 from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
+from recorders.importers.stamps import to_ns
 from recorders.log import Stream
 from recorders.models.arrivals import Weighting
 from recorders.parameters import Parameters
@@ -233,7 +234,7 @@ def _begin_ns(path: Path) -> int | None:
     if begin.tzinfo is None:
         raise BadInput(f"{path}: recording_start_time has no time zone; write it with one")
     whole = int(begin.replace(microsecond=0).timestamp())
-    return whole * 10**9 + begin.microsecond * 1000
+    return int(to_ns(whole, 10**9, begin.microsecond * 1000, where=str(path)))
 
 
 def _span_ns(recorded: Recorded, epoch_ns: int) -> tuple[int, int]:
@@ -255,13 +256,17 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
         if not ((begin >= 0.0) & (begin < end)).all():
             raise BadInput(f"{path}: start_time and end_time must be in s, and the end after the start")
         first_ns = file.map({name: span[0] for name, span in spans.items()}).fillna(-1).astype(np.int64)
-        begin_ns = first_ns + (begin * 1e9).round().astype(np.int64)
+        firsts = np.asarray(first_ns, np.int64)
+        begin_ns, end_ns = (
+            pd.Series(to_ns(each, 10**9, firsts, where=str(path)), table.index, "int64")
+            for each in (begin, end)
+        )
         for kind in [each for each in table.columns[1:] if each not in TIMES]:
             is_there = (table[kind].map(_number) > 0.0) & (first_ns >= 0)
             at_once = begin_ns[is_there].groupby(begin_ns[is_there]).groups
             for number, rows in enumerate(at_once.values(), start=1):
                 name = _topic(f"{path.stem}-{kind}" + (f"-{number}" if len(at_once) > 1 else ""))
-                lasts_ns = round(float((end - begin)[rows].max()) * 1e9)
+                lasts_ns = int((end_ns - begin_ns)[rows].max())
                 at_ns = int(begin_ns[rows].iloc[0])
                 yield Sound(name, list(dict.fromkeys(file[rows])), at_ns, at_ns + lasts_ns)
     if not has_one:

@@ -21,10 +21,10 @@ from rerun.experimental import ViewerClient
 
 from recorders.atomic import scratch_folder, whole_file
 from recorders.errors import BadInput
+from recorders.processes import start_module
 from replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-RERUN = (sys.executable, "-m", "replay.timeline.keeper")
 # What a picture says of who made it, in the PNG keyword `Software`.
 SOFTWARE = "fuselog"
 _START_S = 20.0
@@ -156,10 +156,10 @@ def _running(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `rerun OPTIONS`, which says what it has to say in a file of the folder."""
     with (folder / _SAID).open("wb") as output:
-        process = subprocess.Popen(
-            [*RERUN, *options],
-            env=environment,
-            stdin=subprocess.PIPE,
+        process = start_module(
+            "replay.timeline.keeper",
+            *options,
+            environment=environment,
             stdout=output,
             stderr=output,
             start_new_session=True,  # an interrupt from the terminal is ours to handle

@@ -1,5 +1,6 @@
 """What the repository says of itself: the rooms, the commands, the systems it is tried on."""
 
+import ast
 import re
 import tomllib
 from importlib.metadata import version
@@ -8,6 +9,8 @@ from typing import Any
 
 import pytest
 import yaml
+
+from tests.house.sources import PATHS, nodes_of, text_of
 
 ROOT = Path(__file__).parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -114,3 +117,78 @@ def test_one_version_everywhere() -> None:
     assert cited["license"] == PYPROJECT["project"]["license"]
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0].rstrip(",") == stated
+
+
+# What starts a process, by the name that is called.
+STARTS = {
+    *(
+        "Popen",
+        "run",
+        "call",
+        "check_call",
+        "check_output",
+        "getoutput",
+        "system",
+        "popen",
+        "Process",
+        "Pool",
+    ),
+    *(
+        "ProcessPoolExecutor",
+        "LocalCluster",
+        "fork",
+        "forkpty",
+        "posix_spawn",
+        "startfile",
+        "get_context",
+    ),
+    *("create_subprocess_exec", "create_subprocess_shell", "spawn_main", "start_module"),
+}
+MODULES = {"subprocess", "os", "multiprocessing", "asyncio", "concurrent", "distributed"}
+
+
+def test_processes_are_started_in_known_places() -> None:
+    """Python by `start_module`, whose `-P` keeps the current folder off the path, or `safe_spawning`."""
+    found = set()
+    for path in PATHS:
+        starting = {
+            alias.asname or alias.name
+            for node in nodes_of(path)
+            if isinstance(node, ast.ImportFrom) and node.module
+            if node.module.partition(".")[0] in MODULES or node.module == "recorders.processes"
+            for alias in node.names
+        }
+        for node in nodes_of(path):
+            if isinstance(node, ast.Call):
+                *of, name = ast.unparse(node.func).rsplit(".", 1)
+                is_start = name in STARTS and (of[0] in MODULES if of else name in starting)
+                if is_start or (of == ["os"] and name.startswith(("exec", "spawn"))):
+                    found.add((path.as_posix(), name))
+    assert found == {
+        ("pipeline/deploying/certificate.py", "run"),  # GCC, and a filter that it compiled
+        ("pipeline/runs/executors.py", "LocalCluster"),
+        ("pipeline/runs/executors.py", "ProcessPoolExecutor"),
+        ("pipeline/runs/executors.py", "get_context"),
+        ("recorders/processes.py", "Popen"),
+        ("replay/foreign/processes/isolation.py", "start_module"),
+        ("replay/foreign/processes/orphans.py", "start_module"),
+        ("replay/foreign/processes/process.py", "Popen"),  # a program that the user names
+        ("replay/engine/compiling/trial.py", "start_module"),
+        ("replay/timeline/viewer.py", "start_module"),
+    }
+    python = {path.as_posix() for path in PATHS if "sys.executable" in text_of(path)}
+    assert python == {"recorders/processes.py"}
+
+
+def test_environment_variables_are_read_in_one_place() -> None:
+    """Or handed on to a process; the text of `native.py` is in the key of every kernel, and stays."""
+    reads = {path.as_posix() for path in PATHS if re.search(r"\bos\.(environ|getenv)", text_of(path))}
+    assert reads == {
+        "fuselog/testing.py",
+        "pipeline/output/terminal.py",
+        "recorders/environment.py",
+        "recorders/processes.py",
+        "replay/engine/compiling/compile.py",
+        "replay/engine/compiling/kernels/native.py",
+        "replay/timeline/viewer.py",
+    }

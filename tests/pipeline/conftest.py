@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ import pytest
 from mcap.writer import Writer
 
 from pipeline.command_line import main
+from pipeline.output.report import write_report
+from pipeline.output.report.kinds import run_sentences
 from pipeline.output.results import Outcome, Result, write_outcome
 from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
@@ -98,10 +101,32 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
         keeping.hold_outcome(name, settings, outcome, in_full=in_full)
         return write_outcome(folder, name, settings, outcome)
 
+    def held(study: str, labels: list[str], outcome: Outcome, settings: Any = None) -> None:
+        hold(study, labels, outcome, settings)
+        told(study, labels, outcome, settings)
+
+    hold = studies.hold
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(studies, "hold", held)
         for module in WRITERS:
             patch.setattr(f"{module}.write_outcome", written)
         yield
+
+
+_TOLD: set[tuple[str, ...]] = set()
+
+
+def told(study: str, labels: list[str], outcome: Outcome, settings: Any) -> None:
+    """Have `run`'s sentences and the report of what a study found, once for each set of its tables."""
+    key = study, *outcome.tables, *outcome.figures
+    if key not in _TOLD:
+        _TOLD.add(key)
+        stated = {"study": study, "estimators": {each: {} for each in labels}, **(settings or {})}
+        with TemporaryDirectory() as place, without_drawing():
+            folder = Path(place)
+            result = write_outcome(folder, study, stated, outcome)
+            run_sentences(result, folder)
+            write_report([folder], folder / "report.html")
 
 
 @pytest.fixture(scope="session")

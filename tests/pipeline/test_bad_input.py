@@ -190,6 +190,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "run acoustic --set options.modes=[]": ("options of study acoustic", "modes", "bearings-only"),
     "run los-two-sensors --set options.scenarios=[]": ("options of study los", "the 5 of the paper"),
     "run lcd-sampling --set options.sizes=[]": ("options of study lcd-sampling", "'sizes'"),
+    "run lcd-sampling --runs 3": ("experiment lcd-sampling", "makes no runs; leave out --runs"),
     "run garbled.toml": ("garbled.toml", "TOML"),
     "run deep.toml": ("deep.toml", "nested more than 50 levels deep"),
     "record deep.toml": ("deep.toml", "nested more than 50 levels deep"),

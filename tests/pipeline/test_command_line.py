@@ -605,6 +605,16 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
 
 
 @pytest.mark.usefixtures("here")
+def test_the_run_that_a_result_shows_is_saved(world: Path, fuselog: Fuselog) -> None:
+    result = world / "result"
+    said = fuselog("view", str(result), "--save", "shown.rrd")
+    assert (said.code, said.err) == (0, "")
+    assert Path("shown.rrd").read_bytes() == (result / "timeline.rrd").read_bytes()
+    refused = fuselog("view", str(result), "--save", "shown.rrd", "--start", "1")
+    assert (refused.code, "--start, --end, --focus and --connect need a log" in refused.err) == (2, True)
+
+
+@pytest.mark.usefixtures("here")
 def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> None:
     """Defaults too, and those that were given."""
     log = str(world / "log.mcap")
@@ -642,3 +652,27 @@ def test_parameters_that_a_log_states_are_shown_with_their_channel(
     model = fuselog("models", "robot").out
     assert re.search(r"^ sigma_range_m +from the log ", model, re.MULTILINE)
     assert re.search(r"^ inflate_nis +number", model, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        (
+            "NUMBA_CPU_NAME",
+            "bogus",
+            "LLVM cannot compile for this ('bogus' is not a recognized processor",
+        ),
+        ("NUMBA_CPU_FEATURES", "+bogus", "LLVM cannot compile for this ("),
+        ("NUMBA_NUM_THREADS", "0", "expected a number of cores, from 1 on"),
+        ("SOURCE_DATE_EPOCH", "x", "expected whole seconds since 1970"),
+        ("FUSELOG_UNCOMPILED", "yes", "expected 1"),
+    ],
+)
+def test_an_environment_variable_that_cannot_be_is_named(
+    name: str, value: str, expected: str, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, value)
+    said = fuselog("metrics")
+    assert said.code == 2
+    assert said.err.startswith(f"fuselog: {name}={value}: {expected}")
+    assert said.err.count("\n") == 1

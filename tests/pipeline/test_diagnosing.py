@@ -434,7 +434,11 @@ def test_the_study_counts_what_is_named_and_what_a_removal_gains(
     monkeypatch.setattr(study, "SCENARIOS", {"landmarks": short})
     file = tmp_path / "few.toml"
     file.write_text('title = "few"\nstudy = "diagnosis"\nruns = 2\nseed = 3\n')
-    told = fuselog("run", file, "--out", tmp_path / "out", "--json").json["metrics"]
+    said = fuselog("run", file, "--out", tmp_path / "out", "--json")
+    assert said.code == 0, said.err
+    told = said.json["metrics"]
+    options = study.Options(battery_seed=5, battery_runs=9)
+    assert study.battery_seeds(options, 2) == range(5, 7)  # so `--runs` makes all of it smaller
     assert told["diagnosis.worth.landmarks-bias"] > 50.0
     assert told["diagnosis.first_share.landmarks-bias"] == 1.0
     assert told["diagnosis.covered_share.landmarks-bias"] == 1.0

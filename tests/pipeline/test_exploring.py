@@ -343,21 +343,36 @@ def _outer_address() -> str:
             return "127.0.0.2"
 
 
+def asked(url: str, path: str, *headers: str, upgrade: bool = True) -> bytes:
+    """The begin of the answer to a request for a path, of a WebSocket unless that is not wanted."""
+    lines = [f"GET /{path} HTTP/1.1", *headers]
+    if upgrade:
+        lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
+        lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+    name, port = url.removeprefix("http://").split("/")[0].split(":")
+    with socket.create_connection((name, int(port))) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        return connection.recv(64)
+
+
 def test_a_page_of_another_origin_gets_nothing(explorer: Any) -> None:
+    """Nor does another name of this machine, or a WebSocket that has no origin."""
     with urllib.request.urlopen(explorer.url) as answer:
         assert "Access-Control-Allow-Origin" not in answer.headers
         assert 'name="referrer" content="no-referrer"' in answer.read().decode()
     host, path = explorer.url.removeprefix("http://").split("/", 1)
-    name, port = host.split(":")
-    for origin in ("http://evil.example", "http://localhost:1"):
-        with socket.create_connection((name, int(port))) as asked:
-            lines = (
-                *(f"GET /{path}ws HTTP/1.1", f"Host: {host}", f"Origin: {origin}"),
-                *("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"),
-                *("Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "", ""),
-            )
-            asked.sendall("\r\n".join(lines).encode())
-            assert asked.recv(64).startswith(b"HTTP/1.1 403 ")
+    own, other = f"http://{host}", host.replace("127.0.0.1", "localhost")
+    for given, origin in (
+        *((host, ["http://evil.example"]), (host, ["http://localhost:1"]), (host, []), (host, ["null"])),
+        *((other, [own]), (other, [f"http://{other}"]), ("evil.example", ["http://evil.example"])),
+        (host, [own, "http://evil.example"]),
+    ):
+        stated = [f"Host: {given}", *(f"Origin: {each}" for each in origin)]
+        answered = asked(explorer.url, f"{path}ws", *stated)
+        assert answered.startswith((b"HTTP/1.1 403 ", b"HTTP/1.1 400 ")), (given, origin, answered)
+    assert asked(explorer.url, path, f"Host: {other}", upgrade=False).startswith(b"HTTP/1.1 403 ")
+    own_headers = f"Host: {host}", f"Origin: {own}"
+    assert asked(explorer.url, f"{path}ws", *own_headers).startswith(b"HTTP/1.1 101 ")
 
 
 NOW = """() => {
@@ -426,6 +441,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
 @pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
 @pytest.mark.paper
 def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subprocess.Popen[str]]) -> None:
+    """Odd requests give one line a kind meanwhile, without the secret and without control characters."""
     pytest.importorskip("bokeh")
     command = ["explore", str(log), "-e", "ekf", "--no-browser"]
     with start_fuselog(*command, stderr=subprocess.STDOUT) as running:
@@ -435,7 +451,24 @@ def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subproce
         assert url is not None, said
         with urllib.request.urlopen(url[0]) as answer:
             assert answer.status == 200
+        host, path = url[0].removeprefix("http://").split("/", 1)
+        for each in 3 * (
+            "ws",
+            "ws?a=\x9b2J",
+            "ws/../x",
+            "%00",
+            "autoload.js?bokeh-session-id=x",
+            "\x9b",
+        ):
+            for protocol in ("bokeh", "bokeh, x", "x, bokeh.\x9b", "bokeh, " + "a" * 100):
+                own = f"Host: {host}", f"Origin: http://{host}", f"Sec-WebSocket-Protocol: {protocol}"
+                assert asked(url[0], path + each, *own)
+            assert asked(url[0], each, f"Host: {host}", upgrade=False).startswith(b"HTTP/1.1 404 ")
         running.send_signal(signal.SIGINT)
         assert running.wait(10.0) == 128 + signal.SIGINT
+        lines = running.stdout.read().splitlines()
+    assert 1 < len(lines) < 10
+    assert len({*lines}) == len(lines)
+    assert not [each for each in lines if path.strip("/") in each or "\x9b" in each or "Trace" in each]
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url[0])

@@ -3,8 +3,11 @@
 No file of the user is changed or deleted. The tables are the audit; the test goes through all pairs.
 """
 
+import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, nullcontext
 from itertools import cycle
@@ -353,3 +356,97 @@ def test_two_outputs_are_no_part_of_each_other(here: Path) -> None:
 def test_the_root_is_no_result_folder(here: Path) -> None:
     for command in ("run dead.toml", "sweep dead.toml --over duration_s=1,2", "evaluate est.mcap"):
         _check_refusal(run_here(*command.split(), "--out", "/"), here, _state(here), "is the root")
+
+
+# Names of modules that Python, a library or fuselog imports sooner or later.
+SHADOWS = (
+    *(
+        "abc",
+        "argparse",
+        "click",
+        "collections",
+        "distributed",
+        "fuselog",
+        "json",
+        "logging",
+        "matplotlib",
+    ),
+    *("numba", "numpy", "pandas", "pickle", "pipeline", "psutil", "pydantic", "random", "recorders"),
+    *("replay", "reprlib", "rerun", "rerun_cli", "rich", "scipy", "sitecustomize", "socket", "struct"),
+    *("subprocess", "threading", "usercustomize"),
+)
+SHADOW = """
+import os, sys
+with open(os.environ["SHADOWED"], "a") as told:
+    print(__file__, *sys.argv, file=told)
+"""
+# Runs commands one after another with the path that the console script has.
+DRIVER = """
+import json, sys
+from pipeline.command_line import main
+if __name__ == "__main__":
+    print(json.dumps([main(words) for words in json.load(sys.stdin)]))
+"""
+# Commands without an output, and further ones for each way in which a process is started: workers, those
+# of Dask, the viewer, filters of others and what ends them.
+OTHERS = """
+cache
+estimators
+experiments
+header
+info run.mcap
+lint run.mcap
+metrics
+models
+scenarios
+observability run.mcap
+stress run.mcap -e dead-reckoning
+calibrate nav.mcap -e ekf
+run dead.toml --runs 130 --workers 2 --out two
+run dead.toml --runs 130 --scheduler local:1 --out three
+replay run.mcap -e exec:/bin/true -o a.mcap
+replay run.mcap -e lib:./junk.so -o b.mcap
+report result --viewer --out viewer.html
+"""
+# The viewer where there is no graphics driver, and filters that are none.
+MAY_FAIL = {"view", "report", "replay"}
+
+
+def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path: Path) -> None:
+    """Nor do the processes that commands start."""
+    for name in SHADOWS:
+        (here / f"{name}.py").write_text(SHADOW)
+    (here / "junk.so").write_bytes(b"no library")
+    by_name = {
+        each.words[0]: each.to(Path(f"{each.words[0]}{each.suffix}")) for each in COMMANDS.values()
+    }
+    lines = [*by_name.values(), *map(str.split, OTHERS.strip().splitlines())]
+    assert {words[0] for words in lines} == fuselog.commands.keys() - {"explore"}
+    driver, told = tmp_path / "driver.py", tmp_path / "told"
+    driver.write_text(DRIVER)
+    environment = os.environ | {"SHADOWED": str(told)}
+
+    done = subprocess.run(
+        [sys.executable, driver],
+        input=json.dumps(lines),
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    failed = zip(lines, json.loads(done.stdout.splitlines()[-1]), strict=True)
+    assert {words[0] for words, code in failed if code} <= MAY_FAIL, done.stderr
+    script = Path(sys.executable).with_name("fuselog")
+    command = [script, "view", "run.mcap", "--screenshot", "seen.png"]
+    subprocess.run(command, env=environment, capture_output=True, check=False)
+    command = [script, "explore", "run.mcap", "-e", "ekf", "--no-browser"]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as exploring:
+        assert exploring.stdout is not None
+        assert b"http://" in exploring.stdout.readline()
+        exploring.terminate()
+    assert not told.exists(), told.read_text()
+
+
+@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
+def test_settings_of_libraries_in_the_current_folder_are_refused(name: str, here: Path) -> None:
+    (here / name).write_text("cache_dir: mine")
+    _check_refusal(run_here("lint", "run.mcap"), here, _state(here), f"{name}: ")

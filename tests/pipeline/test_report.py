@@ -33,16 +33,19 @@ from pipeline.output.charts import (
 from pipeline.output.claims import Claim
 from pipeline.output.report import _figure, _legend, write_report
 from pipeline.output.report.first_run import Followed
-from pipeline.output.report.kinds import run_sentences
+from pipeline.output.report.kinds import opening, run_sentences
 from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.scene import typical_second
-from pipeline.output.results import Outcome, read_result, result_folder, write_outcome
+from pipeline.output.results import Outcome, Result, read_result, result_folder, write_outcome
 from recorders.errors import BadInput
 from recorders.log import open_log, read_streams
+from recorders.parameters import build
+from recorders.parsing import parse_json
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 Fuselog = Callable[..., Any]
+KEPT_RESULTS = sorted(Path(__file__).parents[2].glob("docs/families/results/*.json"))
 WINDOWS = [(width, scheme) for width in (1280, 400) for scheme in ("light", "dark")]
 
 
@@ -592,3 +595,42 @@ def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figur
     [shares] = [each for each in charts if "that is effective" in each["title"]]
     [curve] = shares["panels"][0]["series"]
     np.testing.assert_allclose(curve["y"], effective["effective"] / 50, rtol=1e-6)
+
+
+@pytest.mark.parametrize("path", KEPT_RESULTS, ids=lambda path: path.stem)
+def test_results_that_are_kept_have_an_opening(path: Path) -> None:
+    """Those of all shipped experiments, whose data need not be here; they do not state their kind."""
+    values = parse_json(path.read_text(encoding="utf-8"))
+    opened = opening(build(Result, {**values, "files": {}}, str(path)), {})
+    assert opened.tried.endswith(".")
+    assert opened.story.verdict
+
+
+def test_an_experiment_is_not_taken_for_a_command_by_its_name_or_tables(tmp_path: Path) -> None:
+    for kind, name in (("run", "tune"), ("run", "compare"), ("tune", "tune")):
+        folder = tmp_path / f"{kind}-{name}"
+        folder.mkdir()
+        tables = {each: pd.DataFrame({"sound": ["a"]}) for each in ("differences", "sweep", "runs")}
+        tables["parameters"] = pd.DataFrame(
+            {"parameter": ["sigma_range_m"], "start": 1.0, "value": 2.0, "low": 1.0, "high": 3.0}
+        )
+        outcome = Outcome(metrics={"ekf.position_rmse_m": 1.0}, tables=tables, kind=kind)
+        write_outcome(folder, name, {"estimators": {"ekf": {}}}, outcome)
+        write_report([folder], folder / "report.html")
+        assert ("is likeliest 2 m" in (folder / "report.html").read_text()) == (kind == "tune")
+
+
+def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:
+    """Wherever they stand: in a title, a text, a label, a claim, a table."""
+    bad = "a\x9b2J\x1b[2J\x07\u202e\u2028b"
+    outcome = Outcome(
+        metrics={f"{bad}.position_rmse_m": 1.0, f"{bad}.nees": 1.0},
+        tables={"names": pd.DataFrame({bad: [bad]})},
+        claims=[Claim(claim=bad, paper=bad, ours=bad, verdict="confirmed")],
+    )
+    settings = {"title": bad, "text": f"# {bad}", "estimators": {bad: {}}, "notes": [bad]}
+    write_outcome(tmp_path, bad.replace("\x1b", ""), settings, outcome)
+    write_report([tmp_path], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert {each for each in page if not each.isprintable()} <= {*"\n\t\u00a0\u2009\u202f"}
+    assert "<title>a\\x9b2J\\x1b[2J\\x07\\u202e\\u2028b: fuselog report</title>" in page

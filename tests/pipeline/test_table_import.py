@@ -57,6 +57,17 @@ def test_a_guessed_mapping_works_as_it_is(
     assert log["/gnss/fix"]["latitude_deg"].tolist()[:2] == [50.0, 50.01]
 
 
+def test_a_guess_whose_import_fails_leaves_nothing(fuselog: Callable[..., Any], tmp_path: Path) -> None:
+    """So that the next try is not refused for the mapping of the first."""
+    table, out = tmp_path / "drive.csv", tmp_path / "drive.mcap"
+    rows = [f"{number},1.5,0.1" for number in range(200_000)]
+    for last, code in (("200000,fast,0.1", 2), ("200000,1.5,0.1", 0)):
+        table.write_text("\n".join(["time,speed,yaw_rate", *rows, last, ""]))
+        said = fuselog("import", "table", str(table), "--guess", "-o", str(out))
+        assert said.code == code, said.err
+        assert (out.exists(), out.with_suffix(".toml").exists()) == 2 * (code == 0,)
+
+
 def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path, tmp_path: Path) -> None:
     """Files and folders in any order; what is wrong is one sentence, and nothing is written."""
     mapping, out = tmp_path / "own.toml", tmp_path / "own.mcap"

@@ -116,6 +116,7 @@ def test_compressed_more_columns_other_times_and_a_date_line(tmp_path: Path):
     [
         ("soon,1,50,-1,0,0", "data row 9, column Time is 'soon'"),
         ("1969-01-01,1,50,-1,0,0", "column Time is '1969-01-01'"),
+        ("9999-01-01,1,50,-1,0,0", "column Time is '9999-01-01'"),
         ("2016-01-12 13:02:11,1,50,-1,0,0", "sort the rows by Time"),
         ("2016-01-13,x,50,-1,0,0", "column MMSI is 'x'; expected a number"),
         ("2016-01-13,1.5,50,-1,0,0", "column MMSI is '1.5'; expected a whole number"),

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from recorders.errors import BadInput
 from recorders.importers.ros import importer
 from recorders.importers.ros.files.bags import open_bag
+from recorders.importers.ros.files.sqlite_file import SqliteFile
 from recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
 from recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
 from recorders.importers.ros.messages import TYPES
@@ -419,6 +420,16 @@ def odometry_bag(place: Path, form: str, count: int, first: int = 0) -> Path:
         for number, stamp in enumerate(stamps)
     ]
     return write_bag(place, form, sent, make.store)
+
+
+def test_rows_of_a_database_that_are_no_messages_are_counted(tmp_path: Path) -> None:
+    path = next(odometry_bag(tmp_path / "bag", "db3", 5).glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE messages SET timestamp = 'soon' WHERE id = 2")
+        database.execute("UPDATE messages SET data = 7 WHERE id = 3")
+    file = SqliteFile(path)
+    assert sum(len(each.log_time_ns) for each in file.batches(lambda _: True)) == 3
+    assert "2 rows of messages have no whole stamp or no bytes" in file.losses[0]
 
 
 def counted(path: Path) -> tuple[list[int], dict[str, str]]:

@@ -591,6 +591,9 @@ BAD = [
     ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row has a time that can be read"),
     ("t,lat,lon,h\n1,,8,0\n", FIX, "", "", "none of its rows could be imported"),
     ("t,lat,lon,h\n-1,1,8,0\n", FIX, "", "", "column t: a stamp is before 1970 or after"),
+    ("t,lat,lon,h\n1767225600000,1,8,0\n", FIX, "", "", "or after 2262 (1767225600000"),
+    ("t,lat,lon,h\n9999-01-01,1,8,0\n", FIX, '"t"', '"t", unit = "date"', "cells that are not dates"),
+    ("t,lat,lon,h\n1,1,8,30000\n", FIX, '"t"', '"t", week = "h", unit = "ms"', "t and h: a stamp"),
     ("t,lat,lon,h\n", FIX, "", "", "table.csv: has a header line but no rows"),
     ("", FIX, "", "", "table.csv: has no rows"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """

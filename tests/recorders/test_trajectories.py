@@ -106,3 +106,10 @@ def test_arrays_that_are_no_trajectory_are_refused() -> None:
         Trajectory("mine", position_m, rotation=np.zeros((2, 4)))
     with pytest.raises(BadInput, match="mine: its stamps go back"):
         Trajectory("mine", position_m, time_ns=np.array([1, 0]))
+
+
+def test_a_time_whose_exponent_is_absurd_is_zero(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text(f"1e-{'9' * 25} 0 0 0 0 0 0 1\n1e-32000000 0 0 0 0 0 0 1\n")
+    found = read_trajectory(tmp_path / "a.tum")
+    assert found.time_ns is not None
+    assert found.time_ns.tolist() == [0, 0]

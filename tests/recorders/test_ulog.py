@@ -278,6 +278,14 @@ def test_what_is_no_ulog_is_refused_in_a_sentence(tmp_path: Path, content: bytes
         read(tmp_path / "bad.ulg", content)
 
 
+def test_stamps_beyond_64_bits_are_refused(tmp_path: Path) -> None:
+    content = bytearray(by_hand(rows=1, marks=False))
+    content[8:16] = struct.pack("<Q", 1 << 61)
+    content[-32:-24] = struct.pack("<Q", 1 << 61)
+    with pytest.raises(BadInput, match=r"a stamp is before 1970 or after 2262 \(2305843009213693952 t"):
+        read(tmp_path / "a.ulg", bytes(content))
+
+
 def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
     """Each has its own column, in the order of the file, and a change is of its own alone."""
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from unicodedata import category
 from urllib.parse import unquote
 
 import pandas as pd
@@ -36,7 +37,7 @@ from pipeline.output.results import TIMINGS, Result, read_result, read_table, sp
 from pipeline.output.terminal import format_value
 from pipeline.output.words import QUANTITIES, TRACKING, label_of, quantity
 from recorders.atomic import whole_file
-from recorders.errors import BadInput
+from recorders.errors import BadInput, printable
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -113,6 +114,7 @@ def write_report(
     environment = Environment(
         loader=PackageLoader("pipeline.output.report", "."),
         autoescape=select_autoescape(),
+        finalize=_visible,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -144,6 +146,16 @@ def is_report(page: Path) -> bool:
 def _signed(page: bytes) -> bytes:
     """Sign the page with its own SHA-256 at its end."""
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
+
+
+def _visible(value: object) -> object:
+    """Show control characters of a text by their numbers, in all that the page is made of."""
+    if not isinstance(value, str) or value.isprintable():
+        return value
+    shown = "".join(
+        each if each in "\n\t" or category(each) == "Zs" else printable(each) for each in value
+    )
+    return Markup(shown) if isinstance(value, Markup) else shown
 
 
 def _asset(name: str) -> str:
@@ -197,9 +209,10 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     looks = [_chart("", begun.chart)] if begun.chart else []
     order = [card.estimator for card in begun.story.cards] or labels
     looks += _first_run(folder, order, begun.found, viewer=viewer)
-    looks += [each for name in SCENES for each in figures if each.name == name]
-    figures = [each for each in figures if each.name not in SCENES]
-    if "sweep" in result.settings or not looks or looks[-1].name == "tracks":
+    if result.made_by == "compare":
+        looks += [each for name in SCENES for each in figures if each.name == name]
+        figures = [each for each in figures if each.name not in SCENES]
+    if result.made_by == "sweep" or not looks or looks[-1].name == "tracks":
         looks, figures = [*looks, *figures[:2]], figures[2:]
     over_time = [each for each in figures if each.name.startswith("errors")][:1]
     nis = nis_chart(folder, [label for label in labels if label in begun.found.labels])

@@ -361,7 +361,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:
     """Count how many runs a result is of: as many as its tables have, else as its settings say."""
-    if "differences" in tables and len(tables["differences"]):
+    if result.made_by == "compare" and len(tables["differences"]):
         return int(tables["differences"]["runs"].max())
     logs = result.settings.get("logs")
     if isinstance(logs, Mapping):

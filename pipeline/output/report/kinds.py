@@ -80,18 +80,18 @@ class Opening:
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
     """Write how a result's page begins; `timings` are what its estimators cost, if that was kept."""
-    if "sides" in result.settings:
+    if result.made_by == "compare":
         return _of_comparison(result, tables)
-    if "sweep" in result.settings:
+    if result.made_by == "sweep":
         return Opening(*story_of_sweep(result, tables), numbers_of="Each estimator where it errs least.")
     found = findings(result, tables)
     base = story(found, result.causes, timings, result.alarms)
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
-    if result.experiment == "diagnose":
+    if result.made_by == "diagnose":
         further = [re.sub(r"^\d+\. ", "", each) for each in notes[1:]]
         return Opening(tried, _of_diagnosis(base, notes), found, further)
-    if result.experiment == "tune":
+    if result.made_by == "tune":
         meanings = result.settings.get("meanings", {})
         return Opening(tried, _of_tuning(base, tables, meanings), found, notes)
     if result.claims:

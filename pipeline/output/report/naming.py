@@ -70,11 +70,11 @@ def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
     """Write a heading for a person: the experiment's title, or what was done with whose logs."""
     settings = result.settings
     title = str(settings.get("title") or result.experiment)
-    if "sides" in settings:
+    if result.made_by == "compare":
         return f"{listed(list(labels))}, compared"
     if isinstance(settings.get("logs"), Mapping):
         title = f"{title}: {listed(list(labels)) or count(runs, 'run')}"
-    return f"{title}, swept" if "sweep" in settings else title
+    return f"{title}, swept" if result.made_by == "sweep" else title
 
 
 def luminance(colour: str) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from recorders.importers.stamps import to_ns
 
 
 @dataclass
@@ -30,7 +31,8 @@ class Clocks:
         if stamp_ns is not None:
             _widen(self.header, topic, stamp_ns)
         _widen(self.bag, topic, log_time_ns)
-        _widen(self.offset, topic, log_time_ns - (log_time_ns if stamp_ns is None else stamp_ns))
+        behind = 0 * log_time_ns if stamp_ns is None else to_ns(log_time_ns, 1, -stamp_ns, where=topic)
+        _widen(self.offset, topic, behind)
 
     def check(self, path: Path, tolerance_s: float) -> None:
         """Raise BadInput where topics are stamped by clocks that have nothing to do with one another."""

@@ -99,7 +99,8 @@ class _Import:
         if reader.taken is None:
             self._take_transforms(topic, messages, log_time_ns, is_static=reader.is_static)
             return
-        sent = Sent(topic, messages.rows, stamps_ns(messages, reader.stamp), log_time_ns)
+        stamps = stamps_ns(messages, reader.stamp, f"{self.path}: topic {topic}: ")
+        sent = Sent(topic, messages.rows, stamps, log_time_ns)
         self._clocks.note(topic, sent.stamp_ns, log_time_ns)
         frames = _frames_of(messages, reader.frame)
         for part in reader.taken.parts(messages):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.importers.ros.layouts import Messages
+from recorders.importers.stamps import to_ns
 from recorders.log import Schema, schemas
 from recorders.models.orientation import heading
 
@@ -72,15 +73,15 @@ class Taken(NamedTuple):
     is_doubtful: bool = False
 
 
-def stamps_ns(messages: Messages, path: str = STAMP) -> NDArray[np.int64] | None:
+def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray[np.int64] | None:
     """Read stamps (n,) in ns of a field, a time or a whole number of ns; None where there is none."""
     numbers = messages.layout.numbers
     if path in numbers:
-        return messages.numbers(path).astype(np.int64)
+        return to_ns(messages.numbers(path), 1, where=where + path)
     if f"{path}.sec" not in numbers:
         return None
-    seconds = messages.numbers(f"{path}.sec").astype(np.int64)
-    return seconds * 1_000_000_000 + messages.numbers(f"{path}.nanosec")
+    seconds, part_ns = messages.numbers(f"{path}.sec"), messages.numbers(f"{path}.nanosec")
+    return to_ns(seconds, 10**9, part_ns, where=where + path)
 
 
 def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:

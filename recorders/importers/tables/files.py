@@ -63,7 +63,7 @@ class Table:
         """Find a column by its name, or its number from 1 on; raises BadInput where there is none."""
         if name in self.columns:
             return name
-        if name.isdecimal() and 0 < int(name) <= len(self.columns):
+        if name.isdecimal() and len(name) < 9 and 0 < int(name) <= len(self.columns):
             return self.columns[int(name) - 1]
         raise BadInput(f"{self.path}: has no column '{name}'; {choices(name, self.columns)}")
 

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from recorders.importers.stamps import NOT_A_TIME
 from recorders.importers.tables.column_streams import GUESSES
 from recorders.importers.tables.columns import (
     GuessedColumn,
@@ -29,7 +30,6 @@ from recorders.importers.tables.columns import (
 from recorders.importers.tables.files import Batch, Table, open_table
 from recorders.importers.tables.times import (
     ISO,
-    NOT_A_TIME,
     TimeMapping,
     formats_of,
     offset_of,

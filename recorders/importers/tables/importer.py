@@ -14,6 +14,7 @@ from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Place, checked, mapped, schema_of
 from recorders.importers.tables.mapping import (
     ConstantStream,
+    Delay,
     LogMapping,
     Origin,
     adapted,
@@ -45,7 +46,7 @@ class TableParameters(Parameters):
     mapping: str = ""
     more: list[str] = []
     mounting_deg: tuple[float, float, float] | None = None
-    delays_s: dict[str, float] = {}
+    delays_s: dict[str, Delay] = {}
     seed: NonNegativeInt = 0
     origin: Place | None = None
 

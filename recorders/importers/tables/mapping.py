@@ -36,6 +36,8 @@ from recorders.importers.tables.times import TimeMapping
 from recorders.parameters import Parameters, build
 from recorders.parsing import read_toml
 
+# In s; a larger one is a slip.
+Delay = Annotated[float, Field(ge=-1e9, le=1e9)]
 _SHIPPED = resources.files("fuselog_data") / "mappings"
 
 
@@ -104,7 +106,7 @@ class TableStream(StreamMapping):
     """
 
     topic: str = Field(pattern=r"^/\S+$")
-    delay_s: float = 0.0
+    delay_s: Delay = 0.0
     only_first: bool = False
     every: PositiveInt = 1
     noise: dict[str, PositiveFloat] = {}

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
+from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
 from recorders.importers.tables.files import Batch, Table, open_table
 from recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
 from recorders.importers.tables.plane import Plane
-from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, read_counter, stamps_ns
+from recorders.importers.tables.times import TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
 from recorders.log import Stream, make_stream
 from recorders.log.planes import FRAME, is_planar
@@ -126,7 +127,7 @@ class Rows:
             cells = pc.utf8_trim_whitespace(cells)
         try:
             return cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
-        except pa.ArrowInvalid:
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             raise BadInput(
                 f"{self.path}: column {column} has cells that are not numbers; give a column of numbers"
             ) from None
@@ -136,7 +137,7 @@ class Rows:
 
     def _stamps(self, batch: Batch, clock: TimeMapping) -> Stamps:
         found = self._read_ns(batch, clock)
-        return found if clock.tag is None else self._counter.stamps_ns(found)
+        return found if clock.tag is None else self._counter.stamps_ns(found, str(self.path))
 
     # What the first rows say.
 
@@ -292,7 +293,7 @@ class Rows:
         return make_stream(
             topic,
             schema_of(own, where),
-            stamps[of] - round(own.delay_s * 1e9),
+            to_ns(stamps[of], 1, -round(own.delay_s * 1e9), where=where),
             log_time_ns=logged[of],
             sensor_time_ns=stamps[of],
             metadata=metadata,

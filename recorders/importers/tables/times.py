@@ -11,17 +11,17 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput
+from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
 from recorders.parameters import Parameters
 
-Stamps = NDArray[np.int64]
 # How many digits after the second (or what else the unit is) are nanoseconds.
 _DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
 _WEEK_NS = 7 * 86400 * 10**9
+_MEND = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
 # Hours ahead of UTC of zones by their short names, as far as these mean one zone.
 ZONES = {
@@ -35,8 +35,6 @@ _WRITTEN = re.compile(
     r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?(?:([ T,]*)"
     r"(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
 )
-# A stamp that is missing.
-NOT_A_TIME = np.iinfo(np.int64).min
 
 
 class TimeMapping(Parameters):
@@ -66,7 +64,7 @@ class TimeMapping(Parameters):
     utc_offset_h: Annotated[float, Field(ge=-15, le=15)] = 0.0
     zone: str | None = None
     format: str = ISO
-    leap_seconds: float = 0.0
+    leap_seconds: Annotated[float, Field(ge=-1e9, le=1e9)] = 0.0
     tag: str | None = None
 
     @model_validator(mode="after")
@@ -161,65 +159,27 @@ def stamps_ns(
     """
     if mapping.rate_hz is not None:
         seconds = (first_row + np.arange(size)) / mapping.rate_hz
-        return mapping.zero_ns + np.rint(seconds * 1e9).astype(np.int64)
+        return to_ns(seconds, 10**9, mapping.zero_ns, where=where, mend="check `rate_hz` and `zero`")
     cells = [columns[name] for name in mapping.columns]
     label = f"{where}: column {' and '.join(mapping.columns)}"
     if mapping.unit == "date":
-        found = _dates_ns(mapping, cells, label)
+        found = to_ns(_dates_ns(mapping, cells, label), 1, mapping.zero_ns, where=label, mend=_MEND)
+    elif mapping.week:
+        of_week = read_ns(cells[0], _DIGITS[mapping.unit], where=label, mend=_MEND)
+        weeks = read_ns(cells[1], 0, where=label, mend=_MEND)
+        since = to_ns(of_week, 1, mapping.zero_ns, where=label, mend=_MEND)
+        found = to_ns(weeks, _WEEK_NS, since, where=label, mend=_MEND)
     else:
-        found = _counted_ns(cells[0], _DIGITS[mapping.unit], label)
-        if mapping.week:
-            weeks = _counted_ns(cells[1], 0, label)
-            is_known = (weeks != NOT_A_TIME) & (found != NOT_A_TIME)
-            found = np.where(is_known, weeks * _WEEK_NS + found, NOT_A_TIME)
-    known = found != NOT_A_TIME
-    shifted = np.where(known, found + mapping.zero_ns, NOT_A_TIME)
-    if np.any(shifted[known] < 0):
-        raise BadInput(
-            f"{label}: a stamp is before 1970 or after 2262; check `unit`, and give in `zero` the "
-            "date that the times count from"
-        )
-    return shifted
-
-
-def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
-    """Read numbers as ns; texts are read to the last digit, where a double of today has 200 ns."""
-    if pa.types.is_timestamp(cells.type):
-        return cells.cast(pa.timestamp("ns")).cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
-    if pa.types.is_integer(cells.type):
-        known = cells.is_valid().to_numpy(zero_copy_only=False)
-        whole = cells.cast(pa.int64()).fill_null(0).to_numpy()
-        return np.where(known, whole * 10**digits, NOT_A_TIME)
-    if pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type):
-        texts = pc.utf8_trim_whitespace(cells)
-        try:
-            exact = pc.round(texts.cast(pa.decimal128(38, digits + 11)), digits)
-        except pa.ArrowInvalid:  # more digits than that, or no number
-            try:
-                cells = texts.cast(pa.float64())
-            except pa.ArrowInvalid as error:
-                why = str(error).splitlines()[0]
-                raise BadInput(
-                    f'{label} has cells that are not numbers ({why}); dates need unit = "date"'
-                ) from None
-        else:
-            # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
-            scaled = exact.cast(pa.decimal128(38, digits))
-            low = np.frombuffer(scaled.buffers()[1], "<i8").reshape(-1, 2)[:, 0]
-            known = cells.is_valid().to_numpy(zero_copy_only=False)
-            return np.where(known, low[scaled.offset : scaled.offset + len(scaled)], NOT_A_TIME)
-    numbers = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
-    known = np.abs(numbers * 10.0**digits) < 2**63
-    filled = np.where(known, numbers, 0.0)
-    whole = np.floor(filled)
-    ns = whole.astype(np.int64) * 10**digits + np.rint((filled - whole) * 10.0**digits).astype(np.int64)
-    return np.where(known, ns, NOT_A_TIME)
+        found = read_ns(cells[0], _DIGITS[mapping.unit], mapping.zero_ns, where=label, mend=_MEND)
+    if np.any(found[found != NOT_A_TIME] < 0):
+        raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {_MEND}")
+    return found
 
 
 def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps:
     """Read dates as ns since 1970, as if their own offset were the mapping's."""
     if pa.types.is_timestamp(cells[0].type):
-        return _counted_ns(cells[0], 0, label)
+        return read_ns(cells[0], 0, where=label, mend=_MEND)
     texts = [pc.utf8_trim_whitespace(each.cast(pa.string())) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
     if mapping.format == ISO:  # pandas knows no fractions after a comma
@@ -236,7 +196,7 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
             since_ns[since_ns != NOT_A_TIME] -= _date_ns("1900-01-01")
         for zone in pd.unique(zones):
             rows = (zones == zone) & (since_ns != NOT_A_TIME)
-            since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone))
+            since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone), label)
     except ValueError as error:
         why = str(error).splitlines()[0]
         raise BadInput(
@@ -246,13 +206,13 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
 
 
 def _since_ns(dates: pd.Series) -> Stamps:
-    return dates.to_numpy().astype("datetime64[ns]").astype(np.int64)
+    return dates.dt.as_unit("ns").to_numpy().astype(np.int64)
 
 
-def _from_zone(local_ns: Stamps, zone: float | ZoneInfo) -> Stamps:
+def _from_zone(local_ns: Stamps, zone: float | ZoneInfo, label: str) -> Stamps:
     """Change stamps (n,) by a zone's clocks to UTC; an hour that comes twice is taken for its first."""
     if not isinstance(zone, ZoneInfo):
-        return local_ns - round(3600e9 * zone)
+        return to_ns(local_ns, 1, -round(3600e9 * zone), where=label, mend=_MEND)
     local = pd.Series(local_ns.astype("datetime64[ns]"))
     first = np.ones(len(local), bool)
     placed = local.dt.tz_localize(zone, ambiguous=first, nonexistent="shift_forward")
@@ -270,11 +230,11 @@ class Counter(NamedTuple):
     rate: float
     cut_ns: int
 
-    def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
+    def stamps_ns(self, ticks_ns: Stamps, where: str) -> Stamps:
         """Return the stamps (n,) of readings; one of a line that was cut off has none."""
-        since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
+        since = np.rint(to_ns(ticks_ns, 1, -self.first_ns, where=where) * self.rate)
         none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
-        return np.where(none, NOT_A_TIME, self.start_ns + since)
+        return to_ns(np.where(none, np.nan, since), 1, self.start_ns, where=where)
 
 
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
@@ -290,18 +250,20 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter
         data = tag.read_bytes()
     except OSError as error:
         raise BadInput(f"{tag}: {error.strerror}; {path.name} needs it to know its first time") from None
-    if not data.startswith(b"TIMETAG RTKLIB") or len(data) < 84:
+    is_whole = data.startswith(b"TIMETAG RTKLIB") and len(data) >= 84
+    seconds, fraction = struct.unpack_from("<Id", data, 64) if is_whole else (0, np.nan)
+    if not 0.0 <= fraction < 1.0:
         raise BadInput(
             f"{tag}: is not a time tag of RTKLIB, which {path.name} needs to know its first time"
         )
-    seconds, fraction = struct.unpack_from("<Id", data, 64)
     last_ms = np.frombuffer(data, "<u4", (len(data) - 76) // 8 * 2, 76)[-2]
     every = np.concatenate([ticks[ticks != NOT_A_TIME] for ticks in ticks_ns] or [np.empty(0, np.int64)])
-    if len(every) < 2 or every.max() <= every[0]:
+    first, last = (int(every[0]), int(every.max())) if len(every) else (0, 0)
+    if last <= first:
         raise BadInput(
             f"{path}: its counter does not increase, so that {tag.name} does not give its times; give "
             "the file as RTKLIB wrote it"
         )
-    rate = float(last_ms) * 1e6 / float(every.max() - every[0])
-    cut_ns = int(every[-1]) if every[-1] < every.max() else NOT_A_TIME
-    return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)
+    rate = float(last_ms) * 1e6 / float(last - first)
+    cut_ns = int(every[-1]) if every[-1] < last else NOT_A_TIME
+    return Counter(first, seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)

@@ -9,6 +9,7 @@ import numpy as np
 
 from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import not_finite
+from recorders.importers.stamps import to_ns
 from recorders.importers.ulog.estimator import TOPICS, Autopilot
 from recorders.importers.ulog.file import UlogFile
 from recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part
@@ -88,14 +89,15 @@ class _Import:
         kept = part.take(np.flatnonzero(~bad)[np.argsort(part.time_us[~bad], kind="stable")])
         if not len(kept.time_us):
             return None
-        published = 1000 * kept.time_us
+        where = f"{self._file.path}: {part.topic}"
+        published = to_ns(kept.time_us, 1000, where=where)
         first_ns = int(published[0])
         self._first_ns = first_ns if self._first_ns is None else min(self._first_ns, first_ns)
         stream = make_stream(
             part.topic,
             part.schema,
             published,
-            log_time_ns=1000 * kept.logged_us,
+            log_time_ns=to_ns(kept.logged_us, 1000, where=where),
             metadata={**part.metadata, **self._noise.get(part.topic.rpartition("/")[2], {})},
             **kept.columns,
         )
@@ -123,16 +125,17 @@ class _Import:
                 make_stream(
                     f"{BODY}/parameters",
                     schemas.VECTOR_MEASUREMENT,
-                    1000 * np.array(times),
+                    to_ns(times, 1000, where=f"{file.path}: its parameters"),
                     metadata=metadata,
                     value=np.array(values),
                 )
             )
         if file.dropouts:
-            begin, length = np.array(file.dropouts, np.int64).T
+            begin_us, length_us = np.array(file.dropouts, np.int64).T
+            begin_ns = to_ns(begin_us, 1000, where=f"{file.path}: its dropouts")
             streams.append(
                 make_stream(
-                    f"{BODY}/dropouts", schemas.OUTAGE, 1000 * begin, end_time_ns=1000 * (begin + length)
+                    f"{BODY}/dropouts", schemas.OUTAGE, begin_ns, end_time_ns=begin_ns + 1000 * length_us
                 )
             )
         return streams

@@ -17,24 +17,12 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from recorders.atomic import whole_file
+from recorders.environment import cache_folder as cache_folder
 from recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
 # Nothing that is kept takes longer to make, on a slow and busy machine.
 _TURN_S = 120.0
-
-
-def cache_folder() -> Path:
-    """Find where this user's computed results are kept.
-
-    FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. By XDG's specification a relative
-    path there does not count.
-    """
-    stated = os.environ.get("FUSELOG_CACHE")
-    if stated:
-        return Path(stated)
-    home = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (home if home.is_absolute() else Path.home() / ".cache") / "fuselog"
 
 
 def is_private(folder: Path) -> bool:

@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
+from recorders import environment
 from replay.engine.compiling.notices import done_once
 from replay.engine.compiling.scratch import Memory, Scratch
 
@@ -205,7 +206,7 @@ def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int],
 
 def use_cores(count: int) -> None:
     """Have kernels of this process use so many cores."""
-    os.environ["NUMBA_NUM_THREADS"] = str(count)
+    os.environ[environment.CORES] = str(count)
     core_count.cache_clear()
     _helpers.cache_clear()
 
@@ -213,9 +214,9 @@ def use_cores(count: int) -> None:
 @cache
 def core_count() -> int:
     """Count how many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
-    asked = os.environ.get("NUMBA_NUM_THREADS", "")
-    if asked.isdigit() and int(asked) > 0:
-        return int(asked)
+    asked = environment.core_count()
+    if asked is not None:
+        return asked
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
@@ -228,4 +229,4 @@ def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
 
 def is_uncompiled() -> bool:
     """Tell whether kernels are plain Python now."""
-    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
+    return environment.is_on(environment.UNCOMPILED)

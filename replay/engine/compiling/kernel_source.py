@@ -3,7 +3,6 @@
 import ast
 import copy
 import inspect
-import os
 import sys
 from collections.abc import Mapping
 from hashlib import sha256
@@ -12,6 +11,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from recorders import environment
 from recorders.errors import BadInput
 from replay.engine.compiling.kernels.program import definition_of
 
@@ -36,7 +36,7 @@ class KernelSource:
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
         inner += ", pipeline_class=Inlined"
-        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        bounds = ", boundscheck=True" if environment.is_on(environment.BOUNDSCHECK) else ""
         self.options = f"_nrt=True{bounds}"
         self._decorator = f"@numba.njit({inner}, {self.options})"
         self.definitions: dict[str, str] = {}

@@ -17,13 +17,14 @@ import psutil
 
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
+from recorders.processes import start_module
 from replay.engine.compiling.compile import core_count
 from replay.engine.streams.blocks import copied
 from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
 from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
 from replay.foreign.native.library import Library
-from replay.foreign.processes.orphans import GUARD, family, kill_family, start_module
+from replay.foreign.processes.orphans import GUARD, family, kill_family
 from replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
 from replay.foreign.processes.worker import IDLE
 from replay.foreign.results import begun, results

@@ -10,10 +10,11 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import psutil
+
+from recorders.processes import start_module
 
 
 def family(process: psutil.Process) -> list[psutil.Process]:
@@ -29,19 +30,6 @@ def kill_family(process: psutil.Process) -> None:
     for each in family(process):
         with suppress(psutil.Error):
             each.kill()
-
-
-def start_module(module: str, **options: Any) -> "subprocess.Popen[bytes]":
-    """Start a module of ours in a process of its own; what it says on standard error goes nowhere."""
-    root = str(Path(__file__).parents[3])  # what we are imported from, whatever the folder is
-    paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": paths, "NUMBA_NUM_THREADS": "1"},
-        **options,
-    )
 
 
 class _Guard:

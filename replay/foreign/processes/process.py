@@ -8,6 +8,7 @@ from contextlib import suppress
 import psutil
 
 from recorders.errors import BadInput, printable
+from recorders.processes import users_environment
 from replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
 from replay.foreign.processes.orphans import GUARD
 
@@ -21,7 +22,11 @@ class Program:
         """Start a program; raises BadInput where it cannot be started."""
         try:
             self.process = subprocess.Popen(
-                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+                words,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=users_environment(),
             )
         except OSError as error:
             raise BadInput(

@@ -15,6 +15,7 @@ import fuselog as fl
 from fuselog import BadInput
 from recorders.log import RunMetadata, make_stream, schemas, write_log
 from recorders.log.opening import Topic
+from recorders.processes import safe_spawning
 from recorders.recording import Recording
 from replay.engine.replaying.estimator import configure
 from replay.engine.streams.sources import memory_source
@@ -22,6 +23,7 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.foreign.description import TopicRead
 from replay.foreign.files.estimates import read_estimates
 from replay.foreign.naming import Allowed
+from replay.foreign.processes.process import Program
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 
@@ -316,3 +318,12 @@ def test_a_log_of_a_program_needs_estimates_and_nothing_else(tmp_path: Path) -> 
         else:
             found = read_estimates(tmp_path / "log.mcap", "own", None)
             assert [each.schema.name for each in found.values()] == ["GaussianEstimate"]
+
+
+def test_a_program_has_the_environment_of_the_user() -> None:
+    """Though workers, which start it, keep the current folder off the path of Python."""
+    says = "import os; raise SystemExit('PYTHONSAFEPATH' in os.environ)"
+    with safe_spawning():
+        started = Program([sys.executable, "-c", says])
+        assert started.process.wait() == 0
+    started.end()

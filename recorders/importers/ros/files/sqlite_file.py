@@ -82,13 +82,20 @@ class SqliteFile:
         query = (
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places}) ORDER BY id"
         )
-        row = None
+        row, strange = None, 0
         try:
             for row in database.execute(query, chosen):
-                yield row
+                if type(row[1]) is int and type(row[2]) is bytes:
+                    yield row
+                else:
+                    strange += 1
         except sqlite3.Error as error:
             behind = "all messages are" if row is None else f"what follows the one of time {row[1]} is"
             self.losses.append(f"{self.path}: is damaged ({error}); {behind} lost")
+        if strange:
+            self.losses.append(
+                f"{self.path}: {strange} rows of messages have no whole stamp or no bytes, and are lost"
+            )
 
     def _batch(self, number: int, rows: list[_Row]) -> Batch:
         stamps_ns = np.array([row[1] for row in rows], np.int64)

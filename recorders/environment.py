@@ -1,0 +1,73 @@
+"""Reads the environment variables that fuselog heeds, and refuses what they cannot be."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from recorders.errors import BadInput
+
+UNCOMPILED, BOUNDSCHECK, TRACEBACK = "FUSELOG_UNCOMPILED", "FUSELOG_BOUNDSCHECK", "FUSELOG_TRACEBACK"
+CORES = "NUMBA_NUM_THREADS"
+
+
+def is_on(name: str) -> bool:
+    """Tell whether a switch is 1."""
+    return os.environ.get(name) == "1"
+
+
+def is_set(name: str) -> bool:
+    """Tell whether a variable is stated and not empty."""
+    return bool(os.environ.get(name))
+
+
+def core_count() -> int | None:
+    """Return how many cores kernels may use, if that is stated."""
+    stated = os.environ.get(CORES, "")
+    return int(stated) if _is_count(stated) and int(stated) > 0 else None
+
+
+def processor() -> tuple[str | None, str | None]:
+    """Return the processor and its features that code is compiled for, as numba reads them."""
+    return os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
+
+
+def cache_folder() -> Path:
+    """Find where this user's computed results are kept.
+
+    FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. By XDG's specification a relative
+    path there does not count.
+    """
+    stated = os.environ.get("FUSELOG_CACHE")
+    if stated:
+        return Path(stated)
+    home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (home if home.is_absolute() else Path.home() / ".cache") / "fuselog"
+
+
+def check() -> None:
+    """Raise BadInput if a variable is set to what it cannot be.
+
+    matplotlib takes MPLBACKEND for the name of a window system, which no command needs: it is dropped.
+    """
+    for name, (is_valid, expected) in _EXPECTED.items():
+        stated = os.environ.get(name)
+        if stated is not None and not is_valid(stated):
+            raise BadInput(f"{name}={stated}: expected {expected}; correct the variable, or unset it")
+    os.environ.pop("MPLBACKEND", None)
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 16
+
+
+def _is_switch(text: str) -> bool:
+    return text in ("", "0", "1")
+
+
+# What is valid of each variable, and what a sentence says of it.
+_EXPECTED: dict[str, tuple[Callable[[str], bool], str]] = {
+    UNCOMPILED: (_is_switch, "1"),
+    BOUNDSCHECK: (_is_switch, "1"),
+    CORES: (lambda text: _is_count(text) and int(text) > 0, "a number of cores, from 1 on"),
+    "SOURCE_DATE_EPOCH": (_is_count, "whole seconds since 1970"),
+}

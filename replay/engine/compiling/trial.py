@@ -1,0 +1,43 @@
+"""Tries, in a process of its own, the processor that the environment asks to compile for.
+
+LLVM ends the process that gives it a processor or features that do not go together.
+"""
+
+import subprocess
+from functools import cache
+
+from recorders import environment
+from recorders.errors import BadInput
+from recorders.processes import start_module
+
+
+def require_processor() -> None:
+    """Raise BadInput if code cannot be compiled for the processor that is asked for, if one is."""
+    if any(environment.processor()):
+        _try(*environment.processor())
+
+
+@cache
+def _try(name: str | None, features: str | None) -> None:
+    process = start_module(__name__, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    said = process.communicate()[1].decode(errors="replace").strip()
+    if said or process.returncode:
+        stated = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features}
+        what = ", ".join(f"{each}={value}" for each, value in stated.items() if value)
+        why = said.splitlines()[0] if said else f"exit code {process.returncode}"
+        raise BadInput(
+            f"{what}: LLVM cannot compile for this ({why}); correct the variable, or unset it"
+        )
+
+
+def main() -> None:
+    """Compile a function that adds for the processor that is asked for."""
+    from replay.engine.compiling.kernels.native import object_code
+
+    object_code(
+        "define double @add(double %a, double %b) {\n %c = fadd double %a, %b\n ret double %c\n}"
+    )
+
+
+if __name__ == "__main__":
+    main()
