@@ -249,6 +249,13 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "force in g": (force(lambda f: f / 9.80665), IMU, "gravity", "in g"),
     "force in mg": (force(lambda f: f / 9.80665e-3), IMU, "gravity", "in mg"),
     "z down": (force(lambda f: f * [1, -1, -1]), IMU, "gravity", "z axis is down"),
+    "no forces": (force(lambda f: 0.0 * f), IMU, "values", "forces are exactly zero in all"),
+    "no turn rates": (
+        column(IMU, "turn_rate_radps", lambda w: 0.0 * w),
+        IMU,
+        "values",
+        "turn rates are exactly zero in all",
+    ),
     "upright": (force(lambda f: f[:, [2, 1, 0]]), IMU, "mounting", "x axis up"),
     "variance -1": (variance(setting(0, 600, -1.0, 0)), FIX, "covariance", "-1"),
     "variance 0": (variance(setting(0, 9, 0.0)), FIX, "covariance", "zero in 9"),

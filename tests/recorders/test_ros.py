@@ -526,6 +526,39 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     assert run.notes == notes
 
 
+def test_halves_that_a_message_says_it_has_not_are_missing(tmp_path: Path) -> None:
+    """A covariance that begins with -1: what stands beside it is no measurement, row by row."""
+    make, none = Maker(), [-1.0, *[0.0] * 8]
+    kinds = {
+        "whole": {},
+        "accelerometer": {"angular_velocity_covariance": none, "angular_velocity__z": np.nan},
+        "gyro": {"linear_acceleration_covariance": none},
+        "neither": {"angular_velocity_covariance": none, "linear_acceleration_covariance": none},
+    }
+    sent: list[Sent] = [
+        ("/imu", START_NS + number, make("sensor_msgs/msg/Imu", START_NS + number, **given))
+        for number, given in enumerate(kinds.values())
+    ]
+    no_twist = [-1.0, *[0.0] * 35]
+    sent += [
+        ("/odom", START_NS + number,
+         make("nav_msgs/msg/Odometry", START_NS + number, twist__covariance=[own] * 36))
+        for number, own in enumerate((1.0, -1.0))
+    ]  # fmt: skip
+    sent[-1][2].twist.covariance[:] = no_twist
+    streams, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    inertial = streams["/inertial"]
+    assert inertial.publish_time_ns.tolist() == [START_NS + number for number in range(3)]
+    assert np.isfinite(inertial["specific_force_mps2"]).all(axis=1).tolist() == [True, True, False]
+    assert np.isfinite(inertial["turn_rate_radps"]).all(axis=1).tolist() == [True, False, True]
+    without = "/imu: inertial kept without"
+    assert notes[f"{without} specific forces: linear_acceleration_covariance[0] is -1"] == "1"
+    assert notes[f"{without} turn rates: angular_velocity_covariance[0] is -1"] == "1"
+    assert notes["/imu: inertial dropped: without specific forces and turn rates"] == "1"
+    assert len(streams["/odometry"]) == 1
+    assert notes["/odom: odometry dropped: without a twist: twist.covariance[0] is -1"] == "1"
+
+
 def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
     """Attachments and metadata of an MCAP bag; an attachment whose name is not whole is a loss."""
     make, name, path = Maker(), "std_msgs/msg/Float64", tmp_path / "bag.mcap"

@@ -107,7 +107,11 @@ class StreamMaker:
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
-        dropped["NaN or infinite"] = not_finite(part.schema, part.columns)
+        stated = {
+            field: np.where(part.lacking[field][:, None], 0.0, column) if field in part.lacking else column
+            for field, column in part.columns.items()
+        }
+        dropped["NaN or infinite"] = not_finite(part.schema, stated)
         if sent.stamp_ns is not None and self._clock == "header":
             own = sent.stamp_ns if part.rows is None else sent.stamp_ns[part.rows]
             dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0
