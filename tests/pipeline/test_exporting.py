@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 import fuselog as fl
 
@@ -58,6 +59,28 @@ def test_poses_are_trajectories(fuselog: Fuselog) -> None:
         np.loadtxt("log-tum/mocap-body.txt"),
         [[0, 1, 2, 3, 0.5, -0.5, 0.5, 0.5], [2, 4, 5, 6, 0.0, 0.0, 0.8, 0.6]],
     )
+
+
+def test_a_trajectory_goes_through_a_log_and_back(fuselog: Fuselog) -> None:
+    """Stamps to the nanosecond, positions to the last digit, rotations to the digits written."""
+    rng = np.random.default_rng(4)
+    quaternions = Rotation.random(50, rng=rng).as_quat()
+    stamps_ns = 1_403_636_579_763_555_584 + np.cumsum(rng.integers(1, 10**9, 50))
+    lines = [
+        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{number:.7f}" for number in pose)
+        for stamp, pose in zip(
+            stamps_ns.tolist(), np.hstack([1e3 * rng.normal(size=(50, 3)), quaternions]), strict=True
+        )
+    ]
+    Path("way.txt").write_text("\n".join(lines))
+    imported = fuselog("import", "table", "way.txt", "--mapping", "tum", "-o", "log.mcap")
+    assert "read as TUM (8 numbers: time in s" in imported.out
+    assert fuselog("export", "log.mcap", "--to", "tum", "-o", "back.txt", "--topic", "/truth").code == 0
+    given, back = (np.genfromtxt(name, dtype=str) for name in ("way.txt", "back.txt"))
+    assert_array_equal(back[:, 0], given[:, 0])
+    assert_array_equal(back[:, 1:4].astype(float), given[:, 1:4].astype(float))
+    apart = Rotation.from_quat(back[:, 4:].astype(float)) * Rotation.from_quat(quaternions).inv()
+    assert apart.magnitude().max() < 4e-7
 
 
 @pytest.mark.parametrize("to", ["csv", "parquet"])

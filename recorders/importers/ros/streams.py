@@ -107,11 +107,10 @@ class StreamMaker:
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
-        stated = {
-            field: np.where(part.lacking[field][:, None], 0.0, column) if field in part.lacking else column
-            for field, column in part.columns.items()
-        }
-        dropped["NaN or infinite"] = not_finite(part.schema, stated)
+        known = dict(part.columns)
+        for name, lacks in part.lacking.items():
+            known[name] = np.where(lacks[:, None], 0.0, known[name])
+        dropped["NaN or infinite"] = not_finite(part.schema, known)
         if sent.stamp_ns is not None and self._clock == "header":
             own = sent.stamp_ns if part.rows is None else sent.stamp_ns[part.rows]
             dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0
