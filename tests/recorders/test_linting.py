@@ -287,6 +287,12 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "place",
         "46.7 m below",
     ),
+    "altitudes leap": (
+        column(FIX, "altitude_m", lambda h: h + 47.0 * (np.arange(len(h)) % 7 == 3)),
+        FIX,
+        "place",
+        "its altitude leaps 172 times, by up to 51.56 m",
+    ),
     "places in NED": (
         lambda s: column("/place", "position_m", lambda p: p[:, [1, 0, 2]] * [1, 1, -1])(driving(s)),
         "/place",
