@@ -161,7 +161,7 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
     note = f"{path}: read as {found.upper().replace('EUROC', 'EuRoC')} ({layout.columns})"
     if layout.time_ns is None:
         return Trajectory(str(path), position_m, rotation, notes=(note,))
-    stamps = [layout.time_ns(fields[0]) for fields in rows]
+    stamps: list[int | Decimal] = [layout.time_ns(fields[0]) for fields in rows]
     beyond = [abs(stamp) >= 2**63 for stamp in stamps]
     _refuse(beyond, path, numbers, f"has a stamp beyond the year 2262; {_wanted(found)}")
     _refuse([stamp != int(stamp) for stamp in stamps], path, numbers, _NO_NS)
@@ -170,7 +170,9 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
 
 def _lines(path: Path) -> tuple[str, list[int], list[str]]:
     """Return the last comment before the poses, and the lines that hold something: numbers and texts."""
-    comment, numbers, lines = "", [], []
+    comment = ""
+    numbers: list[int] = []
+    lines: list[str] = []
     try:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):

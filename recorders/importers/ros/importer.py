@@ -103,8 +103,13 @@ class _Import:
         self._clocks.note(topic, sent.stamp_ns, log_time_ns)
         frames = _frames_of(messages, reader.frame)
         for part in reader.taken.parts(messages):
-            is_truth = topic == self._parameters.truth and part.schema is schemas.POSE
-            self._streams.add(sent, as_truth(part) if is_truth else part, frames)
+            if topic != self._parameters.truth:
+                self._streams.add(sent, part, frames)
+            elif part.schema is schemas.POSE:
+                self._streams.add(sent, as_truth(part), frames)
+            else:
+                fact = f"{part.kind} left out, since a filter must not read what is from the truth"
+                self._streams.tell(topic, fact, len(messages))
 
     # Transforms.
 

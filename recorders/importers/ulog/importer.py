@@ -56,7 +56,7 @@ def _surroundings(path: Path) -> _Surroundings:
         if place is not None and separation_m is not None:
             break
     separation_m = separation_m or 0.0
-    origin = None if place is None else Origin(*place[:2], place[2] + separation_m)
+    origin = None if place is None else Origin(place[0], place[1], place[2] + separation_m)
     instances = sorted(((topic, instance) for topic, instance in file.rows), reverse=True)
     return _Surroundings(origin, separation_m, dict(instances))
 

@@ -187,7 +187,7 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
             data[:, columns[name]] = numbers
     # one that says nothing, or cannot be interpolated, is as if it had not come
     known = np.isfinite(read)
-    says_nothing = ~(known.all(axis=1) if control.interpolated else known.any(axis=1))
+    says_nothing = np.logical_not(known.all(axis=1) if control.interpolated else known.any(axis=1))
     return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), says_nothing)
 
 
