@@ -162,7 +162,7 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
     if layout.time_ns is None:
         return Trajectory(str(path), position_m, rotation, notes=(note,))
     stamps: list[int | Decimal] = [layout.time_ns(fields[0]) for fields in rows]
-    beyond = [abs(stamp) >= 2**63 for stamp in stamps]
+    beyond = [not -(2**63) < stamp < 2**63 for stamp in stamps]
     _refuse(beyond, path, numbers, f"has a stamp beyond the year 2262; {_wanted(found)}")
     _refuse([stamp != int(stamp) for stamp in stamps], path, numbers, _NO_NS)
     return _in_order(str(path), position_m, rotation, np.array(list(map(int, stamps)), np.int64), note)

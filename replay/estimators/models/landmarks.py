@@ -248,7 +248,13 @@ DRIVE_CALIBRATION: Mapping[str, float] = {
     "turn_bias_radps": 0.01,
 }
 MOTION = Motion(move, control_noise=velocity_noise)
-TURN_RATE = Control("turn_rate", schemas.INERTIAL_SAMPLE, ("turn_radps",), read_turn_rate)
+TURN_RATE = Control(
+    "turn_rate",
+    schemas.INERTIAL_SAMPLE,
+    ("turn_radps",),
+    read_turn_rate,
+    noise={"turn_noise_density": ("turn_noise_density", "gyro_noise_density")},
+)
 ODOMETRY = Control(
     "odometry",
     schemas.ODOMETRY,
