@@ -33,6 +33,7 @@ _CLOCKED = {
     schemas.MAGNETIC_FIELD.full_name,
     schemas.ODOMETRY.full_name,
 }
+_DRIVING = {schemas.INERTIAL_SAMPLE.full_name, schemas.ODOMETRY.full_name}
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
 
@@ -92,6 +93,11 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         )
         return
     things = _things(stream, streams)[rows]
+    use = (
+        "a model that they drive takes the mean of both"
+        if stream.schema.full_name in _DRIVING
+        else "both are used, in the file's order"
+    )
     same = (np.diff(stamps_ns) == 0) & (np.diff(things) == 0)
     if same.any() and stream.schema.full_name in REGULARS:
         first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))
@@ -101,8 +107,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             "",
             float(same.sum()),
             f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the stamp of the one "
-            f"before, the first {first_s:.4g} s after its first stamp: both are used, in "
-            f"the file's order",
+            f"before, the first {first_s:.4g} s after its first stamp: {use}",
             mapping="leave one of them out where the log is written",
             sure="fact",
         )

@@ -21,7 +21,7 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
-from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
+from replay.inference.run.timing import last_of_stamps, select_events, share_stamps, where_wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +141,8 @@ def filter_events(
         events = _inserted(events, again)
     if without_covariance.any() or again:
         events = events._replace(wants_estimate=last_of_stamps(events))
+    if control is not None and not events.arrival.shape[1]:
+        events = share_stamps(events, range(start, start + len(control.components)))
     return events._replace(wants_estimate=where_wanted(stage, events)), without_covariance
 
 
