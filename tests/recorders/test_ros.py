@@ -31,6 +31,7 @@ from recorders.importers.ros.layouts import Messages, MessageType, by_size, defi
 from recorders.importers.ros.messages import TYPES
 from recorders.importers.ros.parameters import RosParameters
 from recorders.log import Stream, open_log, read_streams
+from recorders.models.inertial import from_mounting
 from recorders.recording import import_log, import_run
 
 pytestmark = pytest.mark.paper
@@ -389,6 +390,49 @@ def test_named_transforms_are_composed(real_data: Path) -> None:
     error = (between * rotations(below)[rows]).inv() * rotations(chain)
     assert error.magnitude().max() < 1e-6
     assert 2600 < len(chain) < 2639
+
+
+@pytest.mark.parametrize("is_static", [True, False])
+def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is_static: bool) -> None:
+    """Over a mast, as sent once or as ever the same; a frame that moves on the body has none."""
+    make, turn = Maker(), Rotation.from_euler("xyz", [0.1, -0.4, 2.0])
+    links = [
+        ("base_link", "mast", (0.5, 0.1, 0.2), Rotation.from_euler("z", 90, degrees=True)),
+        ("mast", "antenna", (0.3, 0.0, 1.0), Rotation.identity()),
+        ("base_link", "unit", (0.1, 0.0, 0.3), turn),
+    ]
+    transform = "geometry_msgs/msg/TransformStamped"
+    message_type = make.store.types["tf2_msgs/msg/TFMessage"]
+    sent: list[Sent] = []
+    for step in range(4):
+        stamp_ns = START_NS + step * STEP_NS
+        moving = [("base_link", "arm", (0.1 * step, 0.0, 0.0), Rotation.identity())]
+        fixed = links if not (is_static and step) else []
+        for topic, pairs in (("/tf_static" if is_static else "/tf", fixed), ("/tf", moving)):
+            parts = [
+                make(transform, stamp_ns, header__frame_id=parent, child_frame_id=child,
+                     transform__rotation=about.as_quat(),
+                     transform__translation__x=place[0], transform__translation__y=place[1],
+                     transform__translation__z=place[2])
+                for parent, child, place, about in pairs
+            ]  # fmt: skip
+            if parts:
+                sent.append((topic, stamp_ns, message_type(transforms=parts)))
+        sent.append(("/imu", stamp_ns, make("sensor_msgs/msg/Imu", stamp_ns, header__frame_id="unit")))
+        for topic, frame in (("/fix", "antenna"), ("/arm/fix", "arm")):
+            fix = make("sensor_msgs/msg/NavSatFix", stamp_ns, header__frame_id=frame)
+            sent.append((topic, stamp_ns, fix))
+    _, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    told = {key: note for key, note in notes.items() if key.endswith(", mounting")}
+    assert set(told) == {"/fix, mounting", "/inertial, mounting"}
+    assert told["/fix, mounting"] == (
+        "its frame antenna is 0.5, 0.4, 1.2 m forward, left and up of base_link; used by "
+        "--set lever_x_m=0.5 --set lever_y_m=0.4 for the model robot, or "
+        "--set lever_x_m=0.4 --set lever_y_m=0.4 --set lever_z_m=0.9 for the model inertial"
+    )
+    angles = [float(each) for each in re.findall(r"mounting_\w+_rad=(\S+)", told["/inertial, mounting"])]
+    vector = np.array([1.0, 2.0, 3.0])
+    assert from_mounting(*angles, vector) == pytest.approx(turn.apply(vector), abs=1e-4)
 
 
 def test_a_sqlite_bag(real_data: Path, tmp_path: Path) -> None:

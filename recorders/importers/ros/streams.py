@@ -83,6 +83,11 @@ class StreamMaker:
         """Count the messages that have come of the bag."""
         return sum(written.messages for written in self._written.values())
 
+    @property
+    def described(self) -> dict[str, tuple[str, Mapping[str, str]]]:
+        """Return the messages' names and the metadata of all streams, by topic."""
+        return {topic: (each.schema.full_name, each.metadata) for topic, each in self._written.items()}
+
     def tell(self, subject: str, fact: str, count: int) -> None:
         """Count a fact."""
         if count:
