@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from mcap.writer import Writer
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -104,6 +105,20 @@ def test_tables(to: Any, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             )
         else:
             assert (len(found), list(found)[:2]) == (0, ["publish_time_ns", "log_time_ns"])
+
+
+def test_a_log_without_numbers_is_said_to_have_none(fuselog: Fuselog) -> None:
+    with Path("log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("own", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/own", "json", schema), 1, b"{}", 1)
+        writer.finish()
+    said = fuselog("export", "log.mcap", "--to", "csv")
+    assert said.code == 2
+    assert "has no topic whose messages are numbers" in said.err
+    assert "topic /own is own in the encoding 'json'" in said.err
+    assert "export it as csv" not in said.err
 
 
 def test_what_a_pose_lacks_is_said() -> None:

@@ -133,6 +133,17 @@ def test_tuning_and_diagnosing_refuse_it_too() -> None:
         fl.tune(drive(), settings, ["forward_noise_density"])
 
 
+def test_a_truth_of_another_name_is_diagnosed_by(tmp_path: Path) -> None:
+    """By the setting that a replay takes as well."""
+    log, settings = tmp_path / "log.mcap", {"topics": {"truth": "/survey/places"}}
+    odometry, fix, truth = car(ORIGIN, ORIGIN)
+    fl.write(log, [odometry, fix, replace(truth, topic="/survey/places")])
+    found = fl.diagnose(log, "ekf", set=settings)
+    assert not any("no truth" in note for note in found.notes)
+    judged = fl.replay(log, "ekf", set=settings).metrics
+    assert any("position_rmse_m" in key for key in judged)
+
+
 def test_a_bound_may_know_it_and_a_replay_may_start_from_it() -> None:
     first = driven()[0][:1]
     spread = np.diag([1.0, 1.0, 0.01]).ravel()
