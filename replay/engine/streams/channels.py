@@ -48,6 +48,15 @@ def _number(
     return value
 
 
+def heading_variance(metadata: Mapping[str, str]) -> float:
+    """Return the variance (rad^2) that a channel of orientations states about up; NaN where it is none.
+
+    It states one number for all axes, or the covariance about x, y and z.
+    """
+    numbers = [float(each) for each in metadata.get("covariance_rad2", "nan").split(",")]
+    return numbers[-1] if numbers[-1] > 0.0 else np.nan
+
+
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
     """Return a parameter; where it is None, what a channel states for it. Errors as `stated`.
 

@@ -175,6 +175,8 @@ class Sensor:
             the measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
         log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
             that can use it.
+        stated: parameters that its channel may state in another form: metadata -> number, NaN where it
+            does not.
     """
 
     topic: str
@@ -195,6 +197,7 @@ class Sensor:
     jacobian: Function | None = None
     moments: Function | None = None
     log_likelihood: Function | None = None
+    stated: Mapping[str, Callable[[Mapping[str, str]], float]] = field(default_factory=dict)
 
     @property
     def maps(self) -> tuple[Map, ...]:

@@ -91,6 +91,10 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
             for first in own
         ]
     )
+    for row, (sensor, topic) in enumerate(found.sensors, start=1):
+        for name, read in sensor.stated.items():
+            if given[name] is None and name not in topic.metadata and not np.isnan(read(topic.metadata)):
+                settings[row, names.index(name)] = read(topic.metadata)
     lacking = [
         (row, name)
         for row, read in enumerate(needed)

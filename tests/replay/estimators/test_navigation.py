@@ -390,6 +390,38 @@ def test_of_two_samples_of_one_stamp_both_count():
     assert 2.0 * np.arctan2(z, w) == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_heading_may_state_its_covariance():
+    """As headings of tables and of ROS do; the robot's model takes it too."""
+    stamps_ns = 10**9 + 10**7 * np.arange(500)
+    unit = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps_ns,
+        specific_force_mps2=np.tile([0.0, 0.0, 9.80665], (500, 1)),
+        turn_rate_radps=np.zeros((500, 3)),
+        magnetic_field_ut=np.full((500, 3), np.nan),
+    )
+    fix = make_stream(
+        "/fix",
+        schemas.POSITION_FIX,
+        stamps_ns[::100],
+        position_m=np.zeros((5, 3)),
+        covariance_m2=np.ones((5, 3)),
+    )
+    found = []
+    for states in ({"sigma_heading_rad": "0.02"}, {"covariance_rad2": "0.5,0,0,0,0.5,0,0,0,0.0004"}):
+        heading = make_stream(
+            "/heading",
+            schemas.ORIENTATION,
+            stamps_ns[50::100],
+            metadata=states,
+            quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+        )
+        source = memory_source(Recording([unit, fix, heading]), RunMetadata("turns", epoch_ns=10**9))
+        found.append(outputs(INERTIAL, "ekf", [source])["state"]["covariance"])
+    assert_allclose(*found, rtol=1e-12)
+
+
 @pytest.mark.parametrize("states", [True, False])
 def test_gravity_is_that_of_the_fixes(states: bool):
     """A body that rests at 5 deg: at 45 deg gravity is 0.026 m/s2 more, and would be a bias."""
