@@ -215,11 +215,15 @@ def _recognised(
                 f"{path}: its stamps, from {rows[0][0]} to {rows[-1][0]}, may be s or ns: give "
                 '--format tum or --format euroc; in a mapping, format = "tum" or "euroc"'
             )
-        if unit != "s":
-            what = "ns with spaces, where EuRoC has commas and w first" if unit == "ns" else unit
+        if unit == "ns":
             raise BadInput(
-                f"{path}: its stamps are in {what}: it is neither TUM nor EuRoC; fuselog import table "
-                "with a mapping makes a log of it, or --format euroc reads its columns as EuRoC's"
+                f"{path}: its stamps are in ns, with spaces, where EuRoC has commas: give --format "
+                "euroc if the quaternion's w is first; otherwise import it as a table, with a mapping"
+            )
+        if unit != "s":
+            raise BadInput(
+                f"{path}: its stamps are in {unit}, and those of TUM in s, of EuRoC in ns; import it as "
+                "a table, with a mapping"
             )
     layouts = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
     numbered = "its first column numbers the poses: leave it out; or " if _is_numbered(rows) else ""

@@ -52,7 +52,8 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     name = stream.schema.full_name
     if len(stream) < FEWEST or name not in REGULARS:
         return
-    rate_hz = 1e9 / max(float(np.median(_steps_ns(stream))), 1e-3)
+    steps_ns = _steps_ns(stream)
+    rate_hz = 1e9 / float(np.median(steps_ns[steps_ns > 0] if steps_ns.any() else 1e-3))
     fastest_hz = FASTEST_FIX_HZ if name in _FIXES else FASTEST_HZ
     is_slow = name == schemas.INERTIAL_SAMPLE.full_name and rate_hz < SLOWEST_HZ
     if not is_slow and rate_hz <= fastest_hz:

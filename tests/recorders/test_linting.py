@@ -337,6 +337,24 @@ def test_rows_that_are_there_twice_are_counted() -> None:
     assert "2 of its 82 messages are there twice" in found.words
 
 
+def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
+    """Ten samples get one stamp: they repeat, and their unit is right."""
+    [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
+    assert "have the stamp of the one before" in found.words
+    assert "a model that they drive takes the mean" in found.words
+
+
+def test_what_is_missing_is_not_frozen() -> None:
+    """Of a unit whose gyro stops: its turn rates were still before, and are missing after."""
+
+    def stop(rates: Any) -> None:
+        rates[:200], rates[200:] = 0.0, np.nan
+
+    stopping = column(IMU, "turn_rate_radps", stop)
+    streams = stopping(clean(1))
+    assert not [each for each in lint([streams]) if "frozen" in each.words]
+
+
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:
     for frame, ours, mend in (
         ("base_link_frd", "forward, left, up", "mounting_deg = [180, 0, 0]"),

@@ -499,8 +499,9 @@ def test_instances_of_a_topic_have_streams_of_their_own(tmp_path: Path):
         ([0.0, 0.0, 0.0, 0.0, 535.0, 535.0], 47.0),
         ([488.0 + 151.0] * 6, 0.0),
         ([np.nan] * 6, 0.0),
+        ([2147483.0] * 6, 0.0),
     ],
-    ids=["zero", "good", "garbage", "zero at first", "far", "missing"],
+    ids=["zero", "good", "garbage", "zero at first", "far", "missing", "largest"],
 )
 def test_a_height_above_the_ellipsoid_that_is_none_is_that_above_the_sea(
     tmp_path: Path, is_new: bool, ellipsoid_m: list[float], separation_m: float

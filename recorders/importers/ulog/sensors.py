@@ -209,7 +209,7 @@ def gnss(fields: Fields) -> Iterator[Part]:
     else:
         place = fields.vector("lat", "lon") * 1e-7
     ellipsoid_m, sea_m, agree = heights(fields)
-    is_wrong = ~agree & np.isfinite(sea_m) & ((sea_m != 0.0) | ~np.isfinite(ellipsoid_m))
+    is_wrong = ~agree & np.isfinite(sea_m)
     height_m = np.where(is_wrong, sea_m + fields.separation_m, ellipsoid_m)
     own = fields.rows.topic == "vehicle_gps_position"
     name = fields.named("{}") if own else f"{{}}_{fields.rows.instance}"
