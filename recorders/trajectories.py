@@ -2,7 +2,8 @@
 
 A line of a TUM file is time (s), position and quaternion x, y, z, w; of a KITTI file the upper three
 rows of a pose's matrix, without a stamp; of a EuRoC file, with commas, time (ns), position, quaternion
-w, x, y, z, and more that is no part of the pose.
+w, x, y, z, and more that is no part of the pose. Stamps tell TUM, with spaces or commas, from EuRoC:
+where they may be either, the file is refused.
 """
 
 import re
@@ -23,6 +24,11 @@ Format = Literal["tum", "kitti", "euroc"]
 
 # How far quaternions may be from unit length, and matrices from orthogonal: they are printed numbers.
 TOLERANCE = 1e-3
+# From how far on a quaternion is no rounded one, but something else.
+NEARLY = 0.1
+# Stamps in s end in 2262. Steps in s are less than the first of these, in ns more than the second.
+MOST_S, SLOWEST_S, FASTEST_NS = 9.2e9, 1e4, 1e6
+_NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
 # Squares of positions that are farther away, and their sums, may be no numbers any more.
 FARTHEST_M = 1e100
 
@@ -37,7 +43,7 @@ class Trajectory:
         rotation: (n, 3, 3) from the body's frame to that of the positions, to as many digits as the
             source states; None where there is none.
         time_ns: (n,); None where there are no stamps.
-        notes: sentences on what was mended.
+        notes: sentences on the format that was found, and on what was corrected.
     """
 
     name: str
@@ -82,7 +88,7 @@ class _Layout(NamedTuple):
     least: int
     most: float
     position: list[int]
-    time_ns: Callable[[str], int] | None = None
+    time_ns: Callable[[str], int | Decimal] | None = None
 
 
 def _seconds_ns(text: str) -> int:
@@ -106,7 +112,7 @@ LAYOUTS: dict[Format, _Layout] = {
         8,
         np.inf,
         [1, 2, 3],
-        lambda text: int(_exact(text)),
+        _exact,
     ),
 }
 
@@ -119,14 +125,15 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         format: one of `Format`; by default the content tells.
 
     Returns:
-        The poses in the order of time; `notes` of them say what was mended.
+        The poses in the order of time; `notes` of them say as what they were read, and what was
+        corrected.
 
-    Raises BadInput that names the line where the file holds no trajectory.
+    Raises BadInput that names the line where the file holds no trajectory, or may be of two formats.
     """
-    numbers, lines = zip(*_lines(Path(path)), strict=True)
-    found = _recognised(path, numbers[0], lines[0]) if format is None else _known(format)
-    layout = LAYOUTS[found]
+    comment, numbers, lines = _lines(Path(path))
     rows = list(map(_fields, lines))
+    found = _recognised(path, numbers, lines, rows) if format is None else _known(format)
+    layout = LAYOUTS[found]
     values = np.empty((len(rows), layout.least))
     for row, (number, fields) in enumerate(zip(numbers, rows, strict=True)):
         if not layout.least <= len(fields) <= layout.most:
@@ -141,6 +148,7 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         numbers,
         "has a value that is not finite; remove the line",
     )
+    _check_header(path, comment, found)
     if found == "kitti":
         rotation = values.reshape(-1, 3, 4)[:, :, :3]
         off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
@@ -148,53 +156,127 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         _refuse(bad, path, numbers, "has a matrix that is not a rotation; give an orthogonal one")
     else:
         quaternion = values[:, 4:]
-        bad = np.abs(np.linalg.norm(quaternion, axis=1) - 1) > TOLERANCE
-        _refuse(bad, path, numbers, "has a quaternion that is not of unit length; scale it to 1")
+        norm = np.linalg.norm(quaternion, axis=1)
+        bad = np.abs(norm - 1) > TOLERANCE
+        mend = (
+            "scale it to 1"
+            if np.all(np.abs(norm - 1) < NEARLY)
+            else f"check what it is; {_wanted(found)}"
+        )
+        _refuse(bad, path, numbers, f"has a quaternion that is not of unit length; {mend}")
         rotation = Rotation.from_quat(quaternion, scalar_first=found == "euroc").as_matrix()
     position_m = values[:, layout.position]
+    note = f"{path}: read as {found.upper().replace('EUROC', 'EuRoC')} ({layout.columns})"
     if layout.time_ns is None:
-        return Trajectory(str(path), position_m, rotation)
-    stamps = [layout.time_ns(fields[0]) for fields in rows]
-    beyond = [abs(stamp) >= 2**63 for stamp in stamps]
+        return Trajectory(str(path), position_m, rotation, notes=(note,))
+    stamps: list[int | Decimal] = [layout.time_ns(fields[0]) for fields in rows]
+    beyond = [not -(2**63) < stamp < 2**63 for stamp in stamps]
     _refuse(beyond, path, numbers, f"has a stamp beyond the year 2262; {_wanted(found)}")
-    return _in_order(str(path), position_m, rotation, np.array(stamps, np.int64))
+    _refuse([stamp != int(stamp) for stamp in stamps], path, numbers, _NO_NS)
+    return _in_order(str(path), position_m, rotation, np.array(list(map(int, stamps)), np.int64), note)
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """List the lines that hold something, with their numbers."""
+def _lines(path: Path) -> tuple[str, list[int], list[str]]:
+    """Return the last comment before the poses, and the lines that hold something: numbers and texts."""
+    comment = ""
+    numbers: list[int] = []
+    lines: list[str] = []
     try:
         with path.open(encoding="utf-8-sig") as file:
-            lines = [
-                (number, line.strip())
-                for number, line in enumerate(file, 1)
-                if line.strip() and not line.lstrip().startswith("#")
-            ]
+            for number, line in enumerate(file, 1):
+                if line.lstrip().startswith("#"):
+                    comment = comment if lines else line
+                elif line.strip():
+                    numbers.append(number)
+                    lines.append(line.strip())
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror}; give a trajectory file") from None
     except UnicodeDecodeError:
         raise BadInput(f"{path}: is not a text file; give a trajectory as TUM, KITTI or EuRoC") from None
     if not lines:
         raise BadInput(f"{path}: has no poses; give a trajectory as TUM, KITTI or EuRoC")
-    return lines
+    return comment, numbers, lines
 
 
 def _fields(line: str) -> list[str]:
     return re.split(r"\s*,\s*|\s+", line)
 
 
-def _recognised(path: object, number: int, line: str) -> Format:
-    """Find the format that the first pose looks like."""
-    fields = _fields(line)
-    if "," in line and fields[0].isdigit() and len(fields) >= LAYOUTS["euroc"].least:
-        return "euroc"
-    for name in ("tum", "kitti"):
-        if len(fields) == LAYOUTS[name].least:
-            return name
+def _recognised(
+    path: object, numbers: Sequence[int], lines: Sequence[str], rows: Sequence[Sequence[str]]
+) -> Format:
+    """Find the format of poses, by the columns of the first and by the stamps of all.
+
+    Raises BadInput where they are of no format, or may be of two.
+    """
+    count, has_commas = len(rows[0]), "," in lines[0]
+    if count == LAYOUTS["kitti"].least and not (has_commas and _unit(rows) == "ns"):
+        return "kitti"
+    if count >= LAYOUTS["tum"].least and (count == LAYOUTS["tum"].least or has_commas):
+        unit = _unit(rows)
+        if count == LAYOUTS["tum"].least and (unit == "s" or not (unit or has_commas)):
+            return "tum"
+        if unit == "ns" and has_commas:
+            return "euroc"
+        if not unit:
+            raise BadInput(
+                f"{path}: its stamps, from {rows[0][0]} to {rows[-1][0]}, may be s or ns: give "
+                '--format tum or --format euroc; in a mapping, format = "tum" or "euroc"'
+            )
+        if unit == "ns":
+            raise BadInput(
+                f"{path}: its stamps are in ns, with spaces, where EuRoC has commas: give --format "
+                "euroc if the quaternion's w is first; otherwise import it as a table, with a mapping"
+            )
+        if unit != "s":
+            raise BadInput(
+                f"{path}: its stamps are in {unit}, and those of TUM in s, of EuRoC in ns; import it as "
+                "a table, with a mapping"
+            )
     layouts = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
+    numbered = "its first column numbers the poses: leave it out; or " if _is_numbered(rows) else ""
     raise BadInput(
-        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {layouts}; "
-        "fuselog import table makes a log of a table with other columns"
+        f"{path}: line {numbers[0]} is not a pose: it has {count} columns, where {layouts}; "
+        f"{numbered}fuselog import table makes a log of a table with other columns"
     )
+
+
+def _unit(rows: Sequence[Sequence[str]]) -> str:
+    """Tell the unit of stamps, s, ms, us or ns, by their size and steps; empty where it is open.
+
+    A pose comes more often than every three hours, and not more often than a thousand times a second.
+    Dates in ms and us are of 2001 to 2033.
+    """
+    try:
+        stamps = np.array([float(fields[0]) for fields in rows])
+    except ValueError:
+        return "s"  # whose reader names the line
+    steps = np.abs(np.diff(stamps))
+    typical, usual = float(np.median(stamps)), float(np.median(steps[steps > 0] if steps.any() else 0))
+    if 1e15 < typical < 2e15 or (1e12 < typical < 2e12 and usual < FASTEST_NS):
+        return "us" if typical > 1e13 else "ms"
+    if typical > MOST_S:
+        return "ns"
+    if np.any(stamps % 1.0) or 0.0 < usual < SLOWEST_S:
+        return "s"
+    return "ns" if usual > FASTEST_NS else ""
+
+
+def _is_numbered(rows: Sequence[Sequence[str]]) -> bool:
+    """Tell whether the first column counts the poses, from 0 or 1."""
+    first = [fields[0] for fields in rows]
+    return first in ([str(row + begin) for row in range(len(rows))] for begin in (0, 1))
+
+
+def _check_header(path: object, comment: str, name: Format) -> None:
+    """Raise BadInput where the columns' names in a comment say another order of the quaternion."""
+    places = [re.search(rf"\bq\w*?_?{axis}\b", comment.lower()) for axis in "wx"]
+    first, second = (place.start() if place else -1 for place in places)
+    if name != "kitti" and min(first, second) >= 0 and (first < second) != (name == "euroc"):
+        raise BadInput(
+            f"{path}: its header has the quaternion's w {'first' if first < second else 'last'}, where "
+            f"{_wanted(name)}; give another --format, or fuselog import table with a mapping"
+        )
 
 
 def _known(name: str) -> Format:
@@ -213,12 +295,14 @@ def _refuse(bad: ArrayLike, path: object, numbers: Sequence[int], what: str) -> 
         raise BadInput(f"{path}: line {numbers[int(np.argmax(bad))]} {what}")
 
 
-def _in_order(name: str, position_m: Floats, rotation: Floats, time_ns: NDArray[np.int64]) -> Trajectory:
+def _in_order(
+    name: str, position_m: Floats, rotation: Floats, time_ns: NDArray[np.int64], note: str
+) -> Trajectory:
     steps = np.diff(time_ns)
     if not len(steps) or steps.min() > 0:
-        return Trajectory(name, position_m, rotation, time_ns)
+        return Trajectory(name, position_m, rotation, time_ns, (note,))
     back, again = int((steps < 0).sum()), len(time_ns) - len(np.unique(time_ns))
-    notes = (f"{name}: {back} stamps go back, {again} repeat; the poses were sorted",)
+    notes = (note, f"{name}: {back} stamps go back, {again} repeat; the poses were sorted")
     order = np.argsort(time_ns, kind="stable")
     return Trajectory(name, position_m[order], rotation[order], time_ns[order], notes)
 

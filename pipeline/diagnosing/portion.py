@@ -88,6 +88,9 @@ def first_part(
             break
     for topic, found in parts.items():
         streams[topic] = concatenate(found) if found else source.empty(topic)
+    for each in bound:  # by its name, which a setting may have; its errors are not looked at here
+        if each.truth in source.topics:
+            streams.setdefault(each.truth, source.empty(each.truth))
     end_ns, note = None, ""
     if len(stamps_ns) > MOST_MESSAGES:
         end_ns = int(np.partition(stamps_ns, MOST_MESSAGES)[MOST_MESSAGES])

@@ -116,9 +116,15 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
                 notes.append(str(error))
             continue
         chosen.append(topic)
+    if not chosen and to in TRAJECTORIES:
+        raise BadInput(
+            f"{log.path}: has no estimates, truth or poses to export to {to}; export it as csv"
+        )
     if not chosen:
-        what = "estimates, truth or poses" if to in TRAJECTORIES else "streams of columns"
-        raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
+        why = f": {notes[-1].removeprefix(f'{log.path}: ')}" if notes else "; it has no topics"
+        raise BadInput(
+            f"{log.path}: has no topic whose messages are numbers, which export to {to} needs{why}"
+        )
     return chosen
 
 

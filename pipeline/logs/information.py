@@ -19,7 +19,7 @@ from recorders.plausibility.finding import Finding
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine.compiling.cache import cache_folder, kept_files
-from replay.engine.replaying.estimator import Bound, Estimator
+from replay.engine.replaying.estimator import Bound, Estimator, bound_to
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
@@ -142,7 +142,7 @@ def estimators_that_fit(topics: Mapping[str, Topic]) -> list[str]:
                 estimator = load("estimators", name, Estimator)
                 parameters = build(estimator.parameters, {}, f"estimator {name}")
                 with foreign_code(f"estimator {name}"):
-                    if estimator.bind(name, topics, parameters):
+                    if bound_to(estimator, name, topics, parameters):
                         found.append(name)
     return found
 

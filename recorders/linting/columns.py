@@ -31,7 +31,9 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """
     entries = list(_entries(stream))
     for field, name, column in entries:
-        edges = np.flatnonzero(np.append(True, column[1:] != column[:-1]))
+        missing = np.isnan(column)
+        is_new = (column[1:] != column[:-1]) & ~(missing[1:] & missing[:-1])
+        edges = np.flatnonzero(np.append(True, is_new))
         if len(edges) < 2 or len(column) < FEWEST:
             continue
         runs = np.diff(np.append(edges, len(column)))

@@ -1,4 +1,4 @@
-"""Checks specific forces: which axis is up."""
+"""Checks inertial samples: halves that were never measured, and which axis is up."""
 
 from collections.abc import Iterator, Mapping
 
@@ -20,14 +20,34 @@ UPRIGHT = {
 }
 
 
+def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find units whose forces or turn rates are exactly zero throughout, as no sensor's are."""
+    if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
+        return
+    for field, what in (("specific_force_mps2", "specific forces"), ("turn_rate_radps", "turn rates")):
+        if not stream[field].any():
+            yield Finding(
+                "values",
+                stream.topic,
+                field,
+                float(len(stream)),
+                f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
+                "not measured, and a filter that this topic drives takes them for measurements",
+                mapping="import the half that was measured as a VectorMeasurement",
+            )
+
+
 def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find units whose z axis is not up at rest; not beside orientations, which may say so."""
     if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
         return
     if any(_turns(each) for each in streams.values()):
         return
-    times_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
-    forces = stream["specific_force_mps2"]
+    known = np.isfinite(stream["specific_force_mps2"]).all(axis=1)
+    if known.sum() < FEWEST:
+        return
+    times_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])[known]
+    forces = stream["specific_force_mps2"][known]
     mean = quietest(Series(stream.topic, "specific_force_mps2", times_s, forces))
     norm = 0.0 if mean is None else float(np.linalg.norm(mean))
     if mean is None or not norm:

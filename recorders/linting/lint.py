@@ -20,6 +20,8 @@ CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] 
     places.ranges,
     places.exchanged,
     places.heights,
+    places.jumps,
+    forces.unmeasured,
     forces.upright,
     magnetic.units,
     magnetic.iron,

@@ -18,6 +18,7 @@ CLEAR = 0.02  # of a spread, above which an exchange is worth trying
 SCALE = (0.9, 1.1)
 CLIMB_M, MIRRORED = 2.0, -0.9
 FEWEST = 20
+LEAP_M, CLIMB_MPS = 15.0, 100.0  # what climbs faster has an engine for it
 
 
 def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
@@ -87,6 +88,31 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
             f"{as_is.spread:.2g})",
             "in the mapping exchange the sources of latitude_deg and longitude_deg",
             is_fact=False,
+        )
+
+
+def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find altitudes that leap as nothing climbs, such as where they change what they are above."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
+        return
+    rows = np.flatnonzero(np.isfinite(stream["altitude_m"]))
+    rows = rows[np.argsort(stream.publish_time_ns[rows], kind="stable")]
+    steps_m = np.diff(stream["altitude_m"][rows])
+    steps_s = 1e-9 * np.diff(stream.publish_time_ns[rows])
+    leaps = np.flatnonzero((np.abs(steps_m) > LEAP_M) & (np.abs(steps_m) > CLIMB_MPS * steps_s))
+    if len(leaps):
+        first_s = 1e-9 * float(
+            stream.publish_time_ns[rows[leaps[0] + 1]] - stream.publish_time_ns[rows[0]]
+        )
+        worst_m = float(steps_m[leaps[np.argmax(np.abs(steps_m[leaps]))]])
+        yield Finding(
+            "place",
+            stream.topic,
+            "altitude_m",
+            worst_m,
+            f"{stream.topic}: its altitude leaps {len(leaps)} times, by up to {abs(worst_m):.4g} m from "
+            f"one fix to the next, the first {first_s:.4g} s after its first stamp",
+            mapping="take one altitude throughout, above the ellipsoid or above the sea",
         )
 
 

@@ -315,8 +315,8 @@ AXIS = _declare("Axis", "An undirected axis: a unit vector equal to its negative
 INERTIAL_SAMPLE = _declare(
     "InertialSample",
     "Specific force, turn rate and, where there is a magnetometer, the magnetic field; body frame.",
-    _vector("specific_force_mps2"),
-    _vector("turn_rate_radps"),
+    _vector("specific_force_mps2", may_be_partial=True),
+    _vector("turn_rate_radps", may_be_partial=True),
     _vector("magnetic_field_ut", may_be_nan=True),
 )
 MAGNETIC_FIELD = _declare(

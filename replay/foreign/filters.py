@@ -111,6 +111,7 @@ class FoundFilter:
             {self.prior: self.description.state} if self.prior else {},
             finish=finish,
             parameters=self.parameters,
+            truth=self.truth,
         )
 
     def started(self, given: Mapping[str, Ragged], runs: int) -> tuple[Static, Prior | None]:

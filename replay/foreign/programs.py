@@ -16,6 +16,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
 from replay.engine.compiling.compile import core_count
 from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
+from replay.engine.replaying.truth import TRUTH, truths_among
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.results import failures_by_run
@@ -31,7 +32,7 @@ from replay.foreign.processes.tasks import RunGiven
 
 _PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 LOG, TABLES, OUT = "log", "csv", "out"
-TRUTH, ESTIMATE = schemas.TRUTH_STATE.full_name, "/estimates/"
+ESTIMATE = "/estimates/"
 
 
 class StreamParameters(ForeignParameters):
@@ -137,13 +138,11 @@ def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
     )
 
     def bind(label: str, topics: Mapping[str, Topic], values: Any) -> list[Bound]:
-        truth = _truth(label, topics, values.truth)
+        truth, truths = _truth(label, topics, values.truth), truths_among(topics)
         read = [
             name
             for name, topic in topics.items()
-            if topic.schema_name != TRUTH
-            and not name.startswith(ESTIMATE)
-            and topic.encoding == "protobuf"
+            if name not in truths and not name.startswith(ESTIMATE) and topic.encoding == "protobuf"
         ]
         static = [name for name in read if name.endswith("/prior") or _is_map(topics[name])]
         streams = [name for name in read if name not in static]
@@ -153,7 +152,8 @@ def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
         def solve(given: dict[str, Ragged]) -> list[Ragged]:
             return _solve(label, words, defaults, values, truth, given)
 
-        return [Batch(label, tuple(streams), tuple(static), solve, parameters=values)]
+        of = "" if truth is None else truth.name
+        return [Batch(label, tuple(streams), tuple(static), solve, parameters=values, truth=of)]
 
     return Estimator(f"the program {words[0]}", "messages", parameters, bind)
 

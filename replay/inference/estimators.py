@@ -14,6 +14,7 @@ from recorders.log import Topic
 from recorders.parameters import Parameters, build, meanings
 from recorders.registry import available, load
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from replay.engine.replaying.truth import refuse_named_truths
 from replay.inference.kalman.methods import Method
 from replay.inference.model.augmentation import (
     Start,
@@ -207,6 +208,7 @@ def _bind_fitting(
     asked = {name: roles_of(model) for name, model in models.items()} if renamed else {}
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
+    refuse_named_truths(label, renamed, topics, {model.truth for model in models.values()})
     found = {
         name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
         for name, model in models.items()
@@ -294,6 +296,8 @@ def bind_model(
             offers=offers_of(model, found, topics),
             is_random=is_random,
             reading=partial(reading_of, own, found),
+            truth=found.truth,
+            is_bound=filtering.is_bound,
         )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
@@ -308,6 +312,7 @@ def _check_topics(
     label: str, model: Model, topics: Mapping[str, Topic], renamed: Mapping[str, str]
 ) -> None:
     """Raise BadInput where a topic stands for one that the model does not ask for, or is not there."""
+    refuse_named_truths(label, renamed, topics, {model.truth})
     for role, name in renamed.items():
         _check_role(label, role, roles_of(model))
         if name and not any(topic.endswith(f"/{name.removeprefix('/')}") for topic in topics):

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from mcap.writer import Writer
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 import fuselog as fl
 
@@ -60,6 +62,28 @@ def test_poses_are_trajectories(fuselog: Fuselog) -> None:
     )
 
 
+def test_a_trajectory_goes_through_a_log_and_back(fuselog: Fuselog) -> None:
+    """Stamps to the nanosecond, positions to the last digit, rotations to the digits written."""
+    rng = np.random.default_rng(4)
+    quaternions = Rotation.random(50, rng=rng).as_quat()
+    stamps_ns = 1_403_636_579_763_555_584 + np.cumsum(rng.integers(1, 10**9, 50))
+    lines = [
+        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{number:.7f}" for number in pose)
+        for stamp, pose in zip(
+            stamps_ns.tolist(), np.hstack([1e3 * rng.normal(size=(50, 3)), quaternions]), strict=True
+        )
+    ]
+    Path("way.txt").write_text("\n".join(lines))
+    imported = fuselog("import", "table", "way.txt", "--mapping", "tum", "-o", "log.mcap")
+    assert "read as TUM (8 numbers: time in s" in imported.out
+    assert fuselog("export", "log.mcap", "--to", "tum", "-o", "back.txt", "--topic", "/truth").code == 0
+    given, back = (np.genfromtxt(name, dtype=str) for name in ("way.txt", "back.txt"))
+    assert_array_equal(back[:, 0], given[:, 0])
+    assert_array_equal(back[:, 1:4].astype(float), given[:, 1:4].astype(float))
+    apart = Rotation.from_quat(back[:, 4:].astype(float)) * Rotation.from_quat(quaternions).inv()
+    assert apart.magnitude().max() < 4e-7
+
+
 @pytest.mark.parametrize("to", ["csv", "parquet"])
 def test_tables(to: Any, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every column of every stream, over many blocks; an empty one has a header."""
@@ -81,6 +105,20 @@ def test_tables(to: Any, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             )
         else:
             assert (len(found), list(found)[:2]) == (0, ["publish_time_ns", "log_time_ns"])
+
+
+def test_a_log_without_numbers_is_said_to_have_none(fuselog: Fuselog) -> None:
+    with Path("log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("own", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/own", "json", schema), 1, b"{}", 1)
+        writer.finish()
+    said = fuselog("export", "log.mcap", "--to", "csv")
+    assert said.code == 2
+    assert "has no topic whose messages are numbers" in said.err
+    assert "topic /own is own in the encoding 'json'" in said.err
+    assert "export it as csv" not in said.err
 
 
 def test_what_a_pose_lacks_is_said() -> None:

@@ -56,7 +56,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
             stamp_ns,
             **{f"{of}__{axis}": value for of, each in unit.items() for axis, value in each.items()},
             linear_acceleration_covariance=(0.01 * np.eye(3)).ravel(),
-            angular_velocity_covariance=[-1.0, *[0.0] * 8],
+            angular_velocity_covariance=[0.0] * 9,
         )
         sent.append(("/imu/data", stamp_ns, sample))
     rows = slice(0, None, 20)

@@ -249,6 +249,13 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "force in g": (force(lambda f: f / 9.80665), IMU, "gravity", "in g"),
     "force in mg": (force(lambda f: f / 9.80665e-3), IMU, "gravity", "in mg"),
     "z down": (force(lambda f: f * [1, -1, -1]), IMU, "gravity", "z axis is down"),
+    "no forces": (force(lambda f: 0.0 * f), IMU, "values", "forces are exactly zero in all"),
+    "no turn rates": (
+        column(IMU, "turn_rate_radps", lambda w: 0.0 * w),
+        IMU,
+        "values",
+        "turn rates are exactly zero in all",
+    ),
     "upright": (force(lambda f: f[:, [2, 1, 0]]), IMU, "mounting", "x axis up"),
     "variance -1": (variance(setting(0, 600, -1.0, 0)), FIX, "covariance", "-1"),
     "variance 0": (variance(setting(0, 9, 0.0)), FIX, "covariance", "zero in 9"),
@@ -279,6 +286,12 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "/second",
         "place",
         "46.7 m below",
+    ),
+    "altitudes leap": (
+        column(FIX, "altitude_m", lambda h: h + 47.0 * (np.arange(len(h)) % 7 == 3)),
+        FIX,
+        "place",
+        "its altitude leaps 172 times, by up to 51.56 m",
     ),
     "places in NED": (
         lambda s: column("/place", "position_m", lambda p: p[:, [1, 0, 2]] * [1, 1, -1])(driving(s)),
@@ -322,6 +335,24 @@ def test_rows_that_are_there_twice_are_counted() -> None:
     [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.cause == "stamps"]
     assert found.value == 2.0
     assert "2 of its 82 messages are there twice" in found.words
+
+
+def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
+    """Ten samples get one stamp: they repeat, and their unit is right."""
+    [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
+    assert "have the stamp of the one before" in found.words
+    assert "a model that they drive takes the mean" in found.words
+
+
+def test_what_is_missing_is_not_frozen() -> None:
+    """Of a unit whose gyro stops: its turn rates were still before, and are missing after."""
+
+    def stop(rates: Any) -> None:
+        rates[:200], rates[200:] = 0.0, np.nan
+
+    stopping = column(IMU, "turn_rate_radps", stop)
+    streams = stopping(clean(1))
+    assert not [each for each in lint([streams]) if "frozen" in each.words]
 
 
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:

@@ -32,6 +32,7 @@ from recorders.importers.ros.layouts import Messages, MessageType, by_size, defi
 from recorders.importers.ros.messages import TYPES
 from recorders.importers.ros.parameters import RosParameters
 from recorders.log import Stream, open_log, read_streams
+from recorders.models.inertial import from_mounting
 from recorders.recording import import_log, import_run
 
 pytestmark = pytest.mark.paper
@@ -392,6 +393,49 @@ def test_named_transforms_are_composed(real_data: Path) -> None:
     assert 2600 < len(chain) < 2639
 
 
+@pytest.mark.parametrize("is_static", [True, False])
+def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is_static: bool) -> None:
+    """Over a mast, as sent once or as ever the same; a frame that moves on the body has none."""
+    make, turn = Maker(), Rotation.from_euler("xyz", [0.1, -0.4, 2.0])
+    links = [
+        ("base_link", "mast", (0.5, 0.1, 0.2), Rotation.from_euler("z", 90, degrees=True)),
+        ("mast", "antenna", (0.3, 0.0, 1.0), Rotation.identity()),
+        ("base_link", "unit", (0.1, 0.0, 0.3), turn),
+    ]
+    transform = "geometry_msgs/msg/TransformStamped"
+    message_type = make.store.types["tf2_msgs/msg/TFMessage"]
+    sent: list[Sent] = []
+    for step in range(4):
+        stamp_ns = START_NS + step * STEP_NS
+        moving = [("base_link", "arm", (0.1 * step, 0.0, 0.0), Rotation.identity())]
+        fixed = links if not (is_static and step) else []
+        for topic, pairs in (("/tf_static" if is_static else "/tf", fixed), ("/tf", moving)):
+            parts = [
+                make(transform, stamp_ns, header__frame_id=parent, child_frame_id=child,
+                     transform__rotation=about.as_quat(),
+                     transform__translation__x=place[0], transform__translation__y=place[1],
+                     transform__translation__z=place[2])
+                for parent, child, place, about in pairs
+            ]  # fmt: skip
+            if parts:
+                sent.append((topic, stamp_ns, message_type(transforms=parts)))
+        sent.append(("/imu", stamp_ns, make("sensor_msgs/msg/Imu", stamp_ns, header__frame_id="unit")))
+        for topic, frame in (("/fix", "antenna"), ("/arm/fix", "arm")):
+            fix = make("sensor_msgs/msg/NavSatFix", stamp_ns, header__frame_id=frame)
+            sent.append((topic, stamp_ns, fix))
+    _, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    told = {key: note for key, note in notes.items() if key.endswith(", mounting")}
+    assert set(told) == {"/fix, mounting", "/inertial, mounting"}
+    assert told["/fix, mounting"] == (
+        "its frame antenna is 0.5, 0.4, 1.2 m forward, left and up of base_link; used by "
+        "--set lever_x_m=0.5 --set lever_y_m=0.4 for the model robot, or "
+        "--set lever_x_m=0.4 --set lever_y_m=0.4 --set lever_z_m=0.9 for the model inertial"
+    )
+    angles = [float(each) for each in re.findall(r"mounting_\w+_rad=(\S+)", told["/inertial, mounting"])]
+    vector = np.array([1.0, 2.0, 3.0])
+    assert from_mounting(*angles, vector) == pytest.approx(turn.apply(vector), abs=1e-4)
+
+
 def test_a_sqlite_bag(real_data: Path, tmp_path: Path) -> None:
     """A .db3 file alone and in its folder; a pair of frames against its direction."""
     with tarfile.open(real_data / "trajectories.tar.xz") as archive:
@@ -459,7 +503,7 @@ def test_a_split_bag_is_one_log(form: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_compressed_bags(plugin: str, mode: str, tmp_path: Path) -> None:
-    """Files or messages that ROS 2 compressed one by one."""
+    """Files or messages that ROS 2 compressed one by one, though nothing may say so."""
     make, path = Maker(), tmp_path / "bag"
     bag = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
     bag.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
@@ -468,6 +512,8 @@ def test_compressed_bags(plugin: str, mode: str, tmp_path: Path) -> None:
         for number in range(10):
             message = make("std_msgs/msg/Float64", data=float(number))
             bag.write(topic, START_NS + number, make.store.serialize_cdr(message, message.__msgtype__))
+    assert imported(path)[0]["/value"]["value"][:, 0].tolist() == list(range(10))
+    (path / "metadata.yaml").unlink()
     assert imported(path)[0]["/value"]["value"][:, 0].tolist() == list(range(10))
 
 
@@ -535,6 +581,39 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     written = read_streams(open_log(tmp_path / "out.mcap"), ["/fix"])["/fix"]
     assert (np.diff(written.publish_time_ns) >= 0).all()
     assert run.notes == notes
+
+
+def test_halves_that_a_message_says_it_has_not_are_missing(tmp_path: Path) -> None:
+    """A covariance that begins with -1: what stands beside it is no measurement, row by row."""
+    make, none = Maker(), [-1.0, *[0.0] * 8]
+    kinds = {
+        "whole": {},
+        "accelerometer": {"angular_velocity_covariance": none, "angular_velocity__z": np.nan},
+        "gyro": {"linear_acceleration_covariance": none},
+        "neither": {"angular_velocity_covariance": none, "linear_acceleration_covariance": none},
+    }
+    sent: list[Sent] = [
+        ("/imu", START_NS + number, make("sensor_msgs/msg/Imu", START_NS + number, **given))
+        for number, given in enumerate(kinds.values())
+    ]
+    no_twist = [-1.0, *[0.0] * 35]
+    sent += [
+        ("/odom", START_NS + number,
+         make("nav_msgs/msg/Odometry", START_NS + number, twist__covariance=[own] * 36))
+        for number, own in enumerate((1.0, -1.0))
+    ]  # fmt: skip
+    sent[-1][2].twist.covariance[:] = no_twist
+    streams, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    inertial = streams["/inertial"]
+    assert inertial.publish_time_ns.tolist() == [START_NS + number for number in range(3)]
+    assert np.isfinite(inertial["specific_force_mps2"]).all(axis=1).tolist() == [True, True, False]
+    assert np.isfinite(inertial["turn_rate_radps"]).all(axis=1).tolist() == [True, False, True]
+    without = "/imu: inertial kept without"
+    assert notes[f"{without} specific forces: linear_acceleration_covariance[0] is -1"] == "1"
+    assert notes[f"{without} turn rates: angular_velocity_covariance[0] is -1"] == "1"
+    assert notes["/imu: inertial dropped: without specific forces and turn rates"] == "1"
+    assert len(streams["/odometry"]) == 1
+    assert notes["/odom: odometry dropped: without a twist: twist.covariance[0] is -1"] == "1"
 
 
 def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:

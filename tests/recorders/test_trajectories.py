@@ -1,5 +1,7 @@
 """Trajectory files: recognised from their content, read to the last digit, refused by their line."""
 
+import re
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +44,58 @@ def test_poses_are_sorted_and_it_is_said(tmp_path: Path) -> None:
     path.write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in (3, 1, 1, 2)))
     found = read_trajectory(path)
     assert found.position_m[:, 0].tolist() == [1, 1, 2, 3]
-    assert found.notes == (f"{path}: 1 stamps go back, 1 repeat; the poses were sorted",)
+    how, mended = found.notes
+    assert how.startswith(f"{path}: read as TUM (8 numbers: time in s")
+    assert mended == f"{path}: 1 stamps go back, 1 repeat; the poses were sorted"
+
+
+POSE = f"1 2 3 0 0 {HALF} {HALF}"  # as TUM a quarter turn about z, as EuRoC one of 180 deg about z and y
+NANOSECONDS, UPTIME_NS = 1305031102160407123, 1200_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("begin", "step", "gap", "read_as"),
+    [
+        (0, 1, ",", "tum"),  # whole seconds
+        (1305031102, 30, ",", "tum"),
+        ("1305031102.5", "0.05", ", ", "tum"),
+        (0, 50_000_000, ",", "euroc"),
+        (NANOSECONDS, 5_000_000, ",", "euroc"),
+        (UPTIME_NS, 50_000_000, ",", "euroc"),
+        (0, 1, " ", "tum"),
+        (0, 20_000, " ", "tum"),  # with spaces it is no EuRoC
+        (0, 100_000, ",", "may be s or ns: give --format tum or --format euroc"),
+        (NANOSECONDS, 50_000_000, " ", "in ns, with spaces"),
+        (1305031102160, 50, ",", "in ms"),
+        (1305031102160407, 1_000_000, ",", "in us"),
+    ],
+)
+def test_stamps_tell_one_format_from_another(
+    begin: int | str, step: int | str, gap: str, read_as: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "poses"
+    stamps = [Decimal(begin) + row * Decimal(step) for row in range(9)]
+    path.write_text("".join(f"{stamp}{gap}{POSE.replace(' ', gap)}\n" for stamp in stamps))
+    if read_as not in ("tum", "euroc"):
+        with pytest.raises(BadInput, match=re.escape(read_as)):
+            read_trajectory(path)
+        return
+    found = read_trajectory(path)
+    assert found.time_ns is not None
+    assert found.rotation is not None
+    unit_ns = 1 if read_as == "euroc" else 10**9
+    assert found.time_ns.tolist() == [int(stamp * unit_ns) for stamp in stamps]
+    assert np.allclose(found.rotation[0], QUARTER[0]) == (read_as == "tum")
+    assert found.notes[0].casefold().startswith(f"{path}: read as {read_as}".casefold())
+
+
+def test_a_first_column_that_numbers_the_poses_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "poses"
+    for gap in (" ", ","):
+        rows = [f"{row} {row * 0.1:.1f} {POSE}".replace(" ", gap) for row in range(1, 9)]
+        path.write_text("\n".join(rows))
+        with pytest.raises(BadInput, match="its first column numbers the poses: leave it out"):
+            read_trajectory(path)
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
@@ -72,10 +125,14 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         (TUM + "1305031104 4 5 6 0 0 0\n", None, ("line 5 has 7 columns", "8 numbers")),
         (TUM + "1305031104 4 5 six 0 0 0 1\n", None, ("line 5 is not a pose", "'six'")),
         (TUM + "1305031104 4 5 nan 0 0 0 1\n", None, ("line 5 has a value that is not finite",)),
-        (TUM + "1305031104 4 5 6 0 0 0 2\n", None, ("line 5", "quaternion", "not of unit length")),
+        (TUM + "1305031104 4 5 6 0 0 0 1.05\n", None, ("line 5", "quaternion", "scale it to 1")),
         (TUM + "1305031104000000 4 5 6 0 0 0 1\n", None, ("line 5", "beyond the year 2262", "in s")),
         (KITTI + "1 0 0 4 0 2 0 5 0 0 1 6\n", None, ("line 3", "matrix that is not a rotation")),
         (KITTI + "1 0 0 4 0 1 0 5 0 0 -1 6\n", None, ("line 3", "matrix that is not a rotation")),
+        (TUM.replace("\n1305031103 ", "\n1305031103.5 "), "euroc", ("line 2", "no whole number of ns")),
+        ("# t px py pz qw qx qy qz\n" + TUM.partition("\n")[2], None, ("header has", "w first")),
+        (f"0.5,1,2,3,0,0,{HALF},{HALF},9\n", None, ("line 1 is not a pose", "9 columns")),
+        (TUM + "1305031104 4 5 6 0 0 0 3\n", None, ("line 5", "check what it is", "x y z w")),
         (KITTI, "tum", ("line 1 has 12 columns", "tum has 8 numbers")),
         (TUM, "tmu", ("no trajectory format 'tmu'", "did you mean 'tum'")),
     ],

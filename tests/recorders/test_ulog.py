@@ -433,6 +433,109 @@ def test_states_are_in_our_axes_with_the_variances_of_old_and_new_firmware(
     np.testing.assert_allclose(covariance, np.diag([2, 1, 3, 0.2, 0.1, 0.3, *turned]), atol=1e-6)
 
 
+FIX = "uint64_t timestamp;int32_t lat;int32_t lon;int32_t alt;int32_t alt_ellipsoid;uint8_t fix_type;"
+NEW_FIX = (
+    "uint64_t timestamp;double latitude_deg;double longitude_deg;double altitude_msl_m;"
+    "double altitude_ellipsoid_m;uint8_t fix_type;"
+)
+MAG = "uint64_t timestamp;float[3] magnetometer_ga;"
+RAW_MAG = "uint64_t timestamp;float x;float y;float z;"
+PLACE = (
+    "uint64_t timestamp;uint64_t ref_timestamp;double ref_lat;double ref_lon;float ref_alt;"
+    "uint8_t xy_global;"
+)
+
+
+def several(
+    formats: dict[str, str], rows: list[tuple[str, int, str, tuple[float, ...]]], begin: bytes = b""
+) -> bytes:
+    """A log of rows (topic, instance, struct's codes, values) in their order, by topics' formats."""
+    numbers = {key: 30 + n for n, key in enumerate(dict.fromkeys(each[:2] for each in rows))}
+    subscribed = [
+        message("A", struct.pack("<BH", instance, number) + topic.encode())
+        for (topic, instance), number in numbers.items()
+    ]
+    data = [
+        message("D", struct.pack(f"<HQ{codes}", numbers[topic, instance], 1_000_000 + 4000 * n, *values))
+        for n, (topic, instance, codes, values) in enumerate(rows)
+    ]
+    layouts = tuple(f"{topic}:{fields}" for topic, fields in formats.items())
+    return by_hand(*subscribed, formats=layouts, last=b"".join([begin, *data]), rows=30)
+
+
+def test_instances_of_a_topic_have_streams_of_their_own(tmp_path: Path):
+    """The first has the name that filters look for; no other has that of a raw sensor."""
+    fixes = {0: 8.5, 1: 8.6, 2: 8.7}
+    rows = [
+        ("vehicle_gps_position", number, "iiiiB", (474000000, round(1e7 * fixes[number]), 0, 0, 3))
+        for _ in range(3)
+        for number in fixes
+    ]
+    rows += [
+        ("vehicle_magnetometer", number, "3f", (0.1 * number, 0, 0)) for number in (3, 1, 2, 1, 3, 2)
+    ]
+    rows += [("sensor_mag", number, "3f", (0.5, 0, 0)) for number in (1, 2)]
+    formats = {"vehicle_gps_position": FIX, "vehicle_magnetometer": MAG, "sensor_mag": RAW_MAG}
+    path = tmp_path / "instances.ulg"
+    path.write_bytes(several(formats, rows))
+    blocks = ULOG.read(path, UlogParameters())
+    streams = {each.topic.removeprefix("/vehicle/"): each for each in blocks.together().streams}
+    for number, longitude in fixes.items():
+        name = f"fix_vehicle_gps_position_{number}" if number else "fix"
+        assert streams[name]["longitude_deg"].tolist() == pytest.approx([longitude] * 3)
+    first = {name: each["magnetic_field_ut"][0, 0] for name, each in streams.items() if "magnet" in name}
+    assert first == pytest.approx(
+        {
+            "magnetometer": 10,  # of instance 1, which is the first
+            "magnetometer_vehicle_magnetometer_2": 20,
+            "magnetometer_vehicle_magnetometer_3": 30,
+            "magnetometer_1": 50,
+            "magnetometer_2": 50,
+        }
+    )
+    told = blocks.notes["vehicle_gps_position, instance 2"]
+    assert told.startswith("another one, as /vehicle/fix_vehicle_gps_position_2, /vehicle/velocity_")
+
+
+@pytest.mark.parametrize("is_new", [False, True], ids=["1.13", "1.15"])
+@pytest.mark.parametrize(
+    ("ellipsoid_m", "separation_m"),
+    [
+        ([0.0] * 6, 0.0),
+        ([535.0] * 6, 47.0),
+        ([535.0, 0.0, 535.0, 2e6, -3e5, 535.0], 47.0),
+        ([0.0, 0.0, 0.0, 0.0, 535.0, 535.0], 47.0),
+        ([488.0 + 151.0] * 6, 0.0),
+        ([np.nan] * 6, 0.0),
+        ([2147483.0] * 6, 0.0),
+    ],
+    ids=["zero", "good", "garbage", "zero at first", "far", "missing", "largest"],
+)
+def test_a_height_above_the_ellipsoid_that_is_none_is_that_above_the_sea(
+    tmp_path: Path, is_new: bool, ellipsoid_m: list[float], separation_m: float
+):
+    """Fixes stay on one level with the origin of the filter's plane, and what was taken is counted."""
+    fixes = []
+    for height_m in ellipsoid_m:
+        place = (47.4, 8.5, 488.0, height_m)
+        scaled = (1e7, 1e7, 1e3, 1e3)
+        numbers_ = (round(x * by) for x, by in zip(np.nan_to_num(place), scaled, strict=True))
+        fixes.append((*(place if is_new else numbers_), 3))
+    rows = [("vehicle_gps_position", 0, "ddddB" if is_new else "iiiiB", each) for each in fixes]
+    rows.insert(1, ("vehicle_local_position", 0, "QddfB", (1_000_000, 47.4, 8.5, 488.0, 1)))
+    formats = {"vehicle_gps_position": NEW_FIX if is_new else FIX, "vehicle_local_position": PLACE}
+    path = tmp_path / "heights.ulg"
+    path.write_bytes(several(formats, rows))
+    blocks = ULOG.read(path, UlogParameters())
+    fix = next(each for each in blocks.together().streams if each.topic == "/vehicle/fix")
+    assert fix["altitude_m"] == pytest.approx(488.0 + separation_m)
+    assert float(fix.metadata["origin_altitude_m"]) == pytest.approx(488.0 + separation_m)
+    told = [text for text in blocks.notes if "above the ellipsoid" in text]
+    wrong = sum(height_m != 535.0 for height_m in ellipsoid_m)
+    assert [blocks.notes[text] for text in told] == [str(wrong)] * bool(wrong)
+    assert all(text.endswith(", 47 m higher" if separation_m else "instead") for text in told)
+
+
 def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
     """Noise by the sheet, section 1: PX4's defaults are .0015 and .035 for a step of 10 ms."""
     parameters = {
@@ -465,3 +568,5 @@ def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
     assert notes["EKF2_HDG_GATE"].startswith("test each component by itself")
     assert notes["EKF2_TAU_POS"] == "have no counterpart in the model inertial"
     assert notes["CAL_ACC0_XOFF"].startswith("had their effect before")
+    many = carried({f"EKF2_OTHER_{number}": 0.0 for number in range(200)})
+    assert list(many) == ["EKF2_OTHER_0, EKF2_OTHER_1, EKF2_OTHER_10 and 197 more"]

@@ -83,7 +83,7 @@ def stream_names(
     wanted = {
         (each.topic, kind): f"{below(each.topic, reader.taken)}/{kind}"
         for each, reader in readers.items()
-        if reader.taken is not None
+        if reader.taken is not None and each.topic != parameters.truth
         for kind in reader.taken.kinds
     }
     if (truth := parameters.truth) is not None:

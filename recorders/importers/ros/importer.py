@@ -15,6 +15,7 @@ from recorders.importers.ros.files.bags import Bag, open_bag
 from recorders.importers.ros.files.raw import Batch, Connection
 from recorders.importers.ros.layouts import Messages, Undecodable, by_size
 from recorders.importers.ros.messages import CHILD_FRAME, Part, as_truth, stamps_ns
+from recorders.importers.ros.mountings import Mountings
 from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
 from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
@@ -48,7 +49,7 @@ class _Import:
         self._pending: dict[tuple[Connection, int], _Pending] = defaultdict(_Pending)
         self._waiting_messages = self._waiting_bytes = 0
         self._read: Counter[str] = Counter()
-        self._clocks = Clocks()
+        self._clocks, self._mountings = Clocks(), Mountings()
         self._chains = self._named_chains()
 
     # What is read.
@@ -104,8 +105,13 @@ class _Import:
         self._clocks.note(topic, sent.stamp_ns, log_time_ns)
         frames = _frames_of(messages, reader.frame)
         for part in reader.taken.parts(messages):
-            is_truth = topic == self._parameters.truth and part.schema is schemas.POSE
-            self._streams.add(sent, as_truth(part) if is_truth else part, frames)
+            if topic != self._parameters.truth:
+                self._streams.add(sent, part, frames)
+            elif part.schema is schemas.POSE:
+                self._streams.add(sent, as_truth(part), frames)
+            else:
+                fact = f"{part.kind} left out, since a filter must not read what is from the truth"
+                self._streams.tell(topic, fact, len(messages))
 
     # Transforms.
 
@@ -155,10 +161,12 @@ class _Import:
     def _take_transforms(
         self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64], *, is_static: bool
     ) -> None:
-        if is_static:
-            self._streams.came_of[topic]["what named transforms are composed with"] = None
-            return
         for pair, transforms in self._transforms(topic, messages, log_time_ns):
+            self._mountings.add(pair, transforms)
+            if is_static:
+                what = "what named transforms and mountings are composed with"
+                self._streams.came_of[topic][what] = None
+                continue
             self._clocks.note(topic, transforms.stamp_ns, transforms.log_time_ns)
             for chain in self._chains:
                 chain.add(pair, transforms)
@@ -208,6 +216,7 @@ class _Import:
                 notes[":".join(chain.pair)] = (
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
+        notes |= dict(self._mountings.notes(self._streams.described))
         notes |= self._streams.noise
         for (subject, fact), count in self._streams.counts.items():
             notes[f"{subject}: {fact}"] = str(count)

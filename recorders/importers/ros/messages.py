@@ -45,6 +45,7 @@ class Part:
         rows: of which message each is; None where there is one of each.
         dropped: by reason, which (k,) are left out.
         doubtful: by reason, which (k,) are kept all the same.
+        lacking: by field, which (k,) state that they have no such data; their columns are NaN there.
     """
 
     kind: str
@@ -56,6 +57,7 @@ class Part:
     rows: NDArray[np.int64] | None = None
     dropped: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     doubtful: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    lacking: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
 class Taken(NamedTuple):
@@ -103,6 +105,11 @@ def covariance(messages: Messages, path: str) -> Floats:
     return np.where(unknown[:, None], np.nan, found) if unknown.any() else found
 
 
+def has_none(messages: Messages, path: str) -> NDArray[np.bool_]:
+    """Tell which messages (n,) state by a covariance that begins with -1 that they have no such data."""
+    return np.asarray(messages.numbers(path)[:, 0] == -1.0)
+
+
 def _unknown(messages: Messages, width: int) -> Floats:
     return np.full((len(messages), width), np.nan)
 
@@ -128,12 +135,14 @@ def _fix(messages: Messages) -> Iterator[Part]:
 def _inertial(messages: Messages) -> Iterator[Part]:
     force = covariance(messages, "linear_acceleration_covariance")
     rate = covariance(messages, "angular_velocity_covariance")
+    no_force = has_none(messages, "linear_acceleration_covariance")
+    no_rate = has_none(messages, "angular_velocity_covariance")
     yield Part(
         "inertial",
         schemas.INERTIAL_SAMPLE,
         {
-            "specific_force_mps2": vector(messages, "linear_acceleration"),
-            "turn_rate_radps": vector(messages, "angular_velocity"),
+            "specific_force_mps2": _where_known(no_force, vector(messages, "linear_acceleration")),
+            "turn_rate_radps": _where_known(no_rate, vector(messages, "angular_velocity")),
             "magnetic_field_ut": _unknown(messages, 3),
         },
         constants={
@@ -144,11 +153,15 @@ def _inertial(messages: Messages) -> Iterator[Part]:
             "force_noise_density": force[:, _DIAGONAL].mean(axis=1),
             "gyro_noise_density": rate[:, _DIAGONAL].mean(axis=1),
         },
+        dropped={"without specific forces and turn rates": no_force & no_rate},
+        doubtful={
+            "without specific forces: linear_acceleration_covariance[0] is -1": no_force,
+            "without turn rates: angular_velocity_covariance[0] is -1": no_rate,
+        },
+        lacking={"specific_force_mps2": no_force, "turn_rate_radps": no_rate},
     )
     orientation = quaternion(messages, "orientation")
-    is_none = (messages.numbers("orientation_covariance")[:, 0] == -1.0) | (orientation == 0.0).all(
-        axis=1
-    )
+    is_none = has_none(messages, "orientation_covariance") | (orientation == 0.0).all(axis=1)
     yield Part(
         "orientation",
         schemas.ORIENTATION,
@@ -156,6 +169,10 @@ def _inertial(messages: Messages) -> Iterator[Part]:
         constants={"covariance_rad2": covariance(messages, "orientation_covariance")},
         dropped={"without an orientation": is_none},
     )
+
+
+def _where_known(lacks: NDArray[np.bool_], vectors: Floats) -> Floats:
+    return np.where(lacks[:, None], np.nan, vectors) if lacks.any() else vectors
 
 
 def _magnetic(messages: Messages) -> Iterator[Part]:
@@ -179,6 +196,7 @@ def _odometry(messages: Messages) -> Iterator[Part]:
         schemas.ODOMETRY,
         {"forward_mps": velocity[:, 0], "turn_radps": turn[:, 2]},
         noise={"forward_noise_density": spread[:, 0], "turn_noise_density": spread[:, 35]},
+        dropped={"without a twist: twist.covariance[0] is -1": has_none(messages, "twist.covariance")},
         doubtful={
             "with a motion sideways, up or down, rolling or pitching, which it leaves out": beside
             > _PLANAR

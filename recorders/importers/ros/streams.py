@@ -83,6 +83,11 @@ class StreamMaker:
         """Count the messages that have come of the bag."""
         return sum(written.messages for written in self._written.values())
 
+    @property
+    def described(self) -> dict[str, tuple[str, Mapping[str, str]]]:
+        """Return the messages' names and the metadata of all streams, by topic."""
+        return {topic: (each.schema.full_name, each.metadata) for topic, each in self._written.items()}
+
     def tell(self, subject: str, fact: str, count: int) -> None:
         """Count a fact."""
         if count:
@@ -107,7 +112,10 @@ class StreamMaker:
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
-        dropped["NaN or infinite"] = not_finite(part.schema, part.columns)
+        known = dict(part.columns)
+        for name, lacks in part.lacking.items():
+            known[name] = np.where(lacks[:, None], 0.0, known[name])
+        dropped["NaN or infinite"] = not_finite(part.schema, known)
         if sent.stamp_ns is not None and self._clock == "header":
             own = sent.stamp_ns if part.rows is None else sent.stamp_ns[part.rows]
             dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0

@@ -1,6 +1,7 @@
 """Guesses which streams the columns of a table are: inertial, fix, pose, odometry and others."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -44,6 +45,8 @@ _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
 _ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
+_GEODETIC = r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?"
+_ALTITUDE = r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
 )
@@ -93,7 +96,7 @@ def _magnetic(table: GuessedTable) -> Iterator[str]:
 
 
 def _fix(table: GuessedTable) -> Iterator[str]:
-    place = take(table.columns, r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?")
+    place = take(table.columns, *_GEODETIC)
     if not place:
         return
     fields = ("latitude_deg", "longitude_deg")
@@ -110,7 +113,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
             f"factors.{field} = 1e-7   # latitudes up to {latitude:.4g} are not degrees"
             for field in fields
         ]
-    height = take(table.columns, r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)")
+    height = take(table.columns, _ALTITUDE)
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
         if (length := stated_unit(height[0], "m")) not in ("", "m"):
@@ -225,13 +228,11 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     columns = table.columns
     place, factors = _position(columns)
     turn = _quaternion(columns)
-    heading = take(columns, _HEADING) if place and not turn else []
+    heading = take(columns, _HEADING) if place and not (turn or table.has_truth) else []
     if not (place or turn):
         return
-    if place and (table.is_reference or heading):
+    if place and heading:
         why = "the names are a position and a heading, without a covariance, as the truth has them"
-        if table.is_reference:
-            why = "the file's name says that it is the truth"
         yield from stream_lines(
             f"{table.prefix}/truth", "TruthState", why, *_truth(place, factors, turn, heading)
         )
@@ -292,6 +293,44 @@ def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
 def _length(place: list[GuessedColumn]) -> str:
     """Return the unit that a position's names state, else m."""
     return stated_unit(place[0], "m") or "m" if place else "m"
+
+
+_TRUE = r"(^|_)(ground_?truth|truth|gt|mocap|vicon|optitrack)(_|$)"
+
+
+def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[GuessedColumn]:
+    """Take the columns whose names say that they are the truth out of the list, without that word.
+
+    Args:
+        columns: of a table.
+        is_reference: whether the file's name says that all are.
+    """
+    found = [each for each in columns if is_reference or re.search(_TRUE, each.plain)]
+    columns[:] = [each for each in columns if each not in found]
+    return [each._replace(plain=re.sub(_TRUE, r"\1", each.plain).strip("_")) for each in found]
+
+
+def truth_lines(table: GuessedTable) -> Iterator[str]:
+    """Write the stream of a table's true columns, of which nothing is made that a filter could read."""
+    columns = table.columns
+    place, factors = _position(columns)
+    if not place and (geodetic := take(columns, *_GEODETIC)):
+        names = dict(zip(("latitude", "longitude"), geodetic, strict=True))
+        names.update(zip(("altitude",), take(columns, _ALTITUDE), strict=False))
+        parts = ", ".join(f"{key} = {name_of(each)}" for key, each in names.items())
+        table.made.append(f"geodetic = {{ {parts} }}")
+        axes = zip(("east_m", "north_m", "up_m"), names.values(), strict=False)
+        place = [each._replace(name=name, unit="m") for name, each in axes]
+        factors = [1] * len(place)
+    turn = _quaternion(columns)
+    heading = [] if turn else take(columns, _HEADING)
+    if place or turn or heading:
+        why = "the names say that it is the truth"
+        lines = _truth(place, factors, turn, heading)
+        yield from stream_lines(f"{table.prefix}/truth", "TruthState", why, *lines)
+    if columns:
+        rest = ", ".join(each.name for each in columns)
+        yield f"# True columns, not taken, so that no filter reads them: {rest}"
 
 
 def _truth(

@@ -22,14 +22,14 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """Holds the columns without a stream yet, how topics begin, whether the file's name says truth.
+    """Holds columns without a stream yet, how topics begin, whether other columns are the truth.
 
     `places` are all columns, by which courses are told, and `made` lines of the table itself.
     """
 
     columns: list[GuessedColumn]
     prefix: str
-    is_reference: bool
+    has_truth: bool
     places: list[GuessedColumn]
     made: list[str]
 

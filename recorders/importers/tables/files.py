@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, cast
 
@@ -29,7 +30,7 @@ from recorders.importers.tables.npz import columns_of
 from recorders.parsing import DEEPEST
 from recorders.trajectories import read_trajectory
 
-Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory"]
+Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc"]
 Batch = dict[str, pa.Array]
 # Gives the batches with these columns, and which of them are wanted as text.
 Read = Callable[[Mapping[str, bool]], Iterator[Batch]]
@@ -109,8 +110,9 @@ def open_table(
         elif format == "rtklib":
             found = _open_rtklib(path)
         else:
+            of_trajectory = partial(_open_trajectory, format=None if format == "trajectory" else format)
             found = {"parquet": _open_parquet, "json": _open_json, "npz": _open_npz}.get(
-                format, _open_trajectory
+                format, of_trajectory
             )(path)
     except DAMAGED as error:
         raise BadInput(f"{path}: cannot be read as {format} ({_first_line(error)})") from None
@@ -315,9 +317,9 @@ def _open_npz(path: Path) -> Table:
     return Table(path, names, batches)
 
 
-def _open_trajectory(path: Path) -> Table:
+def _open_trajectory(path: Path, format: str | None) -> Table:  # noqa: A002
     """Open TUM, KITTI or EuRoC: time_ns (not of KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
-    found = read_trajectory(path)
+    found = read_trajectory(path, format)
     columns = dict(zip("xyz", found.position_m.T, strict=True))
     if found.rotation is not None:
         quaternion = Rotation.from_matrix(found.rotation).as_quat(scalar_first=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME
-from recorders.importers.tables.column_streams import GUESSES
+from recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
 from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
@@ -125,9 +125,17 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         "" if is_alone else "/" + re.sub(r"\W+", "_", Path(name).with_suffix("").as_posix()).strip("_")
     )
     left = [column for column in columns if column.name not in used]
-    rest = GuessedTable(left, prefix, bool(re.search(_REFERENCE, path.stem)), [], [])
+    is_reference = re.search(_REFERENCE, path.stem) is not None
+    true = GuessedTable(true_columns(left, is_reference=is_reference), prefix, True, [], [])
+    rest = GuessedTable(left, prefix, bool(true.columns), [], [])
     streams = [line for guessed in GUESSES for line in guessed(rest)]
-    return "\n".join([*lines, *rest.made, *streams, *_rest(rest)]) + "\n"
+    streams += [*_rest(rest), *truth_lines(true)]
+    if not any(line.startswith("topic =") for line in streams):
+        raise BadInput(
+            f"{path}: its name or columns say that it is the truth, and it has no position or heading; "
+            "if it was measured, write a mapping by hand"
+        )
+    return "\n".join([*lines, *rest.made, *true.made, *streams]) + "\n"
 
 
 def _first_rows(path: Path) -> tuple[Table, Batch, str]:

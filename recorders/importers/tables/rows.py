@@ -314,7 +314,7 @@ class Rows:
         if rest := [each for each in self.table.columns if each not in self._texts | self._numbers]:
             notes[f"{name}: columns not taken"] = some_of(rest)
         if self.table.mended:
-            notes[f"{name}, mended"] = self.table.mended
+            notes[f"{name}, trajectory"] = self.table.mended
         for reason, count in self.table.left_out.items():
             notes[f"{name}: rows left out, {reason}"] = str(count)
         return notes

@@ -1,7 +1,8 @@
 """Imports ULog: topics become streams, and what is not taken is told."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +12,8 @@ from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import not_finite
 from recorders.importers.stamps import to_ns
 from recorders.importers.ulog.estimator import TOPICS, Autopilot
-from recorders.importers.ulog.file import UlogFile
-from recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part
+from recorders.importers.ulog.file import Rows, UlogFile
+from recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part, heights
 from recorders.importers.ulog.settings import carried, stated_noise
 from recorders.log import Stream, make_stream, schemas
 from recorders.log.planes import Origin, in_plane
@@ -27,37 +28,55 @@ class UlogParameters(Parameters):
 
 
 class _Surroundings(NamedTuple):
-    """Holds the origin of the filter's plane on the earth; None where the log states none."""
+    """Holds what is read of a log beforehand.
+
+    Attributes:
+        origin: of the filter's plane on the earth; None where the log states none.
+        separation_m: how far the ellipsoid is below the sea; 0 where no receiver tells.
+        first: the first instance of every topic.
+    """
 
     origin: Origin | None
+    separation_m: float
+    first: Mapping[str, int]
 
 
 def _surroundings(path: Path) -> _Surroundings:
-    """Read a log up to where its filter says where it is."""
-    separation_m = 0.0
-    for block in UlogFile(path).blocks(lambda topic: topic in _PLACED):
-        for rows in sorted(block, key=lambda each: each.topic == "vehicle_local_position"):
-            fields = Fields(rows)
-            if fields.has("alt_ellipsoid"):
-                separation_m = 1e-3 * float((fields.of("alt_ellipsoid") - fields.of("alt"))[-1])
-            elif fields.has("altitude_ellipsoid_m"):
-                above = fields.of("altitude_ellipsoid_m") - fields.of("altitude_msl_m")
-                separation_m = float(above[-1])
-            elif fields.has("ref_lat"):
-                known = np.flatnonzero((fields.of("xy_global") > 0) & (fields.of("ref_timestamp") > 0))
-                if len(known):
-                    place = fields.vector("ref_lat", "ref_lon", "ref_alt")[known[0]].tolist()
-                    place[2] += separation_m
-                    if np.isfinite(place).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180:
-                        return _Surroundings(Origin(*place))
-    return _Surroundings(None)
+    """Read a log up to where its filter says where it is, and a receiver both of its heights."""
+    place: list[float] | None = None
+    separation_m: float | None = None
+    file = UlogFile(path)
+    for block in file.blocks(lambda topic: topic in _PLACED):
+        for fields in map(Fields, block):
+            if fields.has("ref_lat"):
+                place = _reference(fields) if place is None else place
+                continue
+            ellipsoid_m, sea_m, agree = heights(fields)
+            if (agree & (fields.of("fix_type") >= 3)).any():
+                separation_m = float((ellipsoid_m - sea_m)[agree][-1])
+        if place is not None and separation_m is not None:
+            break
+    separation_m = separation_m or 0.0
+    origin = None if place is None else Origin(place[0], place[1], place[2] + separation_m)
+    instances = sorted(((topic, instance) for topic, instance in file.rows), reverse=True)
+    return _Surroundings(origin, separation_m, dict(instances))
+
+
+def _reference(fields: Fields) -> list[float] | None:
+    """Return latitude, longitude and height above the sea of the filter's origin, if it is known."""
+    known = np.flatnonzero((fields.of("xy_global") > 0) & (fields.of("ref_timestamp") > 0))
+    for place in fields.vector("ref_lat", "ref_lon", "ref_alt")[known[:1]].tolist():
+        if np.isfinite(place).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180:
+            return list(place)
+    return None
 
 
 class _Import:
     """Imports one file: makes its streams, block after block, and keeps what is to be told."""
 
-    def __init__(self, file: UlogFile, origin: Origin | None) -> None:
-        self._file, self._origin = file, origin
+    def __init__(self, file: UlogFile, around: _Surroundings) -> None:
+        self._file, self._around = file, around
+        self._sources: dict[str, tuple[str, int]] = {}
         self._autopilot = Autopilot(file.parameters)
         self._noise = stated_noise(file.parameters)
         self._counts: Counter[str] = Counter()
@@ -72,16 +91,26 @@ class _Import:
                 self._counts[fact] += each.untimed
             if each.topic not in SENSORS:
                 continue
+            is_first = each.instance == self._around.first.get(each.topic, each.instance)
+            fields = Fields(each, is_first, self._around.separation_m)
             try:
-                parts += SENSORS[each.topic](Fields(each))
+                parts += [self._named(part, each) for part in SENSORS[each.topic](fields)]
             except (KeyError, ValueError) as error:
                 self._counts[f"{each.topic}: rows whose fields are others ({error})"] += len(each.data)
         parts += self._autopilot.parts([each for each in rows if each.topic in TOPICS])
         return [stream for part in parts if (stream := self._stream(part)) is not None]
 
+    def _named(self, part: Part, rows: Rows) -> Part:
+        """Give what another topic of the file gives under this name as well a name of its own."""
+        source = rows.topic, rows.instance
+        is_own = self._sources.setdefault(part.topic, source) == source
+        name = part.topic if is_own else f"{part.topic}_{rows.topic}_{rows.instance}"
+        self._sources[name] = source
+        return replace(part, topic=name)
+
     def _stream(self, part: Part) -> Stream | None:
-        for reason, count in part.left_out.items():
-            self._counts[f"{part.topic}: left out {reason}"] += count
+        for fact, count in part.facts.items():
+            self._counts[f"{part.topic}: {fact}"] += count
         if not len(part.time_us):
             return None
         bad = not_finite(part.schema, dict(part.columns)) | (part.time_us < 0)
@@ -101,7 +130,7 @@ class _Import:
             metadata={**part.metadata, **self._noise.get(part.topic.rpartition("/")[2], {})},
             **kept.columns,
         )
-        return in_plane(stream, self._origin)
+        return in_plane(stream, self._around.origin)
 
     def last(self) -> list[Stream]:
         """Return the streams that are whole only at the end: parameters, and what the logger lost."""
@@ -171,6 +200,11 @@ class _Import:
         for what, count in (+file.losses).items():
             notes[f"lost, {what}"] = str(count)
         taken = {*SENSORS, *TOPICS}
+        others: dict[str, list[str]] = {}
+        for name, (topic, instance) in self._sources.items():
+            if name.endswith(f"_{topic}_{instance}"):
+                others.setdefault(f"{topic}, instance {instance}", []).append(name)
+        notes |= {of: f"another one, as {', '.join(names)}" for of, names in others.items()}
         rest = Counter({topic: 0 for topic, _ in file.rows if topic not in taken})
         for (topic, _), count in file.rows.items():
             if topic in rest:
@@ -195,9 +229,9 @@ def read(path: Path, parameters: UlogParameters) -> Blocks:  # noqa: ARG001
 
 
 def _blocks(path: Path, result: Blocks) -> Iterator[list[Stream]]:
-    origin = _surroundings(path).origin
+    around = _surroundings(path)
     file = UlogFile(path)
-    work = _Import(file, origin)
+    work = _Import(file, around)
     for rows in file.blocks(lambda topic: topic in SENSORS or topic in TOPICS):
         yield work.block(rows)
     work.check()

@@ -1,7 +1,7 @@
 """Reads the topics of sensors: one function for each, which makes parts of their rows."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,14 +17,16 @@ _GAUSS_UT = 100.0
 _FIELD = ("field_x_ut", "field_y_ut", "field_z_ut")
 # A time that is not known, as PX4 has it in microseconds relative to the stamp.
 _INVALID_US = 2**31 - 1
+# Heights above the ellipsoid and the sea differ by no more than this.
+FARTHEST_M = 150.0
 
 
 @dataclass(frozen=True)
 class Part:
     """Holds messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
-    Rows where a required number is not finite are left out by whoever makes the stream; `left_out`
-    counts others by reason.
+    Rows where a required number is not finite are left out by whoever makes the stream; `facts` counts
+    others that are left out or changed.
     """
 
     topic: str
@@ -33,21 +35,30 @@ class Part:
     logged_us: NDArray[np.int64]
     columns: Mapping[str, NDArray]
     metadata: Mapping[str, str] = field(default_factory=dict)
-    left_out: Mapping[str, int] = field(default_factory=dict)
+    facts: Mapping[str, int] = field(default_factory=dict)
 
     def take(self, which: NDArray) -> "Part":
         """Return the messages of some rows."""
         columns = {name: column[which] for name, column in self.columns.items()}
-        return Part(
-            self.topic, self.schema, self.time_us[which], self.logged_us[which], columns, self.metadata,
-            self.left_out,
-        )  # fmt: skip
+        return replace(
+            self, time_us=self.time_us[which], logged_us=self.logged_us[which], columns=columns
+        )
 
 
 class Fields(NamedTuple):
-    """Holds the fields of a topic's rows, as numbers."""
+    """Holds the fields of a topic's rows, as numbers.
+
+    `is_first` says whether they are of the first of its instances, and `separation_m` how far the
+    ellipsoid is below the sea where the log was recorded; 0 where that is not known.
+    """
 
     rows: Rows
+    is_first: bool = True
+    separation_m: float = 0.0
+
+    def named(self, name: str) -> str:
+        """Name a stream of which most logs have one; that of another instance says of which it is."""
+        return name if self.is_first else f"{name}_{self.rows.topic}_{self.rows.instance}"
 
     def has(self, name: str) -> bool:
         """Tell whether there is such a field."""
@@ -93,12 +104,14 @@ def combined(fields: Fields) -> Iterator[Part]:
     """Yield the inertial unit that the filter uses; of old firmware also magnetometer and barometer."""
     force = to_flu(fields.vector("accelerometer_m_s2", width=3))
     rate = to_flu(fields.vector("gyro_rad", width=3))
-    yield _inertial(fields, "inertial", force, rate)
+    yield _inertial(fields, fields.named("inertial"), force, rate)
     if fields.has("magnetometer_ga[0]"):
         field_ut = _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
-        yield _at_own_time(fields, "magnetometer", _magnetic(fields, "magnetometer", field_ut))
+        part = _magnetic(fields, fields.named("magnetometer"), field_ut)
+        yield _at_own_time(fields, "magnetometer", part)
     if fields.has("baro_alt_meter"):
-        yield _at_own_time(fields, "baro", fields.values("barometer", {"altitude_m": "baro_alt_meter"}))
+        part = fields.values(fields.named("barometer"), {"altitude_m": "baro_alt_meter"})
+        yield _at_own_time(fields, "baro", part)
 
 
 def _inertial(fields: Fields, topic: str, force: Floats, rate: Floats) -> Part:
@@ -125,9 +138,8 @@ def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
     is_valid = relative_us != _INVALID_US
     time_us = part.time_us + np.where(is_valid, relative_us, 0)
     is_new = is_valid & (np.diff(time_us, prepend=-1) != 0)
-    counts = {"without a time": int((~is_valid).sum())}
-    timed = Part(part.topic, part.schema, time_us, part.logged_us, part.columns, part.metadata, counts)
-    return timed.take(is_new)
+    facts = {"left out without a time": int((~is_valid).sum())}
+    return replace(part, time_us=time_us, facts=facts).take(is_new)
 
 
 def unit(fields: Fields) -> Iterator[Part]:
@@ -159,9 +171,8 @@ def magnetometer(fields: Fields) -> Iterator[Part]:
 
     A model needs to be told the field of the place: `--set topics.magnetic_field=/vehicle/magnetometer`.
     """
-    yield _magnetic(
-        fields, "magnetometer", _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
-    )
+    field_ut = _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
+    yield _magnetic(fields, fields.named("magnetometer"), field_ut)
 
 
 def raw_magnetometer(fields: Fields) -> Iterator[Part]:
@@ -170,29 +181,55 @@ def raw_magnetometer(fields: Fields) -> Iterator[Part]:
     yield _magnetic(fields, f"magnetometer_{fields.rows.instance}", field_ut)
 
 
+class Heights(NamedTuple):
+    """Holds heights (n,) of fixes above the ellipsoid and above the sea, and where these agree.
+
+    Simulators and old drivers leave the height above the ellipsoid empty, or write garbage.
+    """
+
+    ellipsoid_m: Floats
+    sea_m: Floats
+    agree: NDArray[np.bool_]
+
+
+def heights(fields: Fields) -> Heights:
+    """Read the heights of a receiver's fixes."""
+    if fields.has("altitude_ellipsoid_m"):
+        ellipsoid_m, sea_m = fields.of("altitude_ellipsoid_m"), fields.of("altitude_msl_m")
+    else:
+        ellipsoid_m, sea_m = 1e-3 * fields.of("alt_ellipsoid"), 1e-3 * fields.of("alt")
+    is_near = np.abs(ellipsoid_m - sea_m) <= FARTHEST_M
+    return Heights(ellipsoid_m, sea_m, is_near & (ellipsoid_m != 0.0))
+
+
 def gnss(fields: Fields) -> Iterator[Part]:
     """Yield a receiver's position and velocity; eph, epv and s_variance_m_s are standard deviations."""
     if fields.has("latitude_deg"):
-        place = fields.vector("latitude_deg", "longitude_deg", "altitude_ellipsoid_m")
+        place = fields.vector("latitude_deg", "longitude_deg")
     else:
-        place = fields.vector("lat", "lon", "alt_ellipsoid") * [1e-7, 1e-7, 1e-3]
-    # Old firmware leaves the height above the ellipsoid empty.
-    above_sea = fields.of("altitude_msl_m") if fields.has("altitude_msl_m") else 1e-3 * fields.of("alt")
-    place[:, 2] = np.where(place[:, 2] == 0.0, above_sea, place[:, 2])
+        place = fields.vector("lat", "lon") * 1e-7
+    ellipsoid_m, sea_m, agree = heights(fields)
+    is_wrong = ~agree & np.isfinite(sea_m)
+    height_m = np.where(is_wrong, sea_m + fields.separation_m, ellipsoid_m)
     own = fields.rows.topic == "vehicle_gps_position"
-    name = "{}" if own else f"{{}}_{fields.rows.instance}"
+    name = fields.named("{}") if own else f"{{}}_{fields.rows.instance}"
     has_fix = fields.of("fix_type") >= 3
     horizontal, vertical, speed = (fields.of(each) ** 2 for each in ("eph", "epv", "s_variance_m_s"))
-    without = {"without a fix": int((~has_fix).sum())}
+    higher = f", {fields.separation_m:.4g} m higher" if fields.separation_m else ""
+    facts = {
+        "left out without a fix": int((~has_fix).sum()),
+        f"its height above the ellipsoid is 0, missing or more than {FARTHEST_M:g} m from that above "
+        f"the sea, which is taken instead{higher}": int((is_wrong & has_fix).sum()),
+    }
     fix = fields.part(
         name.format("fix"),
         schemas.GEODETIC_FIX,
         latitude_deg=place[:, 0],
         longitude_deg=place[:, 1],
-        altitude_m=place[:, 2],
+        altitude_m=height_m,
         covariance_m2=np.stack([horizontal, horizontal, vertical], axis=1),
     )
-    yield Part(**{**vars(fix), "left_out": without}).take(has_fix)
+    yield replace(fix, facts=facts).take(has_fix)
     is_valid = has_fix & (fields.of("vel_ned_valid") != 0)
     velocity = to_enu(fields.vector("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"))
     covariance = speed[:, None] * np.eye(3).ravel()
@@ -204,7 +241,7 @@ def gnss(fields: Fields) -> Iterator[Part]:
 def air(fields: Fields) -> Iterator[Part]:
     """Yield the barometer that the filter uses: its height in the standard atmosphere."""
     yield fields.values(
-        "barometer",
+        fields.named("barometer"),
         {"altitude_m": "baro_alt_meter", "pressure_pa": "baro_pressure_pa",
          "temperature_degc": "baro_temp_celcius"},
     )  # fmt: skip

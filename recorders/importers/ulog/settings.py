@@ -1,6 +1,6 @@
 """Says what parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
 # EKF2's noise is the density over the root of its step: its variance is (step x noise)^2 in a step.
@@ -10,6 +10,7 @@ _DENSITIES = {
     "EKF2_GYR_B_NOISE": "gyro_bias_density",
     "EKF2_ACC_B_NOISE": "force_bias_density",
 }
+_NAMED = 3  # of the parameters that share a reason; /vehicle/parameters has all
 _STEP_US = "EKF2_PREDICT_US"
 _DEFAULT_STEP_US = 10_000
 # By parameter, settings and what a unit of it is in theirs.
@@ -67,5 +68,10 @@ def carried(parameters: Mapping[str, float]) -> dict[str, str]:
         pattern = next((each for each in _REASONS if fnmatchcase(name, each)), None)
         if pattern is not None:
             rest.setdefault(pattern, []).append(name)
-    notes |= {", ".join(names): _REASONS[pattern] for pattern, names in rest.items()}
+    notes |= {_listed(names): _REASONS[pattern] for pattern, names in rest.items()}
     return notes
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

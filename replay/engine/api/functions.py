@@ -222,6 +222,7 @@ def recursive(
             partial(by, advance) if advance else run,
             priors_of(bound),
             finish=ended if finish else None,
+            truth=made.truth,
         )
         return replace(in_order, out_of_sequence=going_back) if out_of_sequence else in_order
 
@@ -334,7 +335,7 @@ def batch(
             solved = solve(Given(values, found, streams_of, runs, name, bound.setup))
             return made.of_solved(solved, runs) if isinstance(solved, Solved) else solved
 
-        return Batch(name, *topics_of(bound), solve_all, priors_of(bound))
+        return Batch(name, *topics_of(bound), solve_all, priors_of(bound), truth=made.truth)
 
     where = find or partial(bindings_by_name, streams, static, optional, components)
     needs = requirements or requirements_of({**streams, **static}, optional)

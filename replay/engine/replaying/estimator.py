@@ -21,6 +21,7 @@ from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.compiling.kernel_source import DoesNotCompile
 from replay.engine.renamed import renamed
+from replay.engine.replaying.truth import refuse_truths, truths_among
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 from replay.engine.vectors.components import Components
@@ -116,6 +117,8 @@ class Recursive:
             parameters.
         offers: by topic that it does not take, the setting with which it would.
         reading: what it reads; None where that is not known.
+        truth: the topic by which its estimates are judged, which it must not read.
+        is_bound: whether it is a bound of estimates, which may read the truth.
     """
 
     name: str
@@ -133,6 +136,8 @@ class Recursive:
     is_random: bool = False
     offers: Mapping[str, str] = field(default_factory=dict)
     reading: Callable[[], Reading] | None = None
+    truth: str = ""
+    is_bound: bool = False
 
 
 @renamed(whole="static")
@@ -150,6 +155,7 @@ class Batch:
         priors: topics of priors, with their components.
         given: streams that the replay hands it beside those of the log.
         parameters: as it was bound with.
+        truth: the topic by which its estimates are judged, which it must not read.
     """
 
     name: str
@@ -159,6 +165,7 @@ class Batch:
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
     parameters: Parameters | None = None
+    truth: str = ""
 
 
 Bound = Recursive | Batch
@@ -275,6 +282,18 @@ def code_of(name: str) -> Iterator[None]:
         raise BadInput(f"estimator {name}: {error}") from error
 
 
+def bound_to(
+    estimator: Estimator[Any], label: str, topics: Mapping[str, Topic], parameters: Parameters
+) -> list[Bound]:
+    """Bind an estimator to topics; raises BadInput where it would read a truth."""
+    bound = estimator.bind(label, topics, parameters)
+    truths = truths_among(topics)
+    for each in bound:
+        if not (isinstance(each, Recursive) and each.is_bound):
+            refuse_truths(label, (*each.static, *each.streams), {*truths, each.truth})
+    return bound
+
+
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
@@ -302,7 +321,7 @@ def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Any]) 
     first = ensemble[0]
     try:
         with code_of(label):
-            bound = estimator.bind(label, first.topics, parameters)
+            bound = bound_to(estimator, label, first.topics, parameters)
     except BadInput as error:
         raise BadInput(f"{first.name}: {error}") from error
     if not bound:

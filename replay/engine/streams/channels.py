@@ -16,15 +16,17 @@ def stated(
     parameters: type[Parameters] | None = None,
     *,
     needed: bool = True,
+    stands_for: str = "",
 ) -> float:
     """Return the first number of this name that one of the channels states; NaN where none needs to.
 
-    Where it stands for a parameter, that is of the type `parameters`. Raises BadInput where none states
-    it though it is needed, it is no number, or the parameter does not take it.
+    Where it stands for a parameter, that is of the type `parameters`, and called `stands_for` there if
+    that is another name. Raises BadInput where none states it though it is needed, it is no number, or
+    the parameter does not take it.
     """
     for topic in topics:
         if name in topic.metadata:
-            return _number(topic.name, name, topic.metadata[name], parameters)
+            return _number(topic.name, name, topic.metadata[name], parameters, stands_for or name)
     if needed:
         mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
         raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
@@ -32,7 +34,9 @@ def stated(
 
 
 @lru_cache(maxsize=256)
-def _number(topic: str, name: str, text: str, parameters: type[Parameters] | None) -> float:
+def _number(
+    topic: str, name: str, text: str, parameters: type[Parameters] | None, stands_for: str
+) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -40,8 +44,17 @@ def _number(topic: str, name: str, text: str, parameters: type[Parameters] | Non
             f"topic {topic} states {name} = {text}, which is not a number; state a number"
         ) from None
     if parameters is not None:
-        build(parameters, {name: value}, f"topic {topic}")
+        build(parameters, {stands_for: value}, f"topic {topic}")
     return value
+
+
+def heading_variance(metadata: Mapping[str, str]) -> float:
+    """Return the variance (rad^2) that a channel of orientations states about up; NaN where it is none.
+
+    It states one number for all axes, or the covariance about x, y and z.
+    """
+    numbers = [float(each) for each in metadata.get("covariance_rad2", "nan").split(",")]
+    return numbers[-1] if numbers[-1] > 0.0 else np.nan
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:

@@ -15,6 +15,7 @@ from recorders.log import Stream, schemas
 from recorders.models.orientation import heading
 from recorders.models.planar import Components, drive, range_bearing
 from replay.engine.arrays import Floats
+from replay.engine.streams.channels import heading_variance
 from replay.engine.streams.measurements import PLANE
 from replay.engine.vectors.tangent import Kind
 from replay.inference.all_methods import modelled
@@ -182,8 +183,7 @@ def read_heading(stream: Stream) -> Floats:
 
 def read_heading_covariance(stream: Stream) -> Floats:
     """Return their variances (n, 1, 1), which the channel states for all, about x, y and z."""
-    stated = [float(each) for each in stream.metadata.get("covariance_rad2", "nan").split(",")]
-    return np.full((len(stream), 1, 1), stated[-1])
+    return np.full((len(stream), 1, 1), heading_variance(stream.metadata))
 
 
 def align(
@@ -248,7 +248,13 @@ DRIVE_CALIBRATION: Mapping[str, float] = {
     "turn_bias_radps": 0.01,
 }
 MOTION = Motion(move, control_noise=velocity_noise)
-TURN_RATE = Control("turn_rate", schemas.INERTIAL_SAMPLE, ("turn_radps",), read_turn_rate)
+TURN_RATE = Control(
+    "turn_rate",
+    schemas.INERTIAL_SAMPLE,
+    ("turn_radps",),
+    read_turn_rate,
+    noise={"turn_noise_density": ("turn_noise_density", "gyro_noise_density")},
+)
 ODOMETRY = Control(
     "odometry",
     schemas.ODOMETRY,

@@ -4,6 +4,7 @@ Sensors of the state of `navigation`, each on a topic of its own that a log may 
 of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters 6 and 15.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from recorders.models.inertial import cross, into_body, into_plane
 from recorders.models.orientation import heading
 from recorders.models.planar import Components
 from replay.engine.arrays import Floats
+from replay.engine.streams.channels import heading_variance
 from replay.estimators.models.ranging import ANCHORS, RANGE, TAGS, distance
 from replay.estimators.navigation.alignment import turn_rate
 from replay.inference.model.model import Control, Sensor
@@ -112,6 +114,11 @@ def read_heading(stream: Stream) -> Floats:
     return heading(stream["quaternion"])[:, None]
 
 
+def heading_sigma(metadata: Mapping[str, str]) -> float:
+    """Return the standard deviation of headings by the variance that their channel states."""
+    return float(np.sqrt(heading_variance(metadata)))
+
+
 def read_height(stream: Stream) -> Floats:
     """Return heights (n, 1)."""
     return stream["value"][:, :1]
@@ -144,6 +151,7 @@ def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
             be_headed,
             heading_noise,
             read=read_heading,
+            stated={"sigma_heading_rad": heading_sigma},
         ),
         Sensor(
             "height",

@@ -67,6 +67,8 @@ class Control:
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
         fallbacks: other topics that the components of these names are taken from where the log has them,
             such as a gyro's turn rate in place of the wheels'.
+        noise: of one of these, the parameters that are its noise, by the names under which its channel
+            may state them; no other channel is asked for them where it drives.
     """
 
     topic: str
@@ -79,6 +81,7 @@ class Control:
     delay: str = ""
     estimates: bool = False
     fallbacks: tuple["Control", ...] = ()
+    noise: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @renamed(lost="gap_noise")
@@ -172,6 +175,8 @@ class Sensor:
             the measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
         log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
             that can use it.
+        stated: parameters that its channel may state in another form: metadata -> number, NaN where it
+            does not.
     """
 
     topic: str
@@ -192,6 +197,7 @@ class Sensor:
     jacobian: Function | None = None
     moments: Function | None = None
     log_likelihood: Function | None = None
+    stated: Mapping[str, Callable[[Mapping[str, str]], float]] = field(default_factory=dict)
 
     @property
     def maps(self) -> tuple[Map, ...]:

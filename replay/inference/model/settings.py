@@ -83,7 +83,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     settings = np.array(
         [
             [
-                stated([*first, *everything], name, model.parameters, needed=False)
+                _stated(found, [*first, *everything], name, model.parameters)
                 if given[name] is None
                 else float(given[name])
                 for name in names
@@ -91,6 +91,10 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
             for first in own
         ]
     )
+    for row, (sensor, topic) in enumerate(found.sensors, start=1):
+        for name, read in sensor.stated.items():
+            if given[name] is None and name not in topic.metadata and not np.isnan(read(topic.metadata)):
+                settings[row, names.index(name)] = read(topic.metadata)
     lacking = [
         (row, name)
         for row, read in enumerate(needed)
@@ -110,6 +114,22 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     if stage.modes:
         switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
     return settings
+
+
+def _stated(
+    found: Found, topics: Sequence[Topic], name: str, parameters: type[ModelParameters]
+) -> float:
+    """Return what channels state for a parameter; NaN where none does.
+
+    The noise of what drives is that of the topic that does, not of the one whose place it takes.
+    """
+    for drive, topic in found.fallbacks:
+        for other in drive.noise.get(name, ()):
+            if other in topic.metadata:
+                return stated([topic], other, parameters, stands_for=name)
+        if name in drive.noise:
+            return np.nan
+    return stated(topics, name, parameters, needed=False)
 
 
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
@@ -193,7 +213,7 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
         for name, number in start.parameters.items()
         if name in read
         and given[name] is None
-        and not any(name in each.metadata for each in stating)
+        and np.isnan(_stated(found, stating, name, stage.model.parameters))
         and name not in origin_parameters(found, parameters)
     }
 

@@ -21,7 +21,7 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
-from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
+from replay.inference.run.timing import last_of_stamps, select_events, share_stamps, where_wanted
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +141,8 @@ def filter_events(
         events = _inserted(events, again)
     if without_covariance.any() or again:
         events = events._replace(wants_estimate=last_of_stamps(events))
+    if control is not None and not events.arrival.shape[1]:
+        events = share_stamps(events, range(start, start + len(control.components)))
     return events._replace(wants_estimate=where_wanted(stage, events)), without_covariance
 
 
@@ -185,10 +187,10 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    without_covariance = np.zeros(count, bool)
-    if control.interpolated:  # one that is not finite is as if it had not come
-        without_covariance |= ~np.isfinite(read).all(axis=1)
-    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), without_covariance)
+    # one that says nothing, or cannot be interpolated, is as if it had not come
+    known = np.isfinite(read)
+    says_nothing = np.logical_not(known.all(axis=1) if control.interpolated else known.any(axis=1))
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), says_nothing)
 
 
 def control_numbers(control: Control, ragged: Ragged) -> Floats:
@@ -342,8 +344,9 @@ def passed_over(
         without_covariance: which of these (n,) have none.
     """
     control = stage.model.control
-    drops_controls = control is not None and control.interpolated
-    if not drops_controls and not any(sensor.covariance for sensor in stage.sensors):
+    drops = control is not None and control.interpolated
+    drops |= any(sensor.covariance for sensor in stage.sensors)
+    if not drops and not without_covariance.any():
         return []
     sensors = {topic.name: sensor for sensor, topic in found.sensors}
     reasons = [

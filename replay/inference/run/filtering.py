@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -134,6 +134,7 @@ class Filter:
     parameters: Any
     settings: Floats
     samplers: tuple[Sampler, ...]
+    is_bound: ClassVar[bool] = False
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
         """List the topics of a log that it starts from: the prior, where there is one, and the maps."""

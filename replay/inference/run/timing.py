@@ -1,6 +1,6 @@
 """Puts events where they belong in time: delays, an interpolated control, and times of output alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -129,6 +129,29 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
     """
     columns: Any = (column[chosen] for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
+
+
+def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
+    """Give the control's messages of one stamp their mean, so that each of them counts.
+
+    A recorder may stamp two samples at once: of each two, one would drive for no time at all.
+
+    Args:
+        events: in the order of their stamps.
+        columns: those of the control.
+    """
+    at = np.flatnonzero(events.source == CONTROL)
+    run = run_of_rows(events.offsets)[at]
+    is_new = (np.diff(events.time_ns[at], prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0)
+    if is_new.all():
+        return events
+    stamp, data = np.cumsum(is_new) - 1, events.data.copy()
+    for column in columns:
+        known = at[np.isfinite(data[at, column])]
+        of = stamp[np.isfinite(data[at, column])]
+        sums = np.bincount(of, data[known, column])
+        data[known, column] = (sums / np.maximum(np.bincount(of), 1))[of]
+    return events._replace(data=data)
 
 
 def interpolate_control(

@@ -114,6 +114,8 @@ class BoundHistory(NamedTuple):
 class BoundFilter(Filter):
     """Runs a filter that knows the truth, and puts out every step of it."""
 
+    is_bound = True
+
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
         """Return the topics of a log that it starts from; raises BadInput where it has no truth."""
         if self.truth not in topics:

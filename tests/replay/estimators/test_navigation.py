@@ -18,6 +18,7 @@ from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.log.planes import Origin
 from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
+from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording, import_run, record_run
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.failures import sentences_of
@@ -360,6 +361,65 @@ def test_a_start_without_a_prior_is_no_surer_than_it_may_be(method: str, given: 
     """Where the heading is next to unknown, by a bank: of 6 runs, which err alike for long."""
     nees, _ = aligned_nees(method, 6, prior={"is_told": False}, **given)
     assert 10.0 < nees.mean() < 20.0
+
+
+def test_of_two_samples_of_one_stamp_both_count():
+    """A body on the spot turns at 0.2 and 0 rad/s by turns: 1 rad in 10 s, though stamps repeat."""
+    count = 2001
+    stamps_ns = 10**9 + 10**7 * (np.arange(count) // 2)
+    rate = np.where(np.arange(count)[:, None] % 2, [0.0, 0.0, 0.2], 0.0)
+    unit = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps_ns,
+        specific_force_mps2=np.tile([0.0, 0.0, 9.80665], (count, 1)),
+        turn_rate_radps=rate,
+        magnetic_field_ut=np.full((count, 3), np.nan),
+    )
+    fix = make_stream(
+        "/fix",
+        schemas.POSITION_FIX,
+        stamps_ns[::200],
+        position_m=np.zeros((11, 3)),
+        covariance_m2=np.ones((11, 3)),
+    )
+    run = RunMetadata("turns", epoch_ns=10**9)
+    found = outputs(INERTIAL, "ekf", [memory_source(Recording([unit, fix]), run)])
+    first, last = found["state"]["mean"][[0, -1], 6:10]
+    w, _, _, z = compose(conjugate(first), last)
+    assert 2.0 * np.arctan2(z, w) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_heading_may_state_its_covariance():
+    """As headings of tables and of ROS do; the robot's model takes it too."""
+    stamps_ns = 10**9 + 10**7 * np.arange(500)
+    unit = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps_ns,
+        specific_force_mps2=np.tile([0.0, 0.0, 9.80665], (500, 1)),
+        turn_rate_radps=np.zeros((500, 3)),
+        magnetic_field_ut=np.full((500, 3), np.nan),
+    )
+    fix = make_stream(
+        "/fix",
+        schemas.POSITION_FIX,
+        stamps_ns[::100],
+        position_m=np.zeros((5, 3)),
+        covariance_m2=np.ones((5, 3)),
+    )
+    found = []
+    for states in ({"sigma_heading_rad": "0.02"}, {"covariance_rad2": "0.5,0,0,0,0.5,0,0,0,0.0004"}):
+        heading = make_stream(
+            "/heading",
+            schemas.ORIENTATION,
+            stamps_ns[50::100],
+            metadata=states,
+            quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+        )
+        source = memory_source(Recording([unit, fix, heading]), RunMetadata("turns", epoch_ns=10**9))
+        found.append(outputs(INERTIAL, "ekf", [source])["state"]["covariance"])
+    assert_allclose(*found, rtol=1e-12)
 
 
 @pytest.mark.parametrize("states", [True, False])

@@ -226,6 +226,74 @@ def test_a_gyro_takes_the_place_of_the_wheels_where_it_is_asked_for() -> None:
     assert_allclose(turned[-1, 2], wrap_angle(0.06 * (STEPS - 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("stated", "density"),
+    [
+        ({"gyro_noise_density": "0.02"}, 0.02),
+        ({"turn_noise_density": "0.03", "gyro_noise_density": "0.02"}, 0.03),
+        ({}, 0.05),  # what is assumed, and not what the wheels state
+    ],
+)
+def test_the_noise_is_that_of_what_drives(stated: dict[str, str], density: float) -> None:
+    """Of a gyro in place of the wheels' turn rate; the wheels still state that of their speed."""
+    wheels = {"forward_noise_density": "0.1", "turn_noise_density": "0.7"}
+    driven = replace(odometry(), metadata=wheels)
+    gyro = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        STAMPS,
+        metadata=stated,
+        specific_force_mps2=np.zeros((STEPS, 3)),
+        turn_rate_radps=np.zeros((STEPS, 3)),
+        magnetic_field_ut=np.full((STEPS, 3), np.nan),
+    )
+    for names, expected in (({"turn_rate": "inertial"}, density), ({}, 0.7)):
+        made = outputs(ROBOT, "ekf", [log(driven, gyro)], topics=names)
+        covariance = made["pose"]["covariance"].reshape(-1, 3, 3)
+        grown = np.diff(covariance[:, 2, 2]) / (1e-9 * np.diff(STAMPS))
+        assert_allclose(grown, expected**2, rtol=1e-6)
+        told = " ".join(sentences_of(made["started"].stream))
+        assert ("no channel states turn_noise_density: 0.05 is assumed" in told) == (expected == 0.05)
+        assert "forward_noise_density" not in told
+
+
+def test_a_message_that_says_nothing_does_not_drive_and_is_counted() -> None:
+    """Of an accelerometer alone, in place of the wheels' turn rate."""
+    half = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        STAMPS,
+        specific_force_mps2=np.tile([0.0, 0.0, 9.8], (STEPS, 1)),
+        turn_rate_radps=np.full((STEPS, 3), np.nan),
+        magnetic_field_ut=np.full((STEPS, 3), np.nan),
+    )
+    made = outputs(ROBOT, "ekf", [log(odometry(), half)], topics={"turn_rate": "inertial"})
+    assert np.isfinite(made["pose"]["mean"]).all()
+    skipped = sentences_of(made["skipped"].stream)
+    assert skipped == ["topic /inertial: it is not finite"] * STEPS
+
+
+@pytest.mark.parametrize("by_gyro", [False, True])
+def test_of_two_messages_of_one_stamp_both_drive(by_gyro: bool) -> None:
+    """Every second has the stamp of the one before: the mean turn rate of the two is 0.1 rad/s."""
+    stamps = EPOCH_NS + 100_000_000 * (np.arange(201) // 2)
+    turn = np.where(np.arange(201) % 2, 0.2, 0.0)
+    wheels = make_stream(
+        "/odometry", schemas.ODOMETRY, stamps, forward_mps=np.ones(201), turn_radps=turn
+    )
+    gyro = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps,
+        specific_force_mps2=np.zeros((201, 3)),
+        turn_rate_radps=turn[:, None] * [0.0, 0.0, 1.0],
+        magnetic_field_ut=np.full((201, 3), np.nan),
+    )
+    names = {"turn_rate": "inertial"} if by_gyro else {}
+    mean = outputs(ROBOT, "ekf", [log(wheels, gyro)], topics=names)["pose"]["mean"]
+    assert_allclose(mean[-1, 2], 1.0, atol=1e-6)
+
+
 def test_headings_are_a_sensor() -> None:
     n = len(SLOW)
     half = 0.5 * poses()[7::10, 2]

@@ -17,13 +17,14 @@ from recorders.importers.ros.files.raw import BagFile, Batch, Connection, joined
 SUFFIXES = (".bag", ".db3", ".mcap")
 _WANTED = "give a .bag, .db3 or .mcap file of ROS, or the folder of one"
 _ZSTD = ".zstd"
+_MAGIC = zstandard.FRAME_HEADER
 
 
 @dataclass
 class Bag:
     """Holds the files of one bag, in the order of their splits, and what is known to be missing.
 
-    `stated` is how many messages metadata.yaml says that each topic has; where `is_packed`, every
+    `stated` is how many messages metadata.yaml says that each topic has; `is_packed` says that every
     message is compressed by itself.
     """
 
@@ -37,7 +38,7 @@ class Bag:
         """Yield the messages of the wanted connections, file by file."""
         for file in self.files:
             for batch in file.batches(wanted):
-                yield _unpacked(batch) if self.is_packed else batch
+                yield _unpacked(batch) if self.is_packed or _looks_packed(batch) else batch
 
     @property
     def connections(self) -> list[Connection]:
@@ -111,6 +112,12 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
 
         return Ros1File(place)
     raise BadInput(f"{path}: is not a bag; {_WANTED}")
+
+
+def _looks_packed(batch: Batch) -> bool:
+    """Tell whether messages are compressed though no metadata.yaml says so: no CDR begins like that."""
+    begin = int(batch.begins[0]) if len(batch.begins) else len(batch.data)
+    return batch.connection.encoding == "cdr" and batch.data[begin : begin + 4].tobytes() == _MAGIC
 
 
 def _unpacked(batch: Batch) -> Batch:

@@ -1,0 +1,55 @@
+"""Keeps the truth out of filters: what estimates are judged by is never what they are made of.
+
+A truth is a topic of `TruthState`, or one that a channel or an estimator names as its truth. Estimators
+are bound to logs by `estimator.bound_to`, which refuses one that reads a truth. A bound is no estimate
+and may; a replay that starts from the truth hands over a prior.
+"""
+
+from collections.abc import Collection, Mapping
+
+from recorders.errors import BadInput
+from recorders.log import Topic, schemas
+
+TRUTH = schemas.TRUTH_STATE.full_name
+
+
+def truths_among(topics: Mapping[str, Topic]) -> set[str]:
+    """Return the topics that are truths, or that a channel names as one."""
+    named = {each.metadata.get("truth", "") for each in topics.values()}
+    return {name for name, each in topics.items() if each.schema_name == TRUTH or name in named}
+
+
+def refuse_truths(label: str, read: Collection[str], truths: Collection[str], how: str = "") -> None:
+    """Raise BadInput where an estimator would read a truth.
+
+    Args:
+        label: of the estimator.
+        read: topics that it reads.
+        truths: topics that are truths.
+        how: the setting by which it would, if there is one.
+    """
+    for topic in read:
+        if topic in truths:
+            raise BadInput(
+                f"estimator {label}: {how}{topic} is a truth, by which estimates are judged, and no "
+                "filter may read it; import what is to be a measurement under a name of its own, as "
+                'topic = "/survey/fix", becomes = "PositionFix" in a mapping'
+            )
+
+
+def refuse_named_truths(
+    label: str, renamed: Mapping[str, str], topics: Mapping[str, Topic], own: Collection[str]
+) -> None:
+    """Raise BadInput where a setting `topics.ROLE` names a truth for a role that is not one.
+
+    Args:
+        label: of the estimator.
+        renamed: topics by role.
+        topics: of the log.
+        own: the roles of truths.
+    """
+    truths = truths_among(topics)
+    for role, name in renamed.items():
+        if name and role not in own:
+            read = [each for each in topics if each.endswith(f"/{name.removeprefix('/')}")]
+            refuse_truths(label, read, truths, f"topics.{role} = {name}: ")
