@@ -21,6 +21,7 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
+from recorders.importers.tables.guessed_places import METRES, altitude_of, places_of, speed_unit_of
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -42,6 +43,7 @@ _YAW_RATE = (
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
+_ALTITUDE = r"(.*_)?(alt|altitude|height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
 _ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _TARGET = (
@@ -98,23 +100,18 @@ def _fix(table: GuessedTable) -> Iterator[str]:
         return
     fields = ("latitude_deg", "longitude_deg")
     lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
-    north, east = place[0].values, place[1].values * np.cos(np.radians(np.nanmedian(place[0].values)))
+    found = places_of(table, place)
+    lines += found.lines
+    north = found.latitude_deg
+    east = found.longitude_deg * np.cos(np.radians(np.nanmedian(north)))
     table.places.extend(
-        each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
+        each._replace(values=METRES * values)
+        for each, values in zip(place[::-1], (east, north), strict=True)
     )
-    latitude, longitude = (largest_of([column]) for column in place)
-    if place[0].unit == "rad" or (latitude < np.pi / 2 and longitude <= np.pi):
-        lines += [f'units.{field} = "rad"   # latitudes up to {latitude:.4g}' for field in fields]
-    elif 90 < latitude <= 90e7:
-        lines += [
-            f"factors.{field} = 1e-7   # latitudes up to {latitude:.4g} are not degrees"
-            for field in fields
-        ]
-    height = take(table.columns, r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)")
+    height = take(table.columns, _ALTITUDE)
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
-        if (length := stated_unit(height[0], "m")) not in ("", "m"):
-            lines.append(f'units.altitude_m = "{length}"   # as its name says')
+        lines += altitude_of(table, height[0], found.unit)
     deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
@@ -198,10 +195,10 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
     if not both:
         return
     speed, rate = both
-    speed_unit = stated_unit(speed, "m/s")
+    speed_unit, speed_why = speed_unit_of(table, speed)
     rate_unit, why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     if rate_unit == "rad/s" and not stated_unit(rate, "rad/s"):
-        size = unit(speed_unit).size if speed_unit else 1.0
+        size = unit(speed_unit).size
         sideways = float(np.nanquantile(np.abs(size * speed.values * rate.values), 0.99))
         if sideways > _LARGEST_ACCELERATION_MPS2:
             rate_unit = "deg/s"
@@ -212,8 +209,7 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
         "the names are a forward speed and a yaw rate",
         f"fields.forward_mps = {name_of(speed)}",
         f"fields.turn_radps = {name_of(rate)}",
-        f"units.forward_mps = {json.dumps(speed_unit or 'm/s')}   # "
-        + ("as its name says" if speed_unit else f"a guess: the largest is {largest_of([speed]):.4g}"),
+        f"units.forward_mps = {json.dumps(speed_unit)}   # {speed_why}",
         f"units.turn_radps = {json.dumps(rate_unit)}   # {why}",
         "# Yaw rates are anticlockwise seen from above; if these are clockwise:",
         "# factors.turn_radps = -1",
