@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from recorders.importers.tables.columns import (
+    ASSUMED,
     GuessedColumn,
     GuessedTable,
     direction_of,
     largest_of,
+    latitude_metres,
     length_of,
     name_of,
     names_of,
@@ -21,7 +23,7 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
-from recorders.importers.tables.guessed_places import METRES, altitude_of, places_of, speed_unit_of
+from recorders.importers.tables.guessed_places import altitude_of, places_of, speed_unit_of
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -102,11 +104,9 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
     found = places_of(table, place)
     lines += found.lines
-    north = found.latitude_deg
-    east = found.longitude_deg * np.cos(np.radians(np.nanmedian(north)))
+    north, east = latitude_metres(found.latitude_deg, found.longitude_deg)
     table.places.extend(
-        each._replace(values=METRES * values)
-        for each, values in zip(place[::-1], (east, north), strict=True)
+        each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
     )
     height = take(table.columns, _ALTITUDE)
     if height:
@@ -303,7 +303,7 @@ def _truth(
     lines, signs, length = [], [*factors, *[1] * len(turn)], _length(place)
     if heading:
         names, kinds = [*names, "heading_rad"], [*kinds, "angle"]
-        in_unit, is_compass, why = direction_of(heading[0], place)
+        in_unit, is_compass, why, _ = direction_of(heading[0], place)
         lines.append(
             f"units.state = {json.dumps([*[length] * len(place), in_unit])}   # the heading: {why}"
         )
@@ -333,7 +333,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
     direction = direction_of(found[0], table.places)
     angle = "heading" if direction.is_compass else "yaw"
     what = "clockwise from north" if direction.is_compass else "anticlockwise from east"
-    table.made.append(f"# {found[0].name}: {what}, {direction.unit}: {direction.why}.")
+    begin = "# " if direction.is_sure else ASSUMED
+    table.made.append(f"{begin}{found[0].name}: {what}, {direction.unit}: {direction.why}.")
     table.made.append(f'attitude = {{ {angle} = {name_of(found[0])}, unit = "{direction.unit}" }}')
     quaternion = [f"quaternion_{part}" for part in "wxyz"]
     yield from stream_lines(

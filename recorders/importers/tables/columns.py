@@ -80,6 +80,13 @@ def known_of(column: GuessedColumn) -> NDArray:
     return values[np.isfinite(values)]
 
 
+def latitude_metres(latitude_deg: NDArray, longitude_deg: NDArray) -> tuple[NDArray, NDArray]:
+    """Return roughly how many m places (rows,) are north and east, on a sphere."""
+    metres = 111_195.0
+    shrunk = metres * np.cos(np.radians(np.nanmedian(latitude_deg)))
+    return metres * latitude_deg, shrunk * longitude_deg
+
+
 def stated_unit(column: GuessedColumn, usual: str) -> str:
     """Return the unit that a column's name states, if it is one of the usual one's kind."""
     is_unit = column.unit and _is_unit(column.unit) and unit(column.unit).powers == unit(usual).powers
@@ -203,6 +210,7 @@ class Direction(NamedTuple):
     unit: str
     is_compass: bool
     why: str
+    is_sure: bool = False
 
 
 def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Direction:
@@ -225,7 +233,7 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
                     likeness[name, is_compass] = np.sum(length * np.cos(angle_rad - turned))
             best = max(likeness, key=lambda each: likeness[each])
             if likeness[best] > 0.5 * np.sum(length):
-                return Direction(*best, "so it goes with the course")
+                return Direction(*best, "so it goes with the course", is_sure=True)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
 

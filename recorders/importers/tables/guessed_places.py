@@ -16,6 +16,7 @@ from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     known_of,
+    latitude_metres,
     stated_unit,
 )
 from recorders.importers.units import unit
@@ -31,9 +32,9 @@ _NOT_A_PLACE = (91.0, 181.0)
 _SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
 _MINUTES = "ddmm.mmmm"
 _SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "kn": 1852 / 3600, "mi/h": 0.44704, "ft/s": 0.3048}
-_NEAR = 0.06  # of a ratio of the path to the speed
+_SPEEDS |= {"cm/s": 0.01, "mm/s": 0.001}
+_NEAR = 0.03  # of a ratio of the path to the speed
 _HIGHEST_M = 12_000.0  # that anything with a receiver mostly is
-METRES = 111_200.0  # of a degree
 _SOUTH_WEST = {"N", "S", "E", "W", "NORTH", "SOUTH", "EAST", "WEST"}
 
 
@@ -233,8 +234,7 @@ def path_ratio(
     table: GuessedTable, latitude_deg: NDArray, longitude_deg: NDArray, speed: NDArray
 ) -> float | None:
     """Return how many m/s of the path one of a speed's unit is; None if places or speeds do not tell."""
-    north = METRES * latitude_deg
-    east = METRES * np.cos(np.radians(latitude_deg)) * longitude_deg
+    north, east = latitude_metres(latitude_deg, longitude_deg)
     return plane_ratio(table, east, north, speed)
 
 
@@ -324,10 +324,9 @@ def speed_unit_of(table: GuessedTable, speed: GuessedColumn) -> tuple[str, str]:
         return "kn", "as AIS has it"
     if len(table.places) > 1:
         ratio = plane_ratio(table, table.places[0].values, table.places[1].values, speed.values)
-        sizes = {**_SPEEDS, "cm/s": 0.01, "mm/s": 0.001}
         if ratio is not None:
-            nearest = min(sizes, key=lambda each: abs(np.log(sizes[each] / ratio)))
-            if abs(np.log(sizes[nearest] / ratio)) < _NEAR:
+            nearest = min(_SPEEDS, key=lambda each: abs(np.log(_SPEEDS[each] / ratio)))
+            if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
                 return nearest, "so places move as fast"
     return "m/s", f"a guess: the largest is {np.nanmax(np.abs(speed.values)):.4g}"
 

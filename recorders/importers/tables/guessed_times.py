@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, parted
+from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, latitude_metres, parted
 from recorders.importers.tables.files import Batch
 from recorders.importers.tables.order import Order, is_reversed, rollover_of
 from recorders.importers.tables.times import (
@@ -28,6 +28,7 @@ from recorders.importers.tables.times import (
     formats_of,
     offset_of,
     stamps_ns,
+    texts_of,
 )
 
 UNKNOWN_ZERO = "2026-01-01"
@@ -217,8 +218,9 @@ def _tried(
         return None
     vehicle, codes = table.vehicle, table.codes
     parts = _parts(stamps, codes)
-    if not vehicle and np.any(np.diff(known) < 0) and not is_reversed([known]):
-        rollover = 0 if mapping.unit == "date" else _rollover(table, mapping)
+    back = -1 if is_reversed([stamps[part] for part in parts]) else 1
+    if any(np.any(np.diff(stamps[part][::back]) < 0) for part in parts):
+        rollover = 0 if mapping.unit == "date" else _rollover(table, mapping, parts, back)
         if rollover:
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
             comments = [
@@ -226,21 +228,20 @@ def _tried(
                 f"{ASSUMED}{columns[0]} begins again at {rollover}, and goes on beyond that; rollover",
             ]
             stamps = _stamps(table, mapping)
-        else:
+        elif back == 1 and not vehicle:
             vehicle = _separating(table, stamps, columns)
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
-    if is_reversed([stamps[part] for part in parts]):
+    if back == -1:
         comments = [*comments, f"{ASSUMED}rows are newest first, as their times fall; they are reversed"]
-    else:
-        try:
-            for part in parts:
-                order = Order(label, mapping)
-                order.follow(stamps[part], part)
-                order.end()
-        except BadInput as error:
-            refusals.append(error)
-            return None
+    try:
+        for part in parts:
+            order = Order(label, mapping)
+            order.follow(stamps[part][::back], part[::back])
+            order.end()
+    except BadInput as error:
+        refusals.append(error)
+        return None
     if vehicle:
         comments = [
             *comments,
@@ -257,13 +258,18 @@ def _stamps(table: _Table, mapping: TimeMapping) -> Stamps:
     return stamps_ns(mapping, table.batch, rows, str(table.path))
 
 
-def _rollover(table: _Table, mapping: TimeMapping) -> int:
-    if len(mapping.columns) != 1:
-        return 0
+def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.int64]], back: int) -> int:
+    """Return at which number a counter begins again, of each vehicle the same; 0 if it does not."""
     column = next(each for each in table.columns if each.name == mapping.columns[0])
-    values = known_of(column)
-    steps = np.diff(values)
-    return rollover_of(values, float(np.median(steps[steps > 0]))) if (steps > 0).any() else 0
+    found = set()
+    for part in parts if len(mapping.columns) == 1 else ():
+        counts = column.values[part][::back]
+        steps = np.diff(counts)
+        if np.any(steps < 0):
+            found.add(
+                rollover_of(counts, float(np.median(steps[steps > 0]))) if np.any(steps > 0) else 0
+            )
+    return found.pop() if len(found) == 1 else 0
 
 
 def _separating(table: _Table, stamps: Stamps, used: Sequence[str]) -> str:
@@ -320,14 +326,17 @@ def _dates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             )
 
 
-def _first_cell(cells: pa.Array) -> str:
-    texts = pc.utf8_trim_whitespace(cells.cast(pa.string()))
-    return next((text for text in texts.to_pylist() if text), "")
+def _first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
+    return next((text for text in texts_of(cells, is_part=is_part).to_pylist() if text), "")
+
+
+def _first_cells(table: _Table, names: Sequence[str]) -> str:
+    return " ".join(_first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
 
 
 def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
     """Return the time of columns of texts; None if they hold none."""
-    cell = " ".join(_first_cell(table.batch[name]) for name in names)
+    cell = _first_cells(table, names)
     if not re.search(r"\d", cell):
         return None
     given: dict[str, Any] = {"column": list(names), "unit": "date"}
@@ -392,7 +401,7 @@ def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Sta
         if spans[each] <= 2.0 * spans[best] and not np.array_equal(stamps_by[each], stamps_by[best])
     ]
     if alike:
-        cell = " ".join(_first_cell(table.batch[name]) for name in names)
+        cell = _first_cells(table, names)
         first, second = (pd.Timestamp(_first_known(stamps_by[each])) for each in (best, alike[0]))
         raise BadInput(
             f"{table.path}: column {' and '.join(names)} holds dates such as '{cell}', which may be "
@@ -610,8 +619,7 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
         latitude, longitude = named["lat"], named["lon"]
         if np.nanmax(np.abs(latitude)) > 90 or np.nanmax(np.abs(latitude)) < 1.6:
             return None
-        north = 111_200.0 * latitude
-        east = 111_200.0 * np.cos(np.radians(latitude)) * longitude
+        north, east = latitude_metres(latitude, longitude)
     elif {"x", "y"} <= named.keys():
         east, north = named["x"], named["y"]
     else:

@@ -163,7 +163,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         [],
         {},
     )
-    rest = without_codes(_of_one(rest, batch, time.vehicle))
+    rest = without_codes(_in_order(rest, batch, time.vehicle))
     streams = [line for guessed in GUESSES for line in guessed(rest)]
     prepared = list(prepared_lines(rest))
     sides = rest.prepared.get("hemispheres", {}).values()
@@ -172,13 +172,15 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     return "\n".join([*lines, *prepared, *rest.made, *streams, *_rest(rest)]) + "\n"
 
 
-def _of_one(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
-    """Return the rows of the vehicle that has the most, by which units are guessed."""
-    if not vehicle:
-        return table
-    names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
-    values, counts = np.unique(names[names != ""], return_counts=True)
-    rows = np.flatnonzero(names == values[np.argmax(counts)]).tolist()
+def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
+    """Return the rows by their times, of several vehicles those of the one that has the most."""
+    rows = np.arange(len(next(iter(batch.values()))))
+    if vehicle:
+        names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
+        values, counts = np.unique(names[names != ""], return_counts=True)
+        rows = np.flatnonzero(names == values[np.argmax(counts)])
+    if table.time_s is not None:
+        rows = rows[np.argsort(table.time_s[rows], kind="stable")]
 
     def chosen(columns: list[GuessedColumn]) -> list[GuessedColumn]:
         return [column._replace(values=column.values[rows]) for column in columns]
@@ -186,7 +188,7 @@ def _of_one(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
     return table._replace(
         columns=chosen(table.columns),
         whole=chosen(table.whole),
-        texts={name: [cells[row] for row in rows] for name, cells in table.texts.items()},
+        texts={name: [cells[row] for row in rows.tolist()] for name, cells in table.texts.items()},
         time_s=None if table.time_s is None else table.time_s[rows],
     )
 

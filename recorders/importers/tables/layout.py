@@ -186,8 +186,11 @@ def _are_units(below: list[list[str]]) -> bool:
     """Tell whether the line below the names has no values, but units or blanks above values."""
     if len(below) < 2 or any(_is_value(cell) or len(cell) > 24 for cell in below[0]):
         return False
-    above = zip(below[0], below[1], strict=False)
-    return any(unit.lower() not in _MISSING and _is_value(cell) for unit, cell in above)
+    return any(
+        unit.lower() not in _MISSING and _is_value(cell)
+        for row in below[1:]
+        for unit, cell in zip(below[0], row, strict=False)
+    )
 
 
 def _bare(cell: str) -> str:

@@ -12,6 +12,8 @@ from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping
 # How many rows in a row, and by how many usual steps, are behind a row before where a clock began again.
 _ROWS, _STEPS = 10, 5.0
 _ROWS_AT_END = 3
+# By how many usual steps a single row is not late but of another clock, or has no time.
+_FAR_STEPS = 100.0
 # Share of the steps that go back in a file whose rows are newest first.
 _REVERSED = 0.9
 # Numbers at which counters begin again: those of bits, and of days and weeks in several units.
@@ -31,7 +33,7 @@ class Order:
         self._unit_ns = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}.get(str(mapping.unit), 0)
         self._zero_ns = mapping.zero_ns
         self._usual_ns = 0.0
-        self._reached_ns = NOT_A_TIME
+        self._first_ns = self._reached_ns = NOT_A_TIME
         self._behind = 0  # rows behind the latest, up to now
         self._fall: tuple[int, int, int] | None = None  # its row, from where and to where
 
@@ -43,7 +45,7 @@ class Order:
         if not self._usual_ns and (steps > 0).any():
             self._usual_ns = float(np.median(steps[steps > 0]))
         if self._reached_ns == NOT_A_TIME:
-            self._reached_ns = int(stamps[0])
+            self._first_ns = self._reached_ns = int(stamps[0])
         highest = np.maximum.accumulate(np.append(self._reached_ns, stamps))
         behind = stamps < highest[:-1]
         self._reached_ns = int(highest[-1])
@@ -65,21 +67,21 @@ class Order:
         self._check(_ROWS_AT_END)
 
     def _check(self, fewest: int) -> None:
-        if self._fall is None or self._behind < fewest:
+        if self._fall is None or not self._behind:
             return
         row, high, low = self._fall
-        if high - low <= _STEPS * self._usual_ns:
+        is_far = high - low > _FAR_STEPS * self._usual_ns and high - low > 0.5 * (high - self._first_ns)
+        is_before = is_far and low < self._first_ns
+        is_far = is_far and fewest == _ROWS_AT_END
+        if high - low <= _STEPS * self._usual_ns or not (is_before or is_far or self._behind >= fewest):
             return
         rollover = self._rollover(high, low)
         unwrap = f"`rollover = {rollover}` if the counter rolled over, " if rollover else ""
         raise BadInput(
-            f"{self._label}: at row {row + 1} the time falls from {_written(high)} to {_written(low)}, "
-            "and "
-            f"the rows after it go on from there; state in `time` {unwrap}"
-            '`order = "any"` if rows are to be sorted by their times, or in the table `vehicle = '
-            '"COLUMN"` '
-            "if a column says whose row it is; if the clock was restarted or set back, split the file "
-            "there"
+            f"{self._label}: at row {row + 1} the time falls from {_written(high)} to {_written(low)}; state "
+            f'in `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or in the table '
+            '`vehicle = "COLUMN"` if a column says whose row it is; if the clock was restarted or set back, '
+            "split the file there"
         )
 
     def _rollover(self, high_ns: int, low_ns: int) -> int:

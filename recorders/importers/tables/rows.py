@@ -360,6 +360,15 @@ class Rows:
                 {name: Reading() for name in ("time", *self._others)},
             )
         order, readings = self._clocks[vehicle]
+        if self._is_reversed:  # the rows of a block are before those of the last one
+            if self._time.rollover and not (self.is_done and self.count == 0):
+                raise BadInput(
+                    f"{self.path}: its rows are newest first, and its counter begins again at "
+                    f"{self._time.rollover:g}; sort the file by its rows, the last one first"
+                )
+            order = Order(f"{self.path}: column {' and '.join(self._time.columns)}", self._time)
+            for reading in readings.values():
+                reading.begin()
         stamps = self._read_ns(batch, self._time, rows, readings["time"])
         others = {
             name: self._read_ns(batch, clock, rows, readings[name])
@@ -367,8 +376,9 @@ class Rows:
         }
         timed = np.all([each != NOT_A_TIME for each in (stamps, *others.values())], axis=0)
         self._tell(self.path.name, "rows without a time are left out", int((~timed).sum()))
-        if not self._is_reversed:
-            order.follow(stamps[timed], rows[timed])
+        order.follow(stamps[timed], rows[timed])
+        if self._is_reversed:
+            order.end()
         self._note(stamps[timed], vehicle)
         clocks = _Clocks(stamps, others.get("arrival", stamps), others.get("sensor", stamps))
         made: dict[tuple[float, ...], dict[str, NDArray]] = {}

@@ -196,6 +196,10 @@ class Reading:
 
     def __init__(self) -> None:
         self.facts = Counter[str]()
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the rows before."""
         self.count_ns = NOT_A_TIME  # the last number of a counter, as it stands in the file
         self.turns = 0  # how often the counter has begun again
         self.local_ns = NOT_A_TIME  # the last local time
@@ -302,12 +306,12 @@ def _dates_ns(
     """Read dates as ns since 1970 in UTC; the offset that a cell states itself comes before all else."""
     leap_ns = round(mapping.leap_seconds * 1e9)
     zone = offset_of(mapping.zone) if mapping.zone is not None else mapping.utc_offset_h
-    if pa.types.is_timestamp(cells[0].type):
+    if len(cells) == 1 and pa.types.is_timestamp(cells[0].type):
         found = counted_ns(cells[0], 0, label)
         if cells[0].type.tz is None:
             found = _from_zone(found, zone, rows, label, reading)
         return np.where(found == NOT_A_TIME, NOT_A_TIME, found - leap_ns)
-    texts = [_padded(pc.utf8_trim_whitespace(each.cast(pa.string())), mapping.format) for each in cells]
+    texts = [_padded(texts_of(each, is_part=len(cells) > 1), mapping.format) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
     if mapping.format == ISO:  # pandas knows no fractions after a comma
         joined = pc.replace_substring_regex(joined, r"(:\d\d),(\d)", r"\1.\2")
@@ -339,6 +343,13 @@ def _dates_ns(
         _check_offsets(since_ns[own], joined.filter(pa.array(own)), zone, rows[own], label)
     since_ns[local] = _from_zone(since_ns[local], zone, rows[local], label, reading)
     return np.where(since_ns == NOT_A_TIME, NOT_A_TIME, since_ns - leap_ns)
+
+
+def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
+    """Return cells as texts; of a date that is a part of a time without its midnight."""
+    if is_part and pa.types.is_timestamp(cells.type):
+        return pc.strftime(cells, format="%Y-%m-%d")
+    return pc.utf8_trim_whitespace(cells.cast(pa.string()))
 
 
 def _padded(texts: pa.Array, pattern: str) -> pa.Array:
