@@ -33,6 +33,12 @@ _CLOCKED = {
     schemas.MAGNETIC_FIELD.full_name,
     schemas.ODOMETRY.full_name,
 }
+# What drives filters, each message until the next one.
+_DRIVING = {
+    schemas.INERTIAL_SAMPLE.full_name,
+    schemas.ODOMETRY.full_name,
+    schemas.TWIST.full_name,
+}
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
 
@@ -51,7 +57,8 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     name = stream.schema.full_name
     if len(stream) < FEWEST or name not in REGULARS:
         return
-    rate_hz = 1e9 / max(float(np.median(_steps_ns(stream))), 1e-3)
+    steps_ns = _steps_ns(stream)
+    rate_hz = 1e9 / float(np.median(steps_ns[steps_ns > 0])) if steps_ns.any() else 1e12
     fastest_hz = FASTEST_FIX_HZ if name in _FIXES else FASTEST_HZ
     is_slow = name == schemas.INERTIAL_SAMPLE.full_name and rate_hz < SLOWEST_HZ
     if not is_slow and rate_hz <= fastest_hz:
@@ -101,8 +108,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             "",
             float(same.sum()),
             f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the stamp of the one "
-            f"before, the first {first_s:.4g} s after its first stamp: both are used, in "
-            f"the file's order",
+            f"before, the first {first_s:.4g} s after its first stamp: {_used(stream)}",
             mapping="leave one of them out where the log is written",
             sure="fact",
         )
@@ -177,6 +183,13 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             digits(gain),
             sure="hint",
         )
+
+
+def _used(stream: Stream) -> str:
+    """Say what becomes of two messages of one stamp; what drives a filter lasts until the next stamp."""
+    if stream.schema.full_name in _DRIVING:
+        return "the second one drives a filter from then on, and the first one has no effect"
+    return "both are used, in the file's order"
 
 
 def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:

@@ -6,6 +6,7 @@ is wrong.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from zoneinfo import ZoneInfo
@@ -14,9 +15,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-import fuselog as fl
 from recorders.errors import BadInput
 from recorders.importers.tables.guessing import assumptions, guess
+from recorders.importers.tables.importer import TableParameters, read
+from recorders.log import Stream
 
 Verdict = Literal["right", "refused", "assumed", "wrong"]
 METRES = 111_194.93  # of a degree
@@ -289,19 +291,25 @@ def _write(
     return path
 
 
+def imported(path: Path, mapping: Path) -> dict[str, Stream]:
+    """Import a table by a mapping."""
+    recording = read(path, TableParameters(mapping=str(mapping))).together()
+    return {stream.topic: stream for stream in recording.streams}
+
+
 def judge(drawn: Drawn) -> tuple[Verdict, str]:
     """Say what the guess and the import by it make of a table."""
     mapping = drawn.path.with_suffix(".toml")
     try:
         text = guess([drawn.path])
         mapping.write_text(text, encoding="utf-8")
-        log = fl.import_("table", drawn.path, mapping=str(mapping))
+        streams = imported(drawn.path, mapping)
     except BadInput as error:
         return "refused", str(error)
     finally:
         mapping.unlink(missing_ok=True)
     said = assumptions(text)
-    wrong = _compared(drawn, log)
+    wrong = _compared(drawn, streams)
     if not wrong:
         return "right", ""
     what, how = wrong
@@ -320,13 +328,13 @@ STATED = {
 }
 
 
-def _compared(drawn: Drawn, log: Any) -> tuple[str, str] | None:
+def _compared(drawn: Drawn, streams: Mapping[str, Stream]) -> tuple[str, str] | None:
     """Return what is wrong of a log, or None."""
     truth, rows = drawn.truth, drawn.has_place
     space = "" if drawn.choices["vehicles"] == "one" else "/A"
-    if f"{space}/fix" not in log.streams:
-        return "place", f"no fix among {list(log.streams)}"
-    fix = log[f"{space}/fix"]
+    if f"{space}/fix" not in streams:
+        return "place", f"no fix among {list(streams)}"
+    fix = streams[f"{space}/fix"]
     if len(fix) != rows.sum():
         return "place", f"{len(fix)} fixes of {rows.sum()}"
     right_ns = truth.stamps_ns[rows]
@@ -346,8 +354,8 @@ def _compared(drawn: Drawn, log: Any) -> tuple[str, str] | None:
         off_m = float(np.abs(fix["altitude_m"] - truth.altitude_m[rows]).max())
         if not off_m < 0.1:
             return "altitude", f"altitudes are up to {off_m:.4g} m off"
-    if drawn.choices["heading"] != "none" and f"{space}/heading" in log.streams:
-        quaternion = log[f"{space}/heading"]["quaternion"]
+    if drawn.choices["heading"] != "none" and f"{space}/heading" in streams:
+        quaternion = streams[f"{space}/heading"]["quaternion"]
         turned = 2 * np.arctan2(quaternion[:, 3], quaternion[:, 0])
         off = np.angle(np.exp(1j * (turned - (np.pi / 2 - truth.heading_rad))))
         if np.abs(off).max() > 0.01:

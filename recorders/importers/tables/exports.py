@@ -26,7 +26,8 @@ def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str
     if not fitting:
         return []
     topic = "/" + unquote(path.name.partition(".")[0]).replace("-", "/")
-    fitting.sort(key=lambda each: each[0].name.lower() not in topic.replace("_", "").lower())
+    name = topic.replace("_", "").lower()
+    fitting.sort(key=lambda each: (list(each[1].values()).count([]), each[0].name.lower() not in name))
     schema, fields = fitting[0]
     times = [f'time = {{ column = "{_CLOCKS[0]}", unit = "ns", order = "any" }}']
     for name, clock in (("arrival", _CLOCKS[1]), ("sensor", _CLOCKS[2])):
@@ -49,8 +50,7 @@ def _fields(schema: Schema, columns: Sequence[str]) -> dict[str, str | list[str]
     for entry in sorted(list(schema)[1:], key=lambda each: -len(each.name)):
         if entry.kind == "vector":
             own = [name for name in left if name.startswith(f"{entry.name}_")]
-            if own:
-                found[entry.name] = own
+            found[entry.name] = own
         else:
             own = [name for name in left if name == entry.name]
             if own:

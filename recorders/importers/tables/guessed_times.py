@@ -263,7 +263,7 @@ def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.in
     column = next(each for each in table.columns if each.name == mapping.columns[0])
     found = set()
     for part in parts if len(mapping.columns) == 1 else ():
-        counts = column.values[part][::back]
+        counts = np.asarray(column.values)[part][::back]
         steps = np.diff(counts)
         if np.any(steps < 0):
             found.add(
