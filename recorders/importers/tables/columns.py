@@ -240,14 +240,11 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
 
 def _angle_units(largest: float) -> list[str]:
     """Return what angles up to a largest one may be in, the likeliest first."""
-    if largest > 720.0:
-        scales = [
-            each
-            for each in ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")
-            if largest <= 370.0 * _per_deg(each)
-        ]
-        return [*scales[:1], "deg", "rad"] if largest < 36_000.0 else scales[:1] or ["deg"]
-    return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
+    if largest <= 720.0:
+        return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
+    scales = ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")
+    fitting = [each for each in scales if largest <= 370.0 * _per_deg(each)]
+    return [*fitting, "deg", "rad"]  # unwrapped ones may be large
 
 
 def _per_deg(name: str) -> float:

@@ -70,10 +70,10 @@ class Order:
         if self._fall is None or not self._behind:
             return
         row, high, low = self._fall
-        is_far = high - low > _FAR_STEPS * self._usual_ns and high - low > 0.5 * (high - self._first_ns)
-        is_before = is_far and low < self._first_ns
-        is_far = is_far and fewest == _ROWS_AT_END
-        if high - low <= _STEPS * self._usual_ns or not (is_before or is_far or self._behind >= fewest):
+        is_last = fewest == _ROWS_AT_END and high - low > 0.5 * (high - self._first_ns)
+        is_before = low < self._first_ns - _FAR_STEPS * self._usual_ns
+        is_clear = high - low > _STEPS * self._usual_ns
+        if not (is_clear and (is_last or is_before or self._behind >= fewest)):
             return
         rollover = self._rollover(high, low)
         unwrap = f"`rollover = {rollover}` if the counter rolled over, " if rollover else ""
