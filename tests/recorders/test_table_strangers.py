@@ -394,3 +394,22 @@ def test_a_code_of_a_missing_value_holds_in_an_attitude(tmp_path: Path) -> None:
     for table, stream in (("missing = { hdg = [511] }", ""), ("", "missing = [511]")):
         got = Got(path, whole.format(table=table, stream=stream))
         assert len(got.streams["/heading"]) == len(ROWS) - 1
+
+
+def test_files_of_one_row_are_one_table(tmp_path: Path) -> None:
+    """As KITTI has OXTS: the times and the names of the columns are in files of their own."""
+    folder = tmp_path / "oxts"
+    (folder / "data").mkdir(parents=True)
+    for k in ROWS:
+        (folder / "data" / f"{k:010d}.txt").write_text(f"{49 + 1e-6 * k:.6f} 8.4 115.0 {0.1 * k:.1f}")
+    stamps = [f"2011-09-26 13:02:{k:02d}.{964389445 + k}" for k in ROWS]
+    (folder / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    names = ["lat: latitude (deg)", "lon: longitude (deg)", "alt: altitude (m)", "roll: roll (rad)"]
+    (folder / "dataformat.txt").write_text("\n".join(names) + "\n")
+    got = Got(folder)
+    assert 'file = "timestamps.txt"' in got.text
+    assert got.times("/fix") == stamps
+    assert got.streams["/fix"]["latitude_deg"][-1] == 49.000039
+    (folder / "data" / f"{40:010d}.txt").write_text("49 8.4 115 0")
+    with pytest.raises(BadInput, match=r"timestamps.txt: has 40 times, and there are more rows"):
+        Got(folder, got.text)

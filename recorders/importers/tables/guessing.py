@@ -29,8 +29,9 @@ from recorders.importers.tables.columns import (
 )
 from recorders.importers.tables.exports import export_mapping
 from recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
+from recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
 from recorders.importers.tables.guessed_places import prepared_lines, without_codes
-from recorders.importers.tables.guessed_times import guess_time
+from recorders.importers.tables.guessed_times import GuessedTime, guess_time
 from recorders.importers.tables.times import NOT_A_TIME, Stamps
 
 # How many rows are read.
@@ -39,6 +40,8 @@ _ROWS = 100_000
 _FEWEST = 10
 # Names of files with the truth.
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
+# The column of times that have a file of their own.
+_STAMP = "timestamp"
 # Reasons of a guess that are none of a doubt.
 _SURE = ("as its name says", "so places move as fast")
 
@@ -55,12 +58,12 @@ def guess(paths: Sequence[Path]) -> str:
         ]
     tables: list[str] = []
     notes: list[str] = []
-    for file, name in files:
-        if file.is_file():
-            try:
-                tables.append(_table(file, name.as_posix(), is_alone=len(files) == 1))
-            except BadInput as error:
-                notes.append(str(error))
+    sources = sources_of([(file, name.as_posix()) for file, name in files if file.is_file()])
+    for source in sources:
+        try:
+            tables.append(_table(source, is_alone=len(sources) == 1))
+        except BadInput as error:
+            notes.append(str(error))
     if not tables:
         raise BadInput(
             notes[0]
@@ -105,9 +108,10 @@ def _warnings(text: str) -> Iterator[str]:
         yield "# altitude_m = "
 
 
-def _table(path: Path, name: str, *, is_alone: bool) -> str:
+def _table(source: Source, *, is_alone: bool) -> str:
     """Write one [[tables]] of a mapping, with its streams."""
-    table, batch, decimal, split = _first_rows(path)
+    path, name = source.path, source.name
+    table, batch, decimal, split = _first_rows(source)
     columns, texts = [], []
     for column in table.columns:
         values = _numbers(batch[column])
@@ -119,9 +123,10 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
                 GuessedColumn(column, plain, unit_in(table.units.get(column, "")) or unit, values)
             )
     exported = export_mapping(path, table.columns, batch)
-    time = None if exported else guess_time(path, batch, columns, texts)
+    time = None if exported else _time(source, batch, columns, texts)
     used = time.used if time else set()
-    if not columns or (not used and not exported and len(columns[0].values) < _FEWEST):
+    is_timed = bool(used or exported or source.stamps)
+    if not columns or (not is_timed and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
             "mapping by hand, as docs/your-log.md says"
@@ -131,6 +136,8 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         return "\n".join([*lines, *exported]) + "\n"
     assert time is not None
     lines += [f'decimal = "{decimal}"'] * (decimal != ".")
+    if source.more:
+        lines += ["joined = true", *[f"columns = {json.dumps(source.columns)}"] * bool(source.columns)]
     if split:
         parts = [f"{json.dumps(source)} = {json.dumps(names)}" for source, names in split.items()]
         lines.append(f"split = {{ {', '.join(parts)} }}")
@@ -172,6 +179,21 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     return "\n".join([*lines, *prepared, *rest.made, *streams, *_rest(rest)]) + "\n"
 
 
+def _time(
+    source: Source, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+) -> GuessedTime:
+    """Guess the time of rows, which may be in a file of its own."""
+    if source.stamps is None:
+        return guess_time(source.path, batch, columns, texts)
+    path, name = source.stamps
+    cells = pa.array(stamps_in(path)[: len(next(iter(batch.values())))], pa.string())
+    values = _numbers(cells)
+    own = [] if values is None else [GuessedColumn(_STAMP, _STAMP, "", values)]
+    found = guess_time(path, {_STAMP: cells}, own, [] if own else [_STAMP])
+    text = found.text.replace(f'column = "{_STAMP}"', f"file = {json.dumps(name)}")
+    return found._replace(text=text, used=set())
+
+
 def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
     """Return the rows by their times, of several vehicles those of the one that has the most."""
     rows = np.arange(len(next(iter(batch.values()))))
@@ -199,24 +221,25 @@ def _seconds(stamps: Stamps) -> NDArray:
     return np.where(known, since, np.nan)
 
 
-def _first_rows(path: Path) -> tuple[Table, Batch, str, dict[str, list[str]]]:
+def _first_rows(source: Source) -> tuple[Table, Batch, str, dict[str, list[str]]]:
     """Open a table; return it, its first rows as texts, the mark before fractions, and what is split."""
     decimal = "."
-    table, batch = _opened(path, decimal, {})
+    table, batch = _opened(source, decimal, {})
     if any(_has_commas(cells) for cells in batch.values()):
         decimal = ","
-        table, batch = _opened(path, decimal, {})
+        table, batch = _opened(source, decimal, {})
     split = {name: names for name in table.columns if (names := _split(name, batch[name]))}
     if split:
-        table, batch = _opened(path, decimal, split)
+        table, batch = _opened(source, decimal, split)
     return table, batch, decimal, split
 
 
-def _opened(path: Path, decimal: str, split: dict[str, list[str]]) -> tuple[Table, Batch]:
-    table = open_table(path, options=TextOptions(decimal=decimal), split=split)
+def _opened(source: Source, decimal: str, split: dict[str, list[str]]) -> tuple[Table, Batch]:
+    options = TextOptions(source.columns, decimal=decimal)
+    table = open_table(source.path, options=options, more=source.more, split=split)
     batch = next(table.batches((), table.columns), None)
     if batch is None:
-        raise BadInput(f"{path}: has no rows")
+        raise BadInput(f"{source.path}: has no rows")
     return table, {column: cells[:_ROWS] for column, cells in batch.items()}
 
 
