@@ -117,8 +117,13 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             continue
         chosen.append(topic)
     if not chosen:
-        what = "estimates, truth or poses" if to in TRAJECTORIES else "streams of columns"
-        raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
+        if to in TRAJECTORIES:
+            what = "estimates, truth or poses"
+            raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
+        raise BadInput(
+            f"{log.path}: has no topic whose messages can be exported to {to}; fuselog info "
+            f"{log.path.name} lists its topics"
+        )
     return chosen
 
 

@@ -1,4 +1,4 @@
-"""What fuselog exports comes back, by the mapping that a guess writes of it: columns and stamps in ns."""
+"""What fuselog exports comes back, by the mapping that a guess writes: columns and stamps in ns."""
 
 from importlib.metadata import entry_points
 from pathlib import Path
