@@ -16,9 +16,12 @@ from recorders.recording import Simulator, record_run
 
 # What makes the runs short that are long.
 SHORT: dict[str, dict[str, Any]] = {
-    "biometric-scores": {"users": 20}, "crossing": {"duration_s": 8.0},
-    "landmarks": {"duration_s": 5.0}, "navigation": {"duration_s": 10.5}, "vehicles": {"duration_s": 5.0},
-}  # fmt: skip
+    "biometric-scores": {"users": 20},
+    "crossing": {"duration_s": 8.0},
+    "landmarks": {"duration_s": 5.0},
+    "navigation": {"duration_s": 10.5},
+    "vehicles": {"duration_s": 5.0},
+}
 SCENARIOS = [
     each.name
     for each in entry_points(group="fuselog.recorders")

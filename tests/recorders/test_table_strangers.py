@@ -43,7 +43,9 @@ def text_of(folder: Path, head: str, row: Callable[[int], str], rows: Sequence[i
 # Whole numbers of times.
 
 
-@pytest.mark.parametrize("kind", ["int64", "uint64", "Int64", "jsonl", "npz", "timestamp", "zoned"])
+@pytest.mark.parametrize(
+    "kind", ["int64", "uint64", "Int64", "jsonl", "npz", "timestamp", "zoned", "duration"]
+)
 def test_whole_numbers_of_ns_are_times(kind: str, tmp_path: Path) -> None:
     stamps = 1_700_000_000_123_456_789 + 100_000_000 * np.arange(40)
     frame = pd.DataFrame({"stamp": stamps, "speed": 1.5, "yaw_rate": 0.0})
@@ -52,6 +54,8 @@ def test_whole_numbers_of_ns_are_times(kind: str, tmp_path: Path) -> None:
         frame.to_json(path, orient="records", lines=True)
     elif kind == "npz":
         np.savez(path, **{name: frame[name].to_numpy() for name in frame})
+    elif kind == "duration":
+        frame.assign(stamp=pd.to_timedelta(frame["stamp"])).to_parquet(path)
     elif kind in ("timestamp", "zoned"):
         times = pd.to_datetime(frame["stamp"])
         frame["stamp"] = (
@@ -78,13 +82,17 @@ def test_no_rate_is_made_up_beside_a_column_that_could_be_a_time(tmp_path: Path)
 # Order.
 
 
-@pytest.mark.parametrize("bits", [16, 24, 32])
-@pytest.mark.parametrize("unit", ["us", "ms"])
-def test_counters_are_continued_beyond_their_rollover(bits: int, unit: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "unit", "bits"),
+    [("time_us", "us", 32), ("ms", "ms", 16), ("tick_us", "us", 24), ("time_ms", "ms", 32)],
+)
+def test_counters_are_continued_beyond_their_rollover(
+    name: str, unit: str, bits: int, tmp_path: Path
+) -> None:
     step = 10 if bits < 32 else 10_000
     path = text_of(
         tmp_path,
-        f"time_{unit},speed,yaw_rate",
+        f"{name},speed,yaw_rate",
         lambda row: f"{(2**bits - 9 * step + step * row) % 2**bits},1,{row}",
     )
     got = Got(path)
@@ -93,7 +101,7 @@ def test_counters_are_continued_beyond_their_rollover(bits: int, unit: str, tmp_
     assert np.all(np.diff(got.streams["/odometry"]["turn_radps"]) > 0)
     assert f"begins again at {2**bits}" in got.said
     by_hand = (
-        f"[[tables]]\ntime = {{ column = 'time_{unit}', unit = '{unit}' }}\n[[tables.streams]]\n"
+        f"[[tables]]\ntime = {{ column = '{name}', unit = '{unit}' }}\n[[tables.streams]]\n"
         "topic = '/v'\nbecomes = 'VectorMeasurement'\nfields.value = ['speed']\ncomponents = 'v'\n"
     )
     with pytest.raises(BadInput, match=f"at row 10 the time falls .*`rollover = {2**bits}`"):
@@ -189,6 +197,7 @@ PLACES: dict[str, tuple[str, Callable[[int], str], float, float]] = {
         1.2916667,
         103.85,
     ),
+    "as WKT": ("t,place", lambda k: f"{EPOCH + k},POINT (8.7 47.{50 + k})", 47.5, 8.7),
     "in one cell": ("t,GPS", lambda k: f'{EPOCH + k},"47.{50 + k}, 8.70"', 47.5, 8.7),
     "east of 91 deg": ("t,lat,lon", row_of_place("22.5", "91.{:02d}"), 22.5, 91.0),
 }
@@ -233,6 +242,11 @@ def test_codes_of_ais_are_missing_values(tmp_path: Path) -> None:
     assert np.abs(got.streams["/fix"]["longitude_deg"] - 91.0).max() < 0.01
     assert got.notes["own.csv: heading: 511 is missing"] == "2"
     assert "lat: 91 means not available, in 2 rows" in got.said
+
+
+def test_a_column_of_codes_alone_gives_nothing(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},219000001,55.5,{11 + 1e-4 * k:.4f},511"  # noqa: E731
+    assert set(Got(text_of(tmp_path, "t,mmsi,lat,lon,heading", row)).streams) == {"/fix", "/values"}
 
 
 def test_altitudes_and_headings_are_read_in_their_unit(tmp_path: Path) -> None:
@@ -300,6 +314,12 @@ def test_continuity_tells_the_day_from_the_month(tmp_path: Path) -> None:
     one_day = text_of(tmp_path, "when,speed,yaw_rate", lambda k: f"07/09/2019 10:{k:02d},1,0")
     with pytest.raises(BadInput, match="may be 9 July 2019 or 7 September 2019"):
         Got(one_day)
+
+
+def test_dates_without_a_time_of_day_are_dates(tmp_path: Path) -> None:
+    days = pd.date_range("2024-01-25", periods=40, freq="1D")
+    got = Got(text_of(tmp_path, "when,speed,yaw_rate", lambda k: f"{days[k]:%d/%m/%Y},1,0"))
+    assert got.times("/odometry")[-1] == "2024-03-04 00:00:00"
 
 
 def test_iso_dates_are_certain(tmp_path: Path) -> None:

@@ -342,8 +342,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
         "Orientation",
         "the name is that of a heading or compass",
         f"fields.quaternion = {json.dumps(quaternion)}",
-        f"states.sigma_heading_rad = {scatter_rad(found[0], direction.unit):.2g}   # as it scatters from "
-        "one to the next; fill in the standard deviation",
+        f"states.sigma_heading_rad = {scatter_rad(found[0], direction.unit):.2g}   # as it scatters "
+        "from one to the next; fill in the standard deviation",
     )
 
 

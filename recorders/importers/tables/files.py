@@ -194,9 +194,7 @@ def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
 
 def _parts_of(names: Sequence[str]) -> str:
     """Return the expression of a cell that holds as many numbers as there are names."""
-    return r"[\s,;/]+".join(
-        rf"(?P<p{index}>[-+]?[\d.]+(?:[eE][-+]?\d+)?)" for index in range(len(names))
-    )
+    return r"[\s,;]+".join(rf"(?P<p{index}>[-+]?[\d.]+(?:[eE][-+]?\d+)?)" for index in range(len(names)))
 
 
 def _first_line(error: Exception) -> str:
@@ -352,7 +350,8 @@ def _open_parquet(path: Path) -> Table:
     first = next(read(dict.fromkeys(columns, False)), None)
     if first is None:
         raise BadInput(f"{path}: has no rows; give a table with rows")
-    return Table(path, list(first), read)
+    units = {name: "s" for name, cells in first.items() if pa.types.is_duration(cells.type)}
+    return Table(path, list(first), read, units=units)
 
 
 def _root(name: str, columns: Sequence[str]) -> str:
@@ -449,7 +448,6 @@ _PLAIN: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (
     (pa.types.is_string_view, pa.string()),
     (pa.types.is_time, pa.string()),
     (pa.types.is_date, pa.timestamp("ms")),
-    (pa.types.is_duration, pa.int64()),
     (pa.types.is_decimal, pa.float64()),
     (pa.types.is_boolean, pa.int8()),
 )
@@ -462,6 +460,9 @@ def floats(cells: pa.Array) -> NDArray[np.float64]:
     """
     if pa.types.is_string(cells.type):
         cells = pc.utf8_trim_whitespace(cells)
+    if pa.types.is_duration(cells.type):  # in s
+        counts = cells.cast(pa.duration("ns")).cast(pa.int64())
+        cells = pc.divide(counts.cast(pa.float64(), safe=False), 1e9)
     found = cells.cast(pa.float64(), safe=not pa.types.is_integer(cells.type))
     return cast(NDArray[np.float64], found.to_numpy(zero_copy_only=False))
 

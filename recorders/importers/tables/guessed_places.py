@@ -74,6 +74,7 @@ def without_codes(table: GuessedTable) -> GuessedTable:
                 )
             )
             for column in columns
+            if not np.isin(column.values[np.isfinite(column.values)], codes.get(column.name, [])).all()
         ]
 
     for name, values in codes.items():

@@ -35,8 +35,13 @@ UNKNOWN_ZERO = "2026-01-01"
 _SIZES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # Unix time, in s, of 2000 and of 2100: what numbers that count from 1970 are between.
 _DATES_S = (946_684_800.0, 4_102_444_800.0)
+_UNIT_WORDS = {
+    "ms": r"ms|millis(ec(ond)?s?)?|msecs?",
+    "us": r"us|micros(ec(ond)?s?)?|usecs?",
+    "ns": r"ns|nanos(ec(ond)?s?)?|nsecs?",
+}
 _NAMED = re.compile(
-    r"time|stamp|utc|epoch|clock|zeit|"
+    r"time|stamp|utc|epoch|clock|zeit|^(s|ms|us|ns)$|"
     r"(^|_)(t|secs?|seconds?|i?tow|millis(econds?)?|micros(econds?)?|msecs?|usecs?|nsecs?|ticks?|elapsed)"
     r"(_|$|\d)"
 )
@@ -542,13 +547,21 @@ def _full(column: GuessedColumn) -> str:
     return f"{column.plain}_{column.unit}" if column.unit in _SIZES else column.plain
 
 
+def _stated_unit(column: GuessedColumn) -> str:
+    """Return the unit of a column of times that its name states; empty without one."""
+    if column.unit in _SIZES:
+        return column.unit
+    last = column.plain.rpartition("_")[2]
+    return next((unit for unit, words in _UNIT_WORDS.items() if re.fullmatch(words, last)), "")
+
+
 def _epoch_unit(column: GuessedColumn) -> str:
     """Return the unit in which a column's numbers are dates from 2000 to 2100; empty without one."""
     known = known_of(column)
     if not len(known):
         return ""
     middle = float(np.median(known))
-    units = [column.unit] if column.unit in _SIZES else list(_SIZES)
+    units = [stated] if (stated := _stated_unit(column)) else list(_SIZES)
     return next((unit for unit in units if _DATES_S[0] < middle * _SIZES[unit] < _DATES_S[1]), "")
 
 
@@ -565,8 +578,8 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
     unit, comments, zero = _epoch_unit(column), [], {}
     if not unit:
         zero = {"zero": UNKNOWN_ZERO}
-        unit, why = column.unit, ""
-        if unit not in _SIZES:
+        unit, why = _stated_unit(column), ""
+        if not unit:
             unit, why = _relative_unit(table, column, step)
         if largest * _SIZES[unit] > _DATES_S[1]:
             raise BadInput(

@@ -172,11 +172,17 @@ def _table(source: Source, *, is_alone: bool) -> str:
     )
     rest = without_codes(_in_order(rest, batch, time.vehicle))
     streams = [line for guessed in GUESSES for line in guessed(rest)]
+    others = _rest(rest)
+    if not (streams or others):
+        raise BadInput(
+            f"{path}: has no column of numbers beside its time; write a mapping by hand, as "
+            "docs/your-log.md says"
+        )
     prepared = list(prepared_lines(rest))
     sides = rest.prepared.get("hemispheres", {}).values()
     if not_taken := [text for text in texts if text not in used and text not in sides]:
         lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
-    return "\n".join([*lines, *prepared, *rest.made, *streams, *_rest(rest)]) + "\n"
+    return "\n".join([*lines, *prepared, *rest.made, *streams, *others]) + "\n"
 
 
 def _time(
@@ -258,11 +264,13 @@ def _split(name: str, cells: pa.Array) -> list[str]:
     """Return the names of the numbers that each cell of a column holds; none for a column of others."""
     if not pa.types.is_string(cells.type):
         return []
-    known = pc.utf8_trim(cells.drop_null(), " ()[]")
+    is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()
+    known = pc.replace_substring_regex(cells.drop_null(), r"(?i)^\s*POINT\s*Z?", "")
+    known = pc.utf8_trim(known, " ()[]")
     known = known.filter(pc.not_equal(known, ""))
     number = r"[-+]?\d+(?:\.\d+)?"
     counts = {
-        count: pc.all(pc.match_substring_regex(known, rf"^{number}(?:[\s,;/]+{number}){{{count - 1}}}$"))
+        count: pc.all(pc.match_substring_regex(known, rf"^{number}(?:[\s,;]+{number}){{{count - 1}}}$"))
         for count in (2, 3)
     }
     count = next((count for count, holds in counts.items() if holds.as_py()), 0)
@@ -271,7 +279,8 @@ def _split(name: str, cells: pa.Array) -> list[str]:
     plain = parted(name)[0]
     if re.search("gps|gnss|pos|coord|location|lat|lon|lng|place|point", plain):
         first = re.search("lat|l(on|ng)", plain)
-        names = ["longitude", "latitude"] if first and first[0] != "lat" else ["latitude", "longitude"]
+        is_east_first = is_point or (first and first[0] != "lat")
+        names = ["longitude", "latitude"] if is_east_first else ["latitude", "longitude"]
         return [*names, "altitude"][:count]
     return [f"{name}.{number}" for number in range(count)]
 

@@ -270,6 +270,8 @@ def counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
     """Read numbers as ns; texts are read to the last digit, where a double of today has 200 ns."""
     if pa.types.is_timestamp(cells.type):
         return cells.cast(pa.timestamp("ns")).cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
+    if pa.types.is_duration(cells.type):
+        return cells.cast(pa.duration("ns")).cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
     if pa.types.is_integer(cells.type):
         known = cells.is_valid().to_numpy(zero_copy_only=False)
         whole = cells.cast(pa.int64()).fill_null(0).to_numpy()
