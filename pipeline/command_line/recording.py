@@ -182,12 +182,14 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = Fals
     """Write a mapping of tables to start from, and say how to go on; or that it is used as it is."""
     from pipeline.output.outputs import MAPPING, check_files
     from recorders.atomic import whole_file
-    from recorders.importers.tables.guessing import guess
+    from recorders.importers.tables.guessing import assumptions, guess
 
     check_files([(mapping, MAPPING)], {"data": paths})
     text = guess(paths)
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
+    for assumed in assumptions(text):
+        click.echo(printable(f"assumed: {assumed}"))
     if is_used:
         click.echo(printable(f"{mapping}: what was guessed and is imported by; read it"))
         return

@@ -72,7 +72,8 @@ class StreamMapping(Parameters):
 
     Attributes:
         becomes: name of the message.
-        fields: for each of its fields a source, or a list of them for a vector; numbers are constants.
+        fields: for each of its fields a source, or a list of them for a vector; numbers are constants,
+            and an empty list is a vector without numbers.
         factors: what sources are multiplied by, by field.
         offsets: what is added to sources then, by field.
         units: what sources (with factors and offsets) are in, by field; without one, in fuselog's unit.
@@ -216,6 +217,8 @@ class _Maker(NamedTuple):
 
     def _values(self, name: str, given: OneOrMore[Source]) -> NDArray:
         """Compute a field's values (n, width), in fuselog's unit."""
+        if given == []:  # a vector that the messages do not have
+            return np.empty((self.size, 0))
         values = self._numbers(_listed(given))
         mapping, width = self.mapping, values.shape[1]
         stated = len(mapping.components.split(","))

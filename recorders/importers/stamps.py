@@ -72,7 +72,8 @@ def read_ns(
     """Read cells (n,) as stamps; texts to the last digit, where a double of today has 200 ns.
 
     Args:
-        cells: whole numbers, floats, texts that are numbers, or timestamps, which have their own unit.
+        cells: whole numbers, floats, texts that are numbers, or timestamps or durations, which have
+            their own unit.
         digits: how many digits after the point of the unit are nanoseconds: 9 if it is a second.
         since_ns: what they count from.
         where: begins the sentence on values that cannot be.
@@ -85,7 +86,7 @@ def read_ns(
     """
     if pa.types.is_dictionary(cells.type):
         cells = cells.dictionary_decode()
-    if pa.types.is_timestamp(cells.type):
+    if pa.types.is_timestamp(cells.type) or pa.types.is_duration(cells.type):
         values = cells.cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
         return to_ns(values, _UNITS_NS[cells.type.unit], since_ns, where=where, mend=mend)
     if pa.types.is_integer(cells.type):

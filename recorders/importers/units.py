@@ -27,6 +27,7 @@ NAMED = {
     **{name: Unit(size, _TIME) for name, size in {"s": 1, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.items()},
     **{name: Unit(size, _TIME) for name, size in {"min": 60, "h": 3600}.items()},
     **{name: Unit(size, _ANGLE) for name, size in {"rad": 1, "mrad": 1e-3, "deg": pi / 180}.items()},
+    "semicircle": Unit(pi / 2**31, _ANGLE),
     **{name: Unit(size, _FLUX) for name, size in {"T": 1, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9}.items()},
     **{name: Unit(size, _FLUX) for name, size in {"G": 1e-4, "mG": 1e-7}.items()},
     **{name: Unit(size * 9.80665, _ACCELERATION) for name, size in {"g": 1, "mg": 1e-3}.items()},
@@ -39,17 +40,19 @@ _ENDINGS = {
     "deg": "deg", "ut": "uT", "ut2": "uT", "s": "s",
 }  # fmt: skip
 _FACTOR = re.compile(r"\s*([/*]?)\s*([A-Za-z]+)(?:\^?(-?\d))?\s*")
+_NUMBER = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s+")
 
 
 def unit(text: str) -> Unit:
-    """Return the unit that a text such as `m/s^2`, `deg/s` or `m s^-2` names.
+    """Return the unit that a text such as `m/s^2`, `deg/s`, `m s^-2` or `1e-7 deg` names.
 
-    Raises BadInput where it names none.
+    Raises BadInput if it names none.
 
-    >>> unit("km/h").size
-    0.2777777777777778
+    >>> unit("km/h").size, unit("0.5 m").size
+    (0.2777777777777778, 0.5)
     """
-    place, factors = 0, []
+    number = _NUMBER.match(text)
+    place, factors = (number.end() if number else 0), []
     while place < len(text):
         found = _FACTOR.match(text, place)
         if not found or found[2] not in NAMED:
@@ -61,7 +64,8 @@ def unit(text: str) -> Unit:
     powers = tuple(
         sum(power * each.powers[index] for each, power in factors) for index in range(len(_LENGTH))
     )
-    return Unit(prod(each.size**power for each, power in factors), powers)
+    size = prod(each.size**power for each, power in factors)
+    return Unit(float(number[1]) * size if number else size, powers)
 
 
 def unit_of(name: str) -> str:

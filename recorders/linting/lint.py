@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 
 from recorders.errors import BadInput
-from recorders.linting import columns, covariances, forces, magnetic, names, places, stamps
+from recorders.linting import columns, covariances, forces, limits, magnetic, names, places, stamps
 from recorders.log import Log, Stream, read_blocks, read_empty
 from recorders.log.streams import concatenate
 from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
@@ -19,9 +19,15 @@ CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] 
     covariances.impossible,
     places.ranges,
     places.exchanged,
+    places.scaled,
     places.heights,
     places.jumps,
     forces.unmeasured,
+    limits.heights,
+    limits.zeros,
+    limits.leaps,
+    limits.turns,
+    limits.dates,
     forces.upright,
     magnetic.units,
     magnetic.iron,

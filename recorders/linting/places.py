@@ -1,9 +1,10 @@
 """Checks places: latitudes and longitudes that are none, or exchanged, and heights."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from recorders.plausibility.body import bodies
@@ -19,6 +20,15 @@ SCALE = (0.9, 1.1)
 CLIMB_M, MIRRORED = 2.0, -0.9
 FEWEST = 20
 LEAP_M, CLIMB_MPS = 15.0, 100.0  # what climbs faster has an engine for it
+ALIKE = 0.03  # of a metre of the wheels
+# What degrees are that were read in another unit, by what they are read as.
+_READ_AS: dict[str, Callable[[NDArray], NDArray]] = {
+    "semicircles read as 1e-7 deg": lambda degrees: degrees * 1e7 * 180 / 2**31,
+    "1e-7 deg read as semicircles": lambda degrees: degrees * 1e-7 * 2**31 / 180,
+    "degrees and minutes, ddmm.mmmm, read as degrees": lambda degrees: (
+        np.fix(degrees) + np.fmod(degrees, 1.0) / 0.6
+    ),
+}
 
 
 def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
@@ -114,6 +124,37 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             f"one fix to the next, the first {first_s:.4g} s after its first stamp",
             mapping="take one altitude throughout, above the ellipsoid or above the sea",
         )
+
+
+def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find latitudes and longitudes in another unit, by which fixes move as far as the wheels say."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
+        return
+    as_is = _wheels(streams, stream)
+    if as_is is None or not as_is.sign:
+        return
+    for what, changed in _READ_AS.items():
+        columns = {
+            **stream.columns,
+            **{name: changed(stream[name]) for name in ("latitude_deg", "longitude_deg")},
+        }
+        other = _wheels(streams, replace(stream, columns=columns))
+        if other is None or abs(other.value - 1.0) > ALIKE:
+            continue
+        if (
+            BETTER * abs(other.value - 1.0) < abs(as_is.value - 1.0)
+            and other.spread < as_is.spread + ALIKE
+        ):
+            yield _place(
+                stream,
+                as_is.value,
+                f"latitude and longitude are {what}: so fixes move {other.value:.4g} m for each metre "
+                "of "
+                f"the wheels, as they are {as_is.value:.4g} m",
+                "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
+                is_fact=False,
+            )
+            return
 
 
 def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:

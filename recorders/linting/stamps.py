@@ -33,7 +33,12 @@ _CLOCKED = {
     schemas.MAGNETIC_FIELD.full_name,
     schemas.ODOMETRY.full_name,
 }
-_DRIVING = {schemas.INERTIAL_SAMPLE.full_name, schemas.ODOMETRY.full_name}
+# What drives filters, each message until the next one.
+_DRIVING = {
+    schemas.INERTIAL_SAMPLE.full_name,
+    schemas.ODOMETRY.full_name,
+    schemas.TWIST.full_name,
+}
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
 
@@ -53,7 +58,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     if len(stream) < FEWEST or name not in REGULARS:
         return
     steps_ns = _steps_ns(stream)
-    rate_hz = 1e9 / float(np.median(steps_ns[steps_ns > 0] if steps_ns.any() else 1e-3))
+    rate_hz = 1e9 / float(np.median(steps_ns[steps_ns > 0])) if steps_ns.any() else 1e12
     fastest_hz = FASTEST_FIX_HZ if name in _FIXES else FASTEST_HZ
     is_slow = name == schemas.INERTIAL_SAMPLE.full_name and rate_hz < SLOWEST_HZ
     if not is_slow and rate_hz <= fastest_hz:

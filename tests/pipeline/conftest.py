@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -101,13 +101,16 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
         keeping.hold_outcome(name, settings, outcome, in_full=in_full)
         return write_outcome(folder, name, settings, outcome)
 
-    def held(study: str, labels: list[str], outcome: Outcome, settings: Any = None) -> None:
-        hold(study, labels, outcome, settings)
-        told(study, labels, outcome, settings)
+    def held(
+        command: str, settings: Mapping[str, Any], outcome: Outcome, *, in_full: bool = True
+    ) -> None:
+        hold(command, settings, outcome, in_full=in_full)
+        if in_full:
+            told(command, settings, outcome)
 
-    hold = studies.hold
+    hold = keeping.hold_outcome
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studies, "hold", held)
+        patch.setattr(keeping, "hold_outcome", held)
         for module in WRITERS:
             patch.setattr(f"{module}.write_outcome", written)
         yield
@@ -116,15 +119,16 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
 _TOLD: set[tuple[str, ...]] = set()
 
 
-def told(study: str, labels: list[str], outcome: Outcome, settings: Any) -> None:
+def told(name: str, settings: Mapping[str, Any], outcome: Outcome) -> None:
     """Have `run`'s sentences and the report of what a study found, once for each set of its tables."""
+    study = settings.get("study", name)
     key = study, *outcome.tables, *outcome.figures
     if key not in _TOLD:
         _TOLD.add(key)
-        stated = {"study": study, "estimators": {each: {} for each in labels}, **(settings or {})}
+        stated = {"study": study, "estimators": {}, **settings}
         with TemporaryDirectory() as place, without_drawing():
             folder = Path(place)
-            result = write_outcome(folder, study, stated, outcome)
+            result = write_outcome(folder, name, stated, outcome)
             run_sentences(result, folder)
             write_report([folder], folder / "report.html")
 

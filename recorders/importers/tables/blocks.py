@@ -1,7 +1,9 @@
 """Reads texts in blocks of whole lines, none of which is too long: memory holds one block."""
 
 import io
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import BinaryIO
 
 BLOCK_BYTES = 1 << 23
@@ -35,27 +37,33 @@ def lines_of(file: BinaryIO) -> Iterator[bytes]:
         yield line
 
 
-class Utf8(io.RawIOBase):
-    """Gives a text's blocks to Arrow, whose handler of rows takes no other bytes than UTF-8."""
+class Chunks(io.RawIOBase):
+    """Gives chunks of bytes, one after the other, as a file."""
 
-    def __init__(self, blocks: Iterator[bytes]) -> None:
-        self._blocks, self._rest = blocks, b""
+    def __init__(self, chunks: Iterator[bytes]) -> None:
+        self._chunks, self._rest = chunks, b""
 
     def readable(self) -> bool:
         """Tell whether files can be read, as they are asked."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Fill the buffer as far as the block in hand goes; 0 at the end."""
+        """Fill the buffer as far as the chunk in hand goes; 0 at the end."""
         while not self._rest:
-            block = next(self._blocks, None)
-            if block is None:
+            chunk = next(self._chunks, None)
+            if chunk is None:
                 return 0
-            self._rest = block.decode("utf-8", "replace").encode()
+            self._rest = chunk
         size = min(len(buffer), len(self._rest))
         buffer[:size] = self._rest[:size]
         self._rest = self._rest[size:]
         return size
+
+
+def utf8(blocks: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield blocks with what is not UTF-8 replaced: Arrow's handler of rows takes no other bytes."""
+    for block in blocks:
+        yield block.decode("utf-8", "replace").encode()
 
 
 def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
@@ -66,3 +74,27 @@ def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
             for line in block.splitlines()
             if not line.startswith(COMMENTS)
         )
+
+
+def without(blocks: Iterator[bytes], heads: Sequence[bytes], left_out: Counter[str]) -> Iterator[bytes]:
+    """Yield blocks without the lines that repeat the header; these are counted."""
+    for block in blocks:
+        if any(head in block for head in heads):
+            lines = block.splitlines(keepends=True)
+            kept = [line for line in lines if line.strip(b"\r\n") not in heads]
+            if len(kept) < len(lines):
+                left_out["that repeat the names of the columns"] += len(lines) - len(kept)
+                block = b"".join(kept)
+        yield block
+
+
+def joined(opened: Callable[[Path], BinaryIO], paths: Sequence[Path]) -> Iterator[bytes]:
+    """Yield the bytes of files one after the other, each ended by a newline; one is open at a time."""
+    for path in paths:
+        last = b"\n"
+        with opened(path) as file:
+            while chunk := file.read(BLOCK_BYTES):
+                yield chunk
+                last = chunk[-1:]
+        if last != b"\n":
+            yield b"\n"

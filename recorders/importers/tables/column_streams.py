@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from recorders.errors import BadInput
 from recorders.importers.tables.columns import (
+    ASSUMED,
     GuessedColumn,
     GuessedTable,
     direction_of,
     largest_of,
+    latitude_metres,
     length_of,
     name_of,
     names_of,
@@ -22,6 +25,7 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
+from recorders.importers.tables.guessed_places import altitude_of, places_of, speed_unit_of
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -43,10 +47,12 @@ _YAW_RATE = (
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
+_ALTITUDE = (
+    r"(.*_)?(alt|altitude|(ellipsoidal_)?height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
+)
 _ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _GEODETIC = r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?"
-_ALTITUDE = r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
 )
@@ -101,23 +107,16 @@ def _fix(table: GuessedTable) -> Iterator[str]:
         return
     fields = ("latitude_deg", "longitude_deg")
     lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
-    north, east = place[0].values, place[1].values * np.cos(np.radians(np.nanmedian(place[0].values)))
+    found = places_of(table, place)
+    lines += found.lines
+    north, east = latitude_metres(found.latitude_deg, found.longitude_deg)
     table.places.extend(
         each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
     )
-    latitude, longitude = (largest_of([column]) for column in place)
-    if place[0].unit == "rad" or (latitude < np.pi / 2 and longitude <= np.pi):
-        lines += [f'units.{field} = "rad"   # latitudes up to {latitude:.4g}' for field in fields]
-    elif 90 < latitude <= 90e7:
-        lines += [
-            f"factors.{field} = 1e-7   # latitudes up to {latitude:.4g} are not degrees"
-            for field in fields
-        ]
     height = take(table.columns, _ALTITUDE)
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
-        if (length := stated_unit(height[0], "m")) not in ("", "m"):
-            lines.append(f'units.altitude_m = "{length}"   # as its name says')
+        lines += altitude_of(table, height[0], found.unit)
     deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
@@ -201,10 +200,10 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
     if not both:
         return
     speed, rate = both
-    speed_unit = stated_unit(speed, "m/s")
+    speed_unit, speed_why = speed_unit_of(table, speed)
     rate_unit, why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     if rate_unit == "rad/s" and not stated_unit(rate, "rad/s"):
-        size = unit(speed_unit).size if speed_unit else 1.0
+        size = unit(speed_unit).size
         sideways = float(np.nanquantile(np.abs(size * speed.values * rate.values), 0.99))
         if sideways > _LARGEST_ACCELERATION_MPS2:
             rate_unit = "deg/s"
@@ -215,8 +214,7 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
         "the names are a forward speed and a yaw rate",
         f"fields.forward_mps = {name_of(speed)}",
         f"fields.turn_radps = {name_of(rate)}",
-        f"units.forward_mps = {json.dumps(speed_unit or 'm/s')}   # "
-        + ("as its name says" if speed_unit else f"a guess: the largest is {largest_of([speed]):.4g}"),
+        f"units.forward_mps = {json.dumps(speed_unit)}   # {speed_why}",
         f"units.turn_radps = {json.dumps(rate_unit)}   # {why}",
         "# Yaw rates are anticlockwise seen from above; if these are clockwise:",
         "# factors.turn_radps = -1",
@@ -315,6 +313,12 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
     columns = table.columns
     place, factors = _position(columns)
     if not place and (geodetic := take(columns, *_GEODETIC)):
+        found = places_of(table, geodetic)
+        if found.unit not in ("deg", "ddmm.mmmm"):
+            raise BadInput(
+                f"{table.path}: its true latitudes are in {found.unit}; convert them to degrees"
+            )
+        table.made.extend(found.lines)
         names = dict(zip(("latitude", "longitude"), geodetic, strict=True))
         names.update(zip(("altitude",), take(columns, _ALTITUDE), strict=False))
         parts = ", ".join(f"{key} = {name_of(each)}" for key, each in names.items())
@@ -346,7 +350,7 @@ def _truth(
     lines, signs, length = [], [*factors, *[1] * len(turn)], _length(place)
     if heading:
         names, kinds = [*names, "heading_rad"], [*kinds, "angle"]
-        in_unit, is_compass, why = direction_of(heading[0], place)
+        in_unit, is_compass, why, _ = direction_of(heading[0], place)
         lines.append(
             f"units.state = {json.dumps([*[length] * len(place), in_unit])}   # the heading: {why}"
         )
@@ -376,7 +380,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
     direction = direction_of(found[0], table.places)
     angle = "heading" if direction.is_compass else "yaw"
     what = "clockwise from north" if direction.is_compass else "anticlockwise from east"
-    table.made.append(f"# {found[0].name}: {what}, {direction.unit}: {direction.why}.")
+    begin = "# " if direction.is_sure else ASSUMED
+    table.made.append(f"{begin}{found[0].name}: {what}, {direction.unit}: {direction.why}.")
     table.made.append(f'attitude = {{ {angle} = {name_of(found[0])}, unit = "{direction.unit}" }}')
     quaternion = [f"quaternion_{part}" for part in "wxyz"]
     yield from stream_lines(
@@ -384,8 +389,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
         "Orientation",
         "the name is that of a heading or compass",
         f"fields.quaternion = {json.dumps(quaternion)}",
-        f"states.covariance_rad2 = {scatter_rad(found[0], direction.unit) ** 2:.2g}   # as it scatters "
-        "from one to the next; fill in the variance",
+        f"states.sigma_heading_rad = {scatter_rad(found[0], direction.unit):.2g}   # as it scatters "
+        "from one to the next; fill in the standard deviation",
     )
 
 

@@ -3,13 +3,17 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.units import unit
+
+# How a line of a guessed mapping begins that says what was assumed.
+ASSUMED = "# Assumed: "
 
 
 class GuessedColumn(NamedTuple):
@@ -22,16 +26,31 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """Holds columns without a stream yet, how topics begin, whether other columns are the truth.
+    """Holds what is known of a table while its streams are guessed.
 
-    `places` are all columns, by which courses are told, and `made` lines of the table itself.
+    Attributes:
+        path: the file.
+        columns: those without a stream yet.
+        texts: the cells (rows,) of the columns of texts, by name.
+        prefix: how topics begin.
+        has_truth: whether other columns are the truth.
+        time_s: the rows' times (rows,), NaN where there is none; None without times.
+        whole: all columns.
+        places: east and north of the rows, by which courses are told, as soon as they are known.
+        made: lines of the table itself.
+        prepared: tables of the mapping's columns, such as `missing`, by name.
     """
 
+    path: Path
     columns: list[GuessedColumn]
+    texts: Mapping[str, Sequence[str]]
     prefix: str
     has_truth: bool
+    time_s: NDArray | None
+    whole: list[GuessedColumn]
     places: list[GuessedColumn]
     made: list[str]
+    prepared: dict[str, dict[str, Any]]
 
 
 def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
@@ -55,9 +74,23 @@ def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> l
     return []
 
 
+def known_of(column: GuessedColumn) -> NDArray:
+    """Return the numbers of a column that are known."""
+    values = column.values
+    return values[np.isfinite(values)]
+
+
+def latitude_metres(latitude_deg: NDArray, longitude_deg: NDArray) -> tuple[NDArray, NDArray]:
+    """Return roughly how many m places (rows,) are north and east, on a sphere."""
+    metres = 111_195.0
+    shrunk = metres * np.cos(np.radians(np.nanmedian(latitude_deg)))
+    return metres * latitude_deg, shrunk * longitude_deg
+
+
 def stated_unit(column: GuessedColumn, usual: str) -> str:
     """Return the unit that a column's name states, if it is one of the usual one's kind."""
-    return column.unit if column.unit and unit(column.unit).powers == unit(usual).powers else ""
+    is_unit = column.unit and _is_unit(column.unit) and unit(column.unit).powers == unit(usual).powers
+    return column.unit if is_unit else ""
 
 
 def unit_by_size(
@@ -107,28 +140,55 @@ _ENDINGS = {
     "radps": "rad/s", "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "dps": "deg/s",
     "mps2": "m/s^2", "m_s2": "m/s^2", "ut": "uT", "rad": "rad", "deg": "deg", "m": "m",
     "ft": "ft", "feet": "ft", "ns": "ns", "us": "us", "ms": "ms", "s": "s",
+    "mm": "mm", "cm": "cm", "mm_s": "mm/s", "cm_s": "cm/s", "cdeg": "0.01 deg",
+    "semicircles": "semicircle",
+    "1e7": "1e-7 deg", "e7": "1e-7 deg", "e6": "1e-6 deg", "e5": "1e-5 deg", "microdeg": "1e-6 deg",
+    "micro_degrees": "1e-6 deg", "microdegrees": "1e-6 deg", "udeg": "1e-6 deg", "usec": "us",
+    "msec": "ms",
+    "nsec": "ns", "sec": "s", "secs": "s", "seconds": "s", "nanoseconds": "ns", "microseconds": "us",
+    "milliseconds": "ms", "degrees": "deg", "meters": "m", "metres": "m", "km": "km",
 }  # fmt: skip
 # Units in brackets that others write otherwise than we do.
 _WRITTEN = {
     "degrees": "deg", "degree": "deg", "grad": "deg", "°": "deg", "meters": "m", "feet": "ft",
-    "fuss": "ft", "knots": "kn", "kts": "kn", "kmh": "km/h", "kph": "km/h", "mph": "mi/h",
+    "fuss": "ft", "knots": "kn", "kts": "kn", "kt": "kn", "kmh": "km/h", "kph": "km/h", "mph": "mi/h",
+    "metres": "m", "meter": "m", "metre": "m", "sec": "s", "seconds": "s", "second": "s", "usec": "us",
+    "msec": "ms", "nsec": "ns", "dps": "deg/s", "radians": "rad", "semicircles": "semicircle",
+    "gee": "g",
+    "microdegrees": "1e-6 deg", "microdeg": "1e-6 deg", "udeg": "1e-6 deg", "cdeg": "0.01 deg",
+    "centidegrees": "0.01 deg", "µs": "us", "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2",
+    "m/s²": "m/s^2", "degc": "", "utesla": "uT", "gauss": "G",
 }  # fmt: skip
 
 
 def parted(name: str) -> tuple[str, str]:
     """Split a name, in lower case with underlines, from its unit, in brackets or at its end.
 
-    >>> parted("Höhe [ft]"), parted("speed_kmh")
-    (('altitude', 'ft'), ('speed', 'km/h'))
+    >>> parted("Höhe [ft]"), parted("speed_kmh"), parted("TimeUS")
+    (('altitude', 'ft'), ('speed', 'km/h'), ('time', 'us'))
     """
     match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
     if match:
-        parts = re.split(r"(\W)", match[1].replace("°", "deg"))
-        given = "".join(_WRITTEN.get(part.lower().translate(_UMLAUTS), part) for part in parts)
-        return underlined(name[: match.start()]), given if _is_unit(given) else ""
-    plain = underlined(name)
+        return underlined(_words(name[: match.start()])), unit_in(match[1])
+    plain = underlined(_words(name))
     ending = next((each for each in _ENDINGS if plain.endswith(f"_{each}")), "")
     return plain.removesuffix(f"_{ending}"), _ENDINGS.get(ending, "")
+
+
+def unit_in(text: str) -> str:
+    """Return the unit that a text such as °/s, knots or m/(s^2) means; empty if it means none."""
+    bare = text.strip().strip("()[]").replace("°", "deg").replace("(", "").replace(")", "")
+    if bare.lower().startswith("deg") and (scaled := re.fullmatch(r"(?i)deg_?\*?1?e-?(\d)", bare)):
+        return f"1e-{scaled[1]} deg"
+    parts = re.split(r"([^\w.-])", bare)
+    given = "".join(_WRITTEN.get(part.lower().translate(_UMLAUTS), part) for part in parts)
+    given = _WRITTEN.get(given.lower(), given)
+    return given if _is_unit(given) else ""
+
+
+def _words(name: str) -> str:
+    """Set apart the words of a name such as TimeUS or yawRate."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
 
 
 def _is_unit(text: str) -> bool:
@@ -150,6 +210,7 @@ class Direction(NamedTuple):
     unit: str
     is_compass: bool
     why: str
+    is_sure: bool = False
 
 
 def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Direction:
@@ -158,7 +219,7 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
     A heading may be unwrapped, so that its largest value says little.
     """
     stated = stated_unit(heading, "rad")
-    units = [stated] if stated else ["rad", "deg"]
+    units = [stated] if stated else _angle_units(largest_of([heading]))
     course = _course(places) if places else None
     if course is not None:
         rows, angle_rad, length = course
@@ -172,9 +233,22 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
                     likeness[name, is_compass] = np.sum(length * np.cos(angle_rad - turned))
             best = max(likeness, key=lambda each: likeness[each])
             if likeness[best] > 0.5 * np.sum(length):
-                return Direction(*best, "so it goes with the course")
-    in_unit, why = unit_by_largest(heading, "rad", "deg", 2 * np.pi)
-    return Direction(in_unit, bool(re.search("compass|course", heading.plain)), why)
+                return Direction(*best, "so it goes with the course", is_sure=True)
+    why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
+    return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
+
+
+def _angle_units(largest: float) -> list[str]:
+    """Return what angles up to a largest one may be in, the likeliest first."""
+    if largest <= 720.0:
+        return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
+    scales = ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")
+    fitting = [each for each in scales if largest <= 370.0 * _per_deg(each)]
+    return [*fitting, "deg", "rad"]  # unwrapped ones may be large
+
+
+def _per_deg(name: str) -> float:
+    return unit("deg").size / unit(name).size
 
 
 def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:

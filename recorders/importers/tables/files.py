@@ -6,15 +6,17 @@ benchmarks. A batch has an Arrow array for each column that is asked for; memory
 
 import bz2
 import gzip
+import io
 import lzma
 import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, cast
+from typing import Any, BinaryIO, Literal, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -22,10 +24,21 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.json
 import pyarrow.parquet
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
-from recorders.importers.tables.blocks import BLOCK_BYTES, COMMENTS, Utf8, blocks_of, delimited, lines_of
+from recorders.importers.tables.blocks import (
+    BLOCK_BYTES,
+    Chunks,
+    blocks_of,
+    delimited,
+    joined,
+    lines_of,
+    utf8,
+    without,
+)
+from recorders.importers.tables.layout import Layout, layout_of
 from recorders.importers.tables.npz import columns_of
 from recorders.parsing import DEEPEST
 from recorders.trajectories import read_trajectory
@@ -49,13 +62,22 @@ DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowEx
 
 @dataclass
 class Table:
-    """Reads a file's table: holds its columns, what was left out of its rows, and what was mended."""
+    """Reads a file's table.
+
+    Attributes:
+        path: the file.
+        columns: their names.
+        left_out: why how many rows were left out.
+        mended: what was mended.
+        units: what a row of units says, by column.
+    """
 
     path: Path
     columns: list[str]
-    _read: Read
+    read: Read
     left_out: Counter[str] = field(default_factory=Counter)
     mended: str = ""
+    units: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_width(self.path, len(self.columns))
@@ -74,39 +96,55 @@ class Table:
         Empty cells are null. Raises BadInput where the file is damaged, or a cell of `numbers` is none.
         """
         try:
-            yield from self._read(dict.fromkeys(numbers, False) | dict.fromkeys(texts, True))
+            yield from self.read(dict.fromkeys(numbers, False) | dict.fromkeys(texts, True))
         except BadInput:
             raise
         except DAMAGED as error:
             raise BadInput(f"{self.path}: {_reason(error, self)}") from None
 
 
+class TextOptions(NamedTuple):
+    """States what a text table does not tell itself.
+
+    Attributes:
+        names: of the columns, if the file does not name them.
+        has_header: whether the first line names the columns; by default the lines tell.
+        delimiter: between cells; " " is for any white space. By default the lines tell.
+        decimal: the mark before fractions.
+        skip: how many lines at the start of the file are not part of the table.
+    """
+
+    names: Sequence[str] = ()
+    has_header: bool | None = None
+    delimiter: str | None = None
+    decimal: str = "."
+    skip: int = 0
+
+
 def open_table(
     path: Path,
     format: Format | None = None,  # noqa: A002
+    options: TextOptions = TextOptions(),  # noqa: B008
     *,
-    names: Sequence[str] = (),
-    has_header: bool | None = None,
-    delimiter: str | None = None,
-    decimal: str = ".",
+    more: Sequence[Path] = (),
+    split: Mapping[str, Sequence[str]] | None = None,
 ) -> Table:
     """Open a file that holds a table.
 
     Args:
         path: the file; .gz, .bz2 and .xz are decompressed.
         format: what it holds; by default its suffix tells, and CSV is what has no other.
-        names: of the columns, where the file does not name them.
-        has_header: whether the first line names the columns; by default its cells tell.
-        delimiter: between cells; " " is for any white space. By default the first line tells.
-        decimal: the mark before fractions.
+        options: what a text does not tell itself.
+        more: text files whose lines follow those of the first.
+        split: columns whose cells hold several numbers each, and the names of these.
 
-    Raises BadInput where the file cannot be read, or holds no rows.
+    Raises BadInput if the file cannot be read, or holds no rows.
     """
     suffix = path.suffixes[-2:][0] if path.suffix in _OPENERS and len(path.suffixes) > 1 else path.suffix
     format = format or _SUFFIXES.get(suffix.lower(), "csv")  # noqa: A001
     try:
         if format == "csv":
-            found = _open_text(path, names, has_header, delimiter, decimal)
+            found = _open_text(path, more, options)
         elif format == "rtklib":
             found = _open_rtklib(path)
         else:
@@ -116,7 +154,49 @@ def open_table(
             )(path)
     except DAMAGED as error:
         raise BadInput(f"{path}: cannot be read as {format} ({_first_line(error)})") from None
-    return found
+    return _split_table(found, split) if split else found
+
+
+def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
+    """Return a table in which the parts of some columns' cells are columns of their own."""
+    parts = {table.column(source): names for source, names in split.items()}
+    source_of = {name: source for source, names in parts.items() for name in names}
+    twice = [name for name in source_of if name in table.columns]
+    if twice or len(source_of) < sum(map(len, parts.values())):
+        names = ", ".join(twice or source_of)
+        raise BadInput(f"{table.path}: `split` gives a name twice, or one of a column: {names}")
+
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        sources = {source_of[name]: True for name in wanted if name in source_of}
+        for batch in table.read(
+            {name: wanted[name] for name in wanted if name not in source_of} | sources
+        ):
+            made: Batch = {}
+            for source in sources:
+                cells = batch[source].cast(pa.string())
+                found = pc.extract_regex(cells, _parts_of(parts[source]))
+                lacking = int(pc.sum(pc.and_(pc.is_valid(cells), pc.is_null(found))).as_py() or 0)
+                if lacking:
+                    fact = f"whose cell of {source} does not hold {len(parts[source])} numbers"
+                    table.left_out[fact] += lacking
+                for index, name in enumerate(parts[source]):
+                    made[name] = pc.struct_field(found, [index])
+            yield {
+                name: batch[name]
+                if name not in made
+                else made[name]
+                if wanted[name]
+                else made[name].cast(pa.float64())
+                for name in wanted
+            }
+
+    columns = [each for name in table.columns for each in parts.get(name, [name])]
+    return replace(table, columns=columns, read=read)
+
+
+def _parts_of(names: Sequence[str]) -> str:
+    """Return the expression of a cell that holds as many numbers as there are names."""
+    return r"[\s,;]+".join(rf"(?P<p{index}>[-+]?[\d.]+(?:[eE][-+]?\d+)?)" for index in range(len(names)))
 
 
 def _first_line(error: Exception) -> str:
@@ -138,6 +218,16 @@ def open_decompressed(path: Path) -> BinaryIO:
     return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
 
 
+@contextmanager
+def _open_joined(paths: Sequence[Path]) -> Iterator[BinaryIO]:
+    """Open one file, or the lines of several as one."""
+    if len(paths) == 1:
+        with open_decompressed(paths[0]) as file:
+            yield file
+        return
+    yield cast(BinaryIO, io.BufferedReader(Chunks(joined(open_decompressed, paths))))
+
+
 def _check_width(path: Path, width: int) -> None:
     if width > MOST_COLUMNS:
         raise BadInput(f"{path}: has {width} columns, of which at most {MOST_COLUMNS} can be read")
@@ -146,54 +236,35 @@ def _check_width(path: Path, width: int) -> None:
 # Text.
 
 
-def _open_text(
-    path: Path, names: Sequence[str], has_header: bool | None, delimiter: str | None, decimal: str
-) -> Table:
-    comments: list[str] = []
-    skipped = 0
-    with open_decompressed(path) as file:
-        for line in lines_of(file):
-            text = line.decode("utf-8-sig" if skipped == 0 else "utf-8").strip("\r\n")
-            if text.strip() and not line.startswith(COMMENTS):
-                break
-            if text.strip():
-                comments.append(text.lstrip("#% "))
-            skipped += 1
-        else:
-            raise BadInput(f"{path}: has no rows; give a table with rows")
-        following = next(lines_of(file), b"").decode("utf-8")
-    # the first line may be cut, as that of a logger whose file began in the middle of one
-    whole = following.strip() or text
-    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in whole), " ")
-    cells = _cells(text, delimiter)
-    width = max(len(cells), len(_cells(following, delimiter)))
-    _check_width(path, width)
-    if has_header or (has_header is None and not any(map(_is_value, cells))):
-        named, skipped = cells, skipped + 1
-        if not following.strip():
-            raise BadInput(f"{path}: has a header line but no rows; give a table with rows")
-    else:
-        named = _cells(comments[-1], delimiter) if comments else []
-        named = named if len(named) == width else []
-    columns, left_out = _unique(names or named, width, path), Counter[str]()
+def _open_text(path: Path, more: Sequence[Path], options: TextOptions) -> Table:
+    paths = [path, *more]
+    with _open_joined(paths) as file:
+        found = layout_of(
+            file,
+            has_names=bool(options.names),
+            has_header=options.has_header,
+            delimiter=options.delimiter,
+            skip=options.skip,
+        )
+    if found is None:
+        raise BadInput(f"{path}: has no rows; give a table with rows")
+    if found.is_empty:
+        raise BadInput(f"{path}: has a header line but no rows; give a table with rows")
+    _check_width(path, found.width)
+    columns, left_out = _unique(options.names or found.names, found.width, path), Counter[str]()
+    if found.above:
+        left_out["that are above the names of the columns"] = found.above
+    if found.units:
+        left_out["that are the units of the columns"] = 1
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        with open_decompressed(path) as file:
-            for _ in range(skipped):
+        with _open_joined(paths) as file:
+            for _ in range(found.skipped):
                 file.readline()
-            yield from _text_batches(file, columns, wanted, delimiter, decimal, left_out)
+            yield from _text_batches(file, columns, wanted, found, options.decimal, left_out)
 
-    return Table(path, columns, read, left_out)
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    cells = line.split() if delimiter == " " else line.split(delimiter)
-    return [cell.strip().strip('"') for cell in cells]
-
-
-def _is_value(cell: str) -> bool:
-    """Tell whether a cell is a number or a time, as no name of a column is."""
-    return bool(re.match(r"[-+]?\.?\d", cell))
+    units = {name: unit for name, unit in zip(columns, found.units, strict=False) if unit}
+    return Table(path, columns, read, left_out, units=units)
 
 
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
@@ -211,7 +282,7 @@ def _text_batches(
     file: BinaryIO,
     columns: list[str],
     wanted: Mapping[str, bool],
-    delimiter: str,
+    layout: Layout,
     decimal: str,
     left_out: Counter[str],
 ) -> Iterator[Batch]:
@@ -219,12 +290,13 @@ def _text_batches(
         left_out[f"of another number of cells than {row.expected_columns}"] += 1
         return "skip"
 
-    is_spaced = delimiter == " "
+    is_spaced = layout.delimiter == " "
+    rows = without(blocks_of(file), layout.heads, left_out)
     batches = pyarrow.csv.open_csv(
-        Utf8(delimited(blocks_of(file)) if is_spaced else blocks_of(file)),
+        Chunks(utf8(delimited(rows) if is_spaced else rows)),
         pyarrow.csv.ReadOptions(column_names=columns, block_size=BLOCK_BYTES),
         pyarrow.csv.ParseOptions(
-            delimiter="," if is_spaced else delimiter, invalid_row_handler=leave_out
+            delimiter="," if is_spaced else layout.delimiter, invalid_row_handler=leave_out
         ),
         pyarrow.csv.ConvertOptions(
             column_types={
@@ -262,7 +334,7 @@ def _open_rtklib(path: Path) -> Table:
             f"{path}: has no header line of RTKLIB, which begins with '%  GPST'; give the .pos file as "
             "RTKLIB writes it"
         )
-    return _open_text(path, named, False, None, ".")
+    return _open_text(path, (), TextOptions(named, has_header=False))
 
 
 # Binary files, and JSON.
@@ -273,14 +345,22 @@ def _open_parquet(path: Path) -> Table:
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         file = pyarrow.parquet.ParquetFile(path)
-        names = list({name.partition(".")[0]: None for name in wanted})
+        names = list({_root(name, columns): None for name in wanted})
         for batch in file.iter_batches(_BLOCK_ROWS, columns=names):
             yield from _flat_batches(pa.table(batch))
 
     first = next(read(dict.fromkeys(columns, False)), None)
     if first is None:
         raise BadInput(f"{path}: has no rows; give a table with rows")
-    return Table(path, list(first), read)
+    units = {name: "s" for name, cells in first.items() if pa.types.is_duration(cells.type)}
+    return Table(path, list(first), read, units=units)
+
+
+def _root(name: str, columns: Sequence[str]) -> str:
+    """Return the column of a file that a column is, or a part of: names may have dots themselves."""
+    return next(
+        (each for each in columns if name == each or name.startswith(f"{each}.")), name.partition(".")[0]
+    )
 
 
 def _open_json(path: Path) -> Table:
@@ -344,7 +424,7 @@ def _flat_batches(table: pa.Table) -> Iterator[Batch]:
         columns: Batch = {}
         for name, column in _by_name(batch).items():
             if not _is_list(column.type):
-                columns[name] = column
+                columns[name] = _plain(column)
                 continue
             width = pc.max(pc.list_value_length(column)).as_py() or 0
             if width + len(columns) > MOST_COLUMNS:
@@ -352,6 +432,41 @@ def _flat_batches(table: pa.Table) -> Iterator[Batch]:
             if pc.min(pc.list_value_length(column)).as_py() == width:
                 columns |= {f"{name}.{index}": pc.list_element(column, index) for index in range(width)}
         yield columns
+
+
+def _plain(column: pa.Array) -> pa.Array:
+    """Return a column in one of the few types that are read: numbers, texts, dates with a time."""
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        return _plain(column.dictionary_decode())
+    for is_such, plain in _PLAIN:
+        if is_such(kind):
+            return column.cast(plain)
+    return column
+
+
+_PLAIN: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (
+    (pa.types.is_large_string, pa.string()),
+    (pa.types.is_string_view, pa.string()),
+    (pa.types.is_time, pa.string()),
+    (pa.types.is_date, pa.timestamp("ms")),
+    (pa.types.is_decimal, pa.float64()),
+    (pa.types.is_boolean, pa.int8()),
+)
+
+
+def floats(cells: pa.Array) -> NDArray[np.float64]:
+    """Return numbers (n,), NaN for empty cells; whole ones beyond 2^53 are rounded.
+
+    Raises pa.ArrowException if a cell holds something else.
+    """
+    if pa.types.is_string(cells.type):
+        cells = pc.utf8_trim_whitespace(cells)
+    if pa.types.is_duration(cells.type):  # in s
+        counts = cells.cast(pa.duration("ns")).cast(pa.int64())
+        cells = pc.divide(counts.cast(pa.float64(), safe=False), 1e9)
+    found = cells.cast(pa.float64(), safe=not pa.types.is_integer(cells.type))
+    return cast(NDArray[np.float64], found.to_numpy(zero_copy_only=False))
 
 
 def _is_list(kind: pa.DataType) -> bool:

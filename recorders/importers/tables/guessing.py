@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,34 +16,34 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME
+from recorders.importers.stamps import NOT_A_TIME, Stamps
 from recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
 from recorders.importers.tables.columns import (
+    ASSUMED,
     GuessedColumn,
     GuessedTable,
     names_of,
     parted,
     stream_lines,
     underlined,
+    unit_in,
 )
-from recorders.importers.tables.files import Batch, Table, open_table
-from recorders.importers.tables.times import (
-    ISO,
-    TimeMapping,
-    formats_of,
-    offset_of,
-    stamps_ns,
-)
+from recorders.importers.tables.exports import export_mapping
+from recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
+from recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
+from recorders.importers.tables.guessed_places import prepared_lines, without_codes
+from recorders.importers.tables.guessed_times import GuessedTime, guess_time
 
 # How many rows are read.
 _ROWS = 100_000
 # A file without times that has fewer is a summary or a text.
 _FEWEST = 10
-# Units of stamps by the least that today's date is in them.
-_EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8))
-_UNKNOWN_ZERO = "2026-01-01"
 # Names of files with the truth.
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
+# The column of times that have a file of their own.
+_STAMP = "timestamp"
+# Reasons of a guess that are none of a doubt.
+_SURE = ("as its name says", "so places move as fast")
 
 
 def guess(paths: Sequence[Path]) -> str:
@@ -59,12 +58,12 @@ def guess(paths: Sequence[Path]) -> str:
         ]
     tables: list[str] = []
     notes: list[str] = []
-    for file, name in files:
-        if file.is_file():
-            try:
-                tables.append(_table(file, name.as_posix(), is_alone=len(files) == 1))
-            except BadInput as error:
-                notes.append(str(error))
+    sources = sources_of([(file, name.as_posix()) for file, name in files if file.is_file()])
+    for source in sources:
+        try:
+            tables.append(_table(source, is_alone=len(sources) == 1))
+        except BadInput as error:
+            notes.append(str(error))
     if not tables:
         raise BadInput(
             notes[0]
@@ -78,6 +77,18 @@ def guess(paths: Sequence[Path]) -> str:
         *_warnings("\n".join(tables)),
     ]
     return "\n".join(head) + "\n\n" + "\n".join(tables)
+
+
+def assumptions(text: str) -> list[str]:
+    """Return what a guessed mapping assumes that changes numbers: its lines that say so."""
+    found = []
+    for line in text.splitlines():
+        setting, _, why = line.partition("   # ")
+        if line.startswith(ASSUMED):
+            found.append(line.removeprefix(ASSUMED))
+        elif why and why not in _SURE:
+            found.append(f"{setting} ({why})")
+    return list(dict.fromkeys(found))
 
 
 def _warnings(text: str) -> Iterator[str]:
@@ -97,62 +108,153 @@ def _warnings(text: str) -> Iterator[str]:
         yield "# altitude_m = "
 
 
-def _table(path: Path, name: str, *, is_alone: bool) -> str:
+def _table(source: Source, *, is_alone: bool) -> str:
     """Write one [[tables]] of a mapping, with its streams."""
-    table, batch, decimal = _first_rows(path)
+    path, name = source.path, source.name
+    table, batch, decimal, split = _first_rows(source)
     columns, texts = [], []
     for column in table.columns:
         values = _numbers(batch[column])
         if values is None:
             texts.append(column)
         else:
-            columns.append(GuessedColumn(column, *parted(column), values))
-    time, used, comments = _time(path, batch, columns, texts)
-    if not columns or (not used and len(columns[0].values) < _FEWEST):
+            plain, unit = parted(column)
+            columns.append(
+                GuessedColumn(column, plain, unit_in(table.units.get(column, "")) or unit, values)
+            )
+    exported = export_mapping(path, table.columns, batch)
+    time = None if exported else _time(source, batch, columns, texts)
+    used = time.used if time else set()
+    is_timed = bool(used or exported or source.stamps)
+    if not columns or (not is_timed and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
             "mapping by hand, as docs/your-log.md says"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}"]
+    if exported:
+        return "\n".join([*lines, *exported]) + "\n"
+    assert time is not None
     lines += [f'decimal = "{decimal}"'] * (decimal != ".")
-    lines += [*comments, f"time = {time}"]
+    if source.more:
+        lines += ["joined = true", *[f"columns = {json.dumps(source.columns)}"] * bool(source.columns)]
+    if split:
+        parts = [f"{json.dumps(source)} = {json.dumps(names)}" for source, names in split.items()]
+        lines.append(f"split = {{ {', '.join(parts)} }}")
+        lines += [
+            f"{ASSUMED}{source} holds {' and '.join(names)} in one cell, in this order; split"
+            for source, names in split.items()
+        ]
+    lines += [*time.comments, f"time = {time.text}"]
     if all(column.isdecimal() for column in table.columns):
         blanks = ", ".join(f'"{column}"' for column in table.columns)
         lines.append(f"# The file does not name its columns; to name them: columns = [{blanks}]")
-    if not_taken := [text for text in texts if text not in used]:
-        lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
     prefix = (
         "" if is_alone else "/" + re.sub(r"\W+", "_", Path(name).with_suffix("").as_posix()).strip("_")
     )
+    if time.vehicle:
+        lines.append(f"vehicle = {json.dumps(time.vehicle, ensure_ascii=False)}")
+        prefix += "/{vehicle}"
+    used |= {time.vehicle}
     left = [column for column in columns if column.name not in used]
     is_reference = re.search(_REFERENCE, path.stem) is not None
-    true = GuessedTable(true_columns(left, is_reference=is_reference), prefix, True, [], [])
-    rest = GuessedTable(left, prefix, bool(true.columns), [], [])
+    cells = {text: batch[text].cast(pa.string()).fill_null("").to_pylist() for text in texts}
+    every = GuessedTable(
+        path,
+        left,
+        {text: cells[text] for text in texts if text not in used},
+        prefix,
+        False,
+        None if time.stamps is None else _seconds(time.stamps),
+        list(left),
+        [],
+        [],
+        {},
+    )
+    every = without_codes(_in_order(every, batch, time.vehicle))
+    of_truth = true_columns(every.columns, is_reference=is_reference)
+    true = every._replace(columns=of_truth, has_truth=True, places=[], made=[])
+    rest = every._replace(has_truth=bool(of_truth))
     streams = [line for guessed in GUESSES for line in guessed(rest)]
     streams += [*_rest(rest), *truth_lines(true)]
-    if not any(line.startswith("topic =") for line in streams):
+    if not streams:
+        raise BadInput(
+            f"{path}: has no column of numbers beside its time; write a mapping by hand, as "
+            "docs/your-log.md says"
+        )
+    if not any(line.startswith("topic =") for line in streams) and rest.has_truth:
         raise BadInput(
             f"{path}: its name or columns say that it is the truth, and it has no position or heading; "
             "if it was measured, write a mapping by hand"
         )
-    return "\n".join([*lines, *rest.made, *true.made, *streams]) + "\n"
+    prepared = list(prepared_lines(rest))
+    sides = rest.prepared.get("hemispheres", {}).values()
+    if not_taken := [text for text in texts if text not in used and text not in sides]:
+        lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
+    return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
 
 
-def _first_rows(path: Path) -> tuple[Table, Batch, str]:
-    """Open a table; return it, its first rows as texts, and the mark before fractions."""
+def _time(
+    source: Source, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+) -> GuessedTime:
+    """Guess the time of rows, which may be in a file of its own."""
+    if source.stamps is None:
+        return guess_time(source.path, batch, columns, texts)
+    path, name = source.stamps
+    cells = pa.array(stamps_in(path)[: len(next(iter(batch.values())))], pa.string())
+    values = _numbers(cells)
+    own = [] if values is None else [GuessedColumn(_STAMP, _STAMP, "", values)]
+    found = guess_time(path, {_STAMP: cells}, own, [] if own else [_STAMP])
+    text = found.text.replace(f'column = "{_STAMP}"', f"file = {json.dumps(name)}")
+    return found._replace(text=text, used=set())
+
+
+def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
+    """Return the rows by their times, of several vehicles those of the one that has the most."""
+    rows = np.arange(len(next(iter(batch.values()))))
+    if vehicle:
+        names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
+        values, counts = np.unique(names[names != ""], return_counts=True)
+        rows = np.flatnonzero(names == values[np.argmax(counts)])
+    if table.time_s is not None:
+        rows = rows[np.argsort(table.time_s[rows], kind="stable")]
+
+    def chosen(columns: list[GuessedColumn]) -> list[GuessedColumn]:
+        return [column._replace(values=column.values[rows]) for column in columns]
+
+    return table._replace(
+        columns=chosen(table.columns),
+        whole=chosen(table.whole),
+        texts={name: [cells[row] for row in rows.tolist()] for name, cells in table.texts.items()},
+        time_s=None if table.time_s is None else table.time_s[rows],
+    )
+
+
+def _seconds(stamps: Stamps) -> NDArray:
+    known = stamps != NOT_A_TIME
+    since = np.where(known, stamps - stamps[known].min(), 0) * 1e-9
+    return np.where(known, since, np.nan)
+
+
+def _first_rows(source: Source) -> tuple[Table, Batch, str, dict[str, list[str]]]:
+    """Open a table; return it, its first rows as texts, the mark before fractions, and what is split."""
     decimal = "."
-    table, batch = _opened(path, decimal)
+    table, batch = _opened(source, decimal, {})
     if any(_has_commas(cells) for cells in batch.values()):
         decimal = ","
-        table, batch = _opened(path, decimal)
-    return table, batch, decimal
+        table, batch = _opened(source, decimal, {})
+    split = {name: names for name in table.columns if (names := _split(name, batch[name]))}
+    if split:
+        table, batch = _opened(source, decimal, split)
+    return table, batch, decimal, split
 
 
-def _opened(path: Path, decimal: str) -> tuple[Table, Batch]:
-    table = open_table(path, decimal=decimal)
+def _opened(source: Source, decimal: str, split: dict[str, list[str]]) -> tuple[Table, Batch]:
+    options = TextOptions(source.columns, decimal=decimal)
+    table = open_table(source.path, options=options, more=source.more, split=split)
     batch = next(table.batches((), table.columns), None)
     if batch is None:
-        raise BadInput(f"{path}: has no rows")
+        raise BadInput(f"{source.path}: has no rows")
     return table, {column: cells[:_ROWS] for column, cells in batch.items()}
 
 
@@ -167,137 +269,40 @@ def _has_commas(cells: pa.Array) -> bool:
     return bool(pc.all(numbers).as_py() and pc.any(with_comma).as_py())
 
 
+def _split(name: str, cells: pa.Array) -> list[str]:
+    """Return the names of the numbers that each cell of a column holds; none for a column of others."""
+    if not pa.types.is_string(cells.type):
+        return []
+    is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()
+    known = pc.replace_substring_regex(cells.drop_null(), r"(?i)^\s*POINT\s*Z?", "")
+    known = pc.utf8_trim(known, " ()[]")
+    known = known.filter(pc.not_equal(known, ""))
+    number = r"[-+]?\d+(?:\.\d+)?"
+    counts = {
+        count: pc.all(pc.match_substring_regex(known, rf"^{number}(?:[\s,;]+{number}){{{count - 1}}}$"))
+        for count in (2, 3)
+    }
+    count = next((count for count, holds in counts.items() if holds.as_py()), 0)
+    if not count:
+        return []
+    plain = parted(name)[0]
+    if re.search("gps|gnss|pos|coord|location|lat|lon|lng|place|point", plain):
+        first = re.search("lat|l(on|ng)", plain)
+        is_east_first = is_point or (first and first[0] != "lat")
+        names = ["longitude", "latitude"] if is_east_first else ["latitude", "longitude"]
+        return [*names, "altitude"][:count]
+    return [f"{name}.{number}" for number in range(count)]
+
+
 def _numbers(cells: pa.Array) -> NDArray | None:
     """Read a column's numbers, NaN for empty cells; None where it holds something else, or nothing."""
-    if pa.types.is_string(cells.type):
-        cells = pc.utf8_trim_whitespace(cells)
+    if pa.types.is_timestamp(cells.type):
+        return None
     try:
-        found = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
+        found = floats(cells)
     except pa.ArrowException:
         return None
     return found if np.isfinite(found).any() else None
-
-
-# The time.
-
-
-def _time(
-    path: Path, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
-) -> tuple[str, set[str], list[str]]:
-    """Write the time as TOML; return also the columns that it is of, and what was seen.
-
-    Raises BadInput where a column of texts holds times that cannot be read: no rate stands for them.
-    """
-    plain = {name: parted(name)[0] for name in texts}
-    days = [name for name in texts if re.fullmatch("(.*_)?(date|day)", plain[name])]
-    hours = [name for name in texts if re.fullmatch("(.*_)?(time|clock|utc)", plain[name])]
-    pairs = [[day, hour] for day in days for hour in hours]
-    for names in (*pairs, *([name] for name in texts)):
-        if found := _dated(batch, names):
-            return found
-    for name in texts:
-        cell = _first_cell(batch[name])
-        if re.search(r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}", cell):
-            raise BadInput(
-                f"{path}: column {name} holds times such as '{cell}', whose format is not known; write "
-                f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
-                "as docs/your-log.md says"
-            )
-    named = [column for column in columns if re.search("time|stamp|utc|^t$|^sec", column.plain)]
-    first = [columns[0]] if columns else []
-    for column in (*named, *first):
-        known = column.values[np.isfinite(column.values)]
-        if len(known) < 2 or np.mean(np.diff(known) >= 0) < 0.9 or known[-1] <= known[0]:
-            continue
-        middle, step = float(np.median(known)), float(np.median(np.diff(known)))
-        epoch = next((name for name, least in _EPOCHS if middle >= least), None)
-        relative = "ns" if step > 1e5 else "us" if step > 1e3 else "ms" if step >= 1 else "s"
-        in_unit = column.unit if column.unit in dict(_EPOCHS) else epoch or relative
-        comments = []
-        if epoch is None:
-            comments = [
-                f"# Stamps begin at {known[0]:g}: give the date that they count from; check the unit."
-            ]
-        zero = f', zero = "{_UNKNOWN_ZERO}"' if epoch is None else ""
-        given = {"column": column.name, "unit": in_unit, "zero": _UNKNOWN_ZERO}
-        mapping = TimeMapping.model_validate(given)
-        text = f'{{ column = {json.dumps(column.name)}, unit = "{in_unit}"{zero} }}'
-        return text, {column.name}, [*comments, *_seen(mapping, batch)]
-    return (
-        '{ rate_hz = 1, zero = "2026-01-01" }',
-        set(),
-        ["# No column looks like a time: give the rate of the rows."],
-    )
-
-
-def _first_cell(cells: pa.Array) -> str:
-    texts = pc.utf8_trim_whitespace(cells.cast(pa.string()))
-    return next((text for text in texts.to_pylist() if text), "")
-
-
-def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]] | None:
-    """Write the time of columns of texts as TOML, as `_time` does; None where they hold none."""
-    cell = " ".join(_first_cell(batch[name]) for name in names)
-    is_of_day = re.match(r"\d{1,2}:\d{2}", cell) is not None
-    given: dict[str, Any] = {"column": list(names), "unit": "date"}
-    comments = ['# If its clock is not UTC: zone = "Europe/Berlin", or utc_offset_h = 8.']
-    if zone := _zone(names):
-        given["zone"], comments = zone, []
-    if is_of_day:
-        given["zero"] = _UNKNOWN_ZERO
-        comments.append("# These times have no date: give the day in zero.")
-    fitting = {}
-    for pattern in formats_of(cell):
-        mapping = TimeMapping.model_validate({**given, "format": pattern})
-        if seen := _seen(mapping, batch):
-            fitting[pattern] = seen
-    if not fitting:
-        return None
-    (pattern, seen), *others = fitting.items()
-    if others:
-        comments.append(f"# Day and month may be exchanged: {others[0][0]} fits as well.")
-    if pattern != ISO:
-        given["format"] = pattern
-    given["column"] = names[0] if len(names) == 1 else list(names)
-    parts = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in given.items()]
-    return f"{{ {', '.join(parts)} }}", set(names), [*seen, *comments]
-
-
-def _zone(names: Sequence[str]) -> str:
-    """Return the zone that a column's name states in brackets."""
-    for text in re.findall(r"[\[(]\s*([^\])]+?)\s*[\])]", " ".join(names)):
-        try:
-            offset_of(text)
-        except ValueError:
-            continue
-        return str(text)
-    return ""
-
-
-def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
-    """Say the rate, gaps and repetitions of stamps; nothing where they cannot be read."""
-    try:
-        stamps = stamps_ns(mapping, batch, 0, len(next(iter(batch.values()))), "")
-    except BadInput:
-        return []
-    steps_s = np.diff(stamps[stamps != NOT_A_TIME]) * 1e-9
-    forward = steps_s[steps_s > 0]
-    if not len(forward):
-        return ["# All rows have one stamp."]
-    usual_s = float(np.median(forward))
-    gaps = forward[forward > 5 * usual_s]
-    rate = f"{1 / usual_s:.4g}"
-    comment = f"# {rate} {'row' if rate == '1' else 'rows'} a second"
-    if len(gaps):
-        what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-        comment += f"; {what} over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
-    for one, many, which in (
-        ("repeats", "repeat", steps_s == 0),
-        ("goes back", "go back", steps_s < 0),
-    ):
-        if which.any():
-            comment += f"; 1 stamp {one}" if which.sum() == 1 else f"; {which.sum()} stamps {many}"
-    return [f"{comment}."]
 
 
 # What columns are together.

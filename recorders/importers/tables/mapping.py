@@ -18,7 +18,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
 
 from recorders.atomic import is_being_written
 from recorders.errors import BadInput, choices, some_of
@@ -137,8 +144,17 @@ class TableMapping(Parameters):
         header: whether the first line names the columns; without this its cells tell.
         delimiter: what is between cells, " " for any white space; without one the first line tells.
         decimal: the mark before fractions.
+        skip: how many lines at the start of the file are not part of the table.
+        split: columns whose cells hold several numbers, such as "47.5 8.7", and the names of these.
+        missing: by column the numbers that stand for a missing value, in all that is made of it.
+        degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as NMEA
+            has them.
+        hemispheres: for columns of latitudes and longitudes the columns that say N or S, E or W.
+        vehicle: the column that says whose row it is; its value is {vehicle} in topics.
+        joined: whether the files are the rows of one table, one after the other by their names.
         time: when a row was measured.
         arrival: when a row reached the recorder, if that is stated.
+        sensor: what the sensor's own clock read, if that is stated and not the same as `time`.
         geodetic: columns of latitude and longitude, from which positions in the plane are made.
         attitude: columns of angles, from which quaternions are made.
         streams: the streams of the rows.
@@ -151,11 +167,28 @@ class TableMapping(Parameters):
     header: bool | None = None
     delimiter: str | None = None
     decimal: str = "."
+    skip: NonNegativeInt = 0
+    split: dict[str, Annotated[list[str], Field(min_length=2)]] = {}
+    missing: dict[str, list[float]] = {}
+    degrees_minutes: list[str] = []
+    hemispheres: dict[str, str] = {}
+    vehicle: str | None = None
+    joined: bool = False
     time: TimeMapping
     arrival: TimeMapping | None = None
+    sensor: TimeMapping | None = None
     geodetic: Geodetic | None = None
     attitude: Attitude | None = None
     streams: list[TableStream] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _has_vehicles_in_topics(self) -> Self:
+        named = ["{vehicle}" in stream.topic for stream in self.streams]
+        if self.vehicle is not None and not all(named):
+            raise ValueError("`vehicle` needs {vehicle} in each topic, as in /{vehicle}/fix")
+        if self.time.file is not None and not self.joined:
+            raise ValueError("`file` of `time` is for files that are joined; give joined = true")
+        return self
 
 
 class ConstantStream(Parameters):
@@ -284,11 +317,16 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
 
 
 class FileMatch(NamedTuple):
-    """Holds a file, its mapping, and what the names in braces stand for."""
+    """Holds a file, its mapping, what the names in braces stand for, and files that belong to it.
+
+    `more` are the files whose rows follow, and `stamps` is the file with the times of all.
+    """
 
     path: Path
     table: TableMapping
     names: dict[str, str]
+    more: tuple[Path, ...] = ()
+    stamps: Path | None = None
 
 
 def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch], list[Path]]:
@@ -315,6 +353,7 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch],
             else:
                 patterns = some_of([table.files for table in mapping.tables])
                 raise BadInput(f"{file}: is not one of the files that the mapping names ({patterns})")
+    found, others = _joined(mapping, found, others)
     for table in mapping.tables:
         if not table.optional and not any(each.table is table for each in found):
             where = some_of(paths)
@@ -323,6 +362,38 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch],
                 "optional = true for its table"
             )
     return found, others
+
+
+def _joined(
+    mapping: LogMapping, found: list[FileMatch], others: list[Path]
+) -> tuple[list[FileMatch], list[Path]]:
+    """Join the files that are one table, and take the file of their times out of the others."""
+    for table in mapping.tables:
+        if not table.joined:
+            continue
+        own = [each for each in found if each.table is table]
+        rest = [each for each in found if each.table is not table]
+        stamps = None
+        if table.time.file is not None and own:
+            paths = [*others, *(each.path for each in found)]
+            stamps = next((path for path in paths if _ends_with(path, table.time.file)), None)
+            if stamps is None:
+                raise BadInput(
+                    f"{own[0].path}: there is no file {table.time.file} with its times; give the folder "
+                    "that has both, or another `file` in `time`"
+                )
+            own = [each for each in own if each.path != stamps]
+            others = [path for path in others if path != stamps]
+        if own:
+            ordered = sorted(own, key=lambda each: each.path)
+            more = tuple(each.path for each in ordered[1:])
+            found = [*rest, ordered[0]._replace(more=more, stamps=stamps)]
+    return found, others
+
+
+def _ends_with(path: Path, name: str) -> bool:
+    parts = Path(name).parts
+    return path.parts[-len(parts) :] == parts
 
 
 def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:

@@ -1,7 +1,11 @@
 """Reads the rows of one file, batch by batch, as streams."""
 
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -11,11 +15,20 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
-from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
-from recorders.importers.tables.files import Batch, Table, open_table
+from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
+from recorders.importers.tables.blocks import lines_of
+from recorders.importers.tables.files import (
+    Batch,
+    Table,
+    TextOptions,
+    floats,
+    open_decompressed,
+    open_table,
+)
 from recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
+from recorders.importers.tables.order import Order, is_reversed
 from recorders.importers.tables.plane import Plane
-from recorders.importers.tables.times import TimeMapping, read_counter, stamps_ns
+from recorders.importers.tables.times import MEND, Reading, TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
 from recorders.log import Stream, make_stream
 from recorders.log.planes import FRAME, is_planar
@@ -24,17 +37,21 @@ PLACE = ("east_m", "north_m", "up_m")
 QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
 
 ReadCounts = Counter[tuple[str, str]]
+_MOST_VEHICLES = 1000
+# The column of the stamps that have a file of their own.
+_STAMP = "\0stamp"
 
 
 class Rows:
     """Imports a file: its next batch lies ready, and what is left out is counted.
 
-    `generator` makes the noise that the mapping asks for. Raises BadInput where the file cannot be read,
+    `generator` makes the noise that the mapping asks for. Raises BadInput if the file cannot be read,
     or lacks a column that its mapping names.
     """
 
     def __init__(self, found: FileMatch, counts: ReadCounts, generator: np.random.Generator) -> None:
-        self.path, self.mapping, self._names = found
+        self.path, self.mapping, self._names = found.path, found.table, dict(found.names)
+        self._more, self._stamps_path = found.more, found.stamps
         self._counts, self._generator = counts, generator
         own = self.mapping
         self.table = self._open()
@@ -42,11 +59,29 @@ class Rows:
         self.messages = Counter[str]()
         self.span_ns: tuple[int, int] | None = None
         self.reached_ns = NOT_A_TIME
+        self._is_prepared = bool(own.missing or own.degrees_minutes or own.hemispheres)
+        self._missing = {self.table.column(name): values for name, values in own.missing.items()}
+        self._halves = {
+            self.table.column(name): self.table.column(side) for name, side in own.hemispheres.items()
+        }
+        self._in_minutes = {self.table.column(name) for name in own.degrees_minutes}
+        self._numbers_of: dict[str, NDArray] = {}  # of the rows in hand, by column
+        self._exact = {
+            self.table.column(source) for stream in own.streams for source in _times_in(stream)
+        }
         self._time = self._clock(own.time)
-        self._arrival = None if own.arrival is None else self._clock(own.arrival)
+        self._others = {
+            name: self._clock(clock)
+            for name, clock in (("arrival", own.arrival), ("sensor", own.sensor))
+            if clock is not None
+        }
+        self._vehicle = None if own.vehicle is None else self.table.column(own.vehicle)
+        self._clocks: dict[str, tuple[Order, dict[str, Reading]]] = {}  # by vehicle
+        self._reached: dict[str, int] = {}
         self._texts, self._numbers = self._wanted()
-        self._batches = self.table.batches(self._numbers, self._texts)
+        self._batches = self._timed(self.table.batches(self._numbers, self._texts))
         self._next = next(self._batches, None)
+        self._is_reversed = self._next is not None and self._goes_back(self._next)
 
     @property
     def is_done(self) -> bool:
@@ -57,14 +92,8 @@ class Rows:
 
     def _open(self) -> Table:
         own = self.mapping
-        return open_table(
-            self.path,
-            own.format,
-            names=own.columns,
-            has_header=own.header,
-            delimiter=own.delimiter,
-            decimal=own.decimal,
-        )
+        options = TextOptions(own.columns, own.header, own.delimiter, own.decimal, own.skip)
+        return open_table(self.path, own.format, options, more=self._more, split=own.split)
 
     @property
     def tag_name(self) -> str:
@@ -73,20 +102,49 @@ class Rows:
 
     def _clock(self, given: TimeMapping) -> TimeMapping:
         """Return the time mapping with columns as the file names them; a counter is read here."""
+        if self._stamps_path is not None and given.file is not None:
+            return given.model_copy(update={"column": [_STAMP], "file": None})
         columns = [self.table.column(name) for name in given.columns]
         week = columns.pop() if given.week else None
         own = given.model_copy(update={"column": columns, "week": week})
         if own.tag is not None:
             batches = self._open().batches((), own.columns)
-            readings = (self._read_ns(batch, own) for batch in batches)
-            self._counter = read_counter(self.path, own.tag, readings)
+            whole = own.model_copy(update={"tag": None})
+            readings = (
+                stamps_ns(whole, batch, np.arange(_size(batch)), str(self.path)) for batch in batches
+            )
+            self._ticks = read_counter(self.path, own.tag, readings)
         return own
+
+    def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """Yield batches with the stamps of the file that has them, if there is one."""
+        if self._stamps_path is None:
+            yield from batches
+            return
+        lines = _lines(self._stamps_path)
+        count = 0
+        for batch in batches:
+            stamps = list(islice(lines, _size(batch)))
+            count += len(stamps)
+            if len(stamps) < _size(batch):
+                raise BadInput(
+                    f"{self._stamps_path}: has {count} times, and there are more rows in {self.path} "
+                    "and "
+                    "the files after it; give a time for each row"
+                )
+            yield {**batch, _STAMP: pa.array(stamps, pa.string())}
+        if rest := sum(1 for _ in lines):
+            raise BadInput(
+                f"{self._stamps_path}: has {count + rest} times, and there are {count} rows in "
+                f"{self.path} "
+                "and the files after it; give a row for each time"
+            )
 
     def _wanted(self) -> tuple[set[str], set[str]]:
         """Return the columns that are wanted as text, and as numbers."""
         own = self.mapping
-        clocks = [self._time, *([] if self._arrival is None else [self._arrival])]
-        texts = {name for clock in clocks for name in clock.columns}
+        clocks = [self._time, *self._others.values()]
+        texts = {name for clock in clocks for name in clock.columns} - {_STAMP}
         names = set[str]()
         for made in (own.geodetic, own.attitude):
             if made is not None:
@@ -99,7 +157,10 @@ class Rows:
                     texts.add(self.table.column(name))
                 else:
                     names.add(name)
+        texts |= self._exact | {*self._halves.values()} | ({self._vehicle} if self._vehicle else set())
         columns = {self.table.column(name) for name in names if not self._is_given(name)}
+        if not (texts or columns):  # the rows have to be counted by some column
+            columns = {self.table.columns[0]}
         return texts, columns - texts
 
     def _is_given(self, source: str) -> bool:
@@ -112,7 +173,7 @@ class Rows:
         return text
 
     def _floats(self, batch: Batch, source: str) -> NDArray:
-        """Read the numbers (n,) of a source, NaN for empty cells."""
+        """Read the numbers (n,) of a source, NaN for empty cells and codes of missing values."""
         if self._is_given(source):
             try:
                 return np.full(_size(batch), float(self._filled(source)))
@@ -122,108 +183,270 @@ class Rows:
                     f"{self.path}: {source} in its file name is '{name}'; expected a number"
                 ) from None
         column = self.table.column(source)
-        cells = batch[column]
-        if pa.types.is_string(cells.type):
-            cells = pc.utf8_trim_whitespace(cells)
+        if column in self._numbers_of:
+            return self._numbers_of[column]
         try:
-            return cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            found = floats(batch[column])
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             raise BadInput(
                 f"{self.path}: column {column} has cells that are not numbers; give a column of numbers"
             ) from None
+        if self._is_prepared:
+            found = self._prepared(batch, column, found)
+            self._numbers_of[column] = found
+        return found
 
-    def _read_ns(self, batch: Batch, clock: TimeMapping) -> Stamps:
-        return stamps_ns(clock, batch, self.count, _size(batch), str(self.path))
+    def _prepared(self, batch: Batch, column: str, found: NDArray) -> NDArray:
+        """Return a column's numbers (n,) without codes of missing values, in degrees and with a sign."""
+        for code in self._missing.get(column, []):
+            is_missing = found == code
+            self._tell(f"{self.path.name}: {column}", f"{code:g} is missing", int(is_missing.sum()))
+            found = np.where(is_missing, np.nan, found)
+        if column in self._in_minutes:
+            size = np.abs(found)
+            minutes = np.fmod(size, 100.0)
+            if np.any(minutes >= 60.0):
+                row = int(np.argmax(minutes >= 60.0))
+                raise BadInput(
+                    f"{self.path}: column {column} holds {found[row]:.9g}, which are no degrees and "
+                    "minutes "
+                    "(ddmm.mmmm); leave it out of degrees_minutes"
+                )
+            found = np.copysign(np.floor(size / 100.0) + minutes / 60.0, found)
+        if column in self._halves:
+            sides = pc.utf8_upper(pc.utf8_trim_whitespace(batch[self._halves[column]].cast(pa.string())))
+            letters = sides.to_numpy(zero_copy_only=False).astype(str)
+            initials = np.char.ljust(letters, 1).astype("<U1")
+            is_south, is_north = np.isin(initials, ["S", "W"]), np.isin(initials, ["N", "E"])
+            if np.any(is_north & (found < 0.0)):
+                row = int(np.argmax(is_north & (found < 0.0)))
+                raise BadInput(
+                    f"{self.path}: column {column} holds {found[row]:.9g} where {self._halves[column]} "
+                    "says "
+                    f"'{letters[row]}'; leave it out of hemispheres if it has signs already"
+                )
+            unknown = ~(is_south | is_north) & np.isfinite(found)
+            self._tell(
+                f"{self.path.name}: {column}", "without a hemisphere, missing", int(unknown.sum())
+            )
+            found = np.where(is_south, -np.abs(found), np.where(is_north, found, np.nan))
+        return found
 
-    def _stamps(self, batch: Batch, clock: TimeMapping) -> Stamps:
-        found = self._read_ns(batch, clock)
-        return found if clock.tag is None else self._counter.stamps_ns(found, str(self.path))
+    def _parts(self, batch: Batch, rows: NDArray[np.int64]) -> Iterator[tuple[Batch, NDArray[np.int64]]]:
+        """Yield the rows of a batch, vehicle by vehicle, whose name stands for {vehicle} meanwhile."""
+        if self._vehicle is None:
+            self._numbers_of.clear()
+            yield batch, rows
+            return
+        names = pc.utf8_trim_whitespace(batch[self._vehicle].cast(pa.string()))
+        nameless = int(pc.sum(pc.or_kleene(pc.is_null(names), pc.equal(names, ""))).as_py() or 0)
+        self._tell(self.path.name, f"rows without a {self._vehicle} are left out", nameless)
+        for name in pc.unique(names).to_pylist():
+            if not name:
+                continue
+            which = np.flatnonzero(pc.fill_null(pc.equal(names, name), False).to_numpy(False))
+            self._names["vehicle"] = re.sub(r"\W+", "_", name).strip("_") or "_"
+            self._numbers_of.clear()
+            yield {column: cells.take(pa.array(which)) for column, cells in batch.items()}, rows[which]
+
+    def _read_ns(
+        self, batch: Batch, clock: TimeMapping, rows: NDArray[np.int64], reading: Reading | None = None
+    ) -> Stamps:
+        found = stamps_ns(clock, batch, rows, str(self.path), reading)
+        return found if clock.tag is None else self._ticks.stamps_ns(found, str(self.path))
+
+    def _goes_back(self, batch: Batch) -> bool:
+        """Tell whether rows are newest first, by the local times of the first ones."""
+        if self._time.order == "any" or not self._time.columns or self._time.tag:
+            return False
+        clock = self._time.model_copy(update={"zone": None, "rollover": None})
+        rows = np.arange(_size(batch))
+        return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])
 
     # What the first rows say.
 
     def first_ns(self) -> int | None:
-        """Return the earliest stamp of the first rows."""
+        """Return the earliest stamp of the first rows; if these are newest first, of all rows."""
         if self._next is None:
             return None
-        stamps = self._stamps(self._next, self._time)
-        known = stamps[stamps != NOT_A_TIME]
-        return int(known.min()) if len(known) else None
+        wanted = {*self._time.columns, *([self._vehicle] if self._vehicle else [])}
+        whole = self._timed(self._open().batches((), wanted - {_STAMP})) if self._is_reversed else ()
+        earliest, count = [], 0
+        for batch in (self._next,) if not self._is_reversed else whole:
+            rows = count + np.arange(_size(batch))
+            count += len(rows)
+            for part, its in self._parts(batch, rows):
+                stamps = self._read_ns(*self._turned(part, its, self._time))
+                earliest += [int(known.min())] if len(known := stamps[stamps != NOT_A_TIME]) else []
+        return min(earliest, default=None)
+
+    def _turned(
+        self, batch: Batch, rows: NDArray[np.int64], clock: TimeMapping
+    ) -> tuple[Batch, TimeMapping, NDArray[np.int64]]:
+        if not self._is_reversed:
+            return batch, clock, rows
+        back = pa.array(np.arange(len(rows))[::-1])
+        return {name: cells.take(back) for name, cells in batch.items()}, clock, rows[::-1]
 
     def first_fix(self) -> Origin | None:
         """Return the first place of the file."""
         fixes = next((each for each in self.mapping.streams if each.becomes == "GeodeticFix"), None)
         if self.mapping.geodetic is None and fixes is None:
             return None
-        for batch in self._open().batches(self._numbers, self._texts):
-            if self.mapping.geodetic is not None:
-                places = self._places(batch)
-            else:
-                assert fixes is not None
-                columns = self._mapped(fixes, batch, {}).columns
-                places = (columns["latitude_deg"], columns["longitude_deg"], columns["altitude_m"])
-            known = np.flatnonzero(np.isfinite(places[0]) & np.isfinite(places[1]))[:1]
-            if len(known):
-                self._check_place(places[0][known], places[1][known])
-                latitude, longitude, altitude = (values[known].item() for values in places)
-                altitude = altitude if np.isfinite(altitude) else 0.0
-                return Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
-        return None
+        counts, self._counts = self._counts, Counter()  # what is read here is read again, and told then
+        try:
+            for whole in self._open().batches(self._numbers, self._texts):
+                for batch, _ in self._parts(whole, np.arange(_size(whole))):
+                    if self.mapping.geodetic is not None:
+                        places = self._places(batch)
+                    else:
+                        assert fixes is not None
+                        columns = self._mapped(fixes, batch, lambda _: {}).columns
+                        places = (
+                            columns["latitude_deg"],
+                            columns["longitude_deg"],
+                            columns["altitude_m"],
+                        )
+                    known = np.flatnonzero(np.isfinite(places[0]) & np.isfinite(places[1]))[:1]
+                    if len(known):
+                        self._check_place(places[0][known], places[1][known])
+                        latitude, longitude, altitude = (values[known].item() for values in places)
+                        altitude = altitude if np.isfinite(altitude) else 0.0
+                        return Origin(
+                            latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude
+                        )
+            return None
+        finally:
+            self._counts = counts
 
     # What becomes of them.
 
     def block(self, plane: Plane | None) -> list[Stream]:
         """Return the streams of the next batch."""
         assert self._next is not None
-        batch, self._next = self._next, next(self._batches, None)
-        stamps = self._stamps(batch, self._time)
-        logged = stamps if self._arrival is None else self._stamps(batch, self._arrival)
-        timed = (stamps != NOT_A_TIME) & (logged != NOT_A_TIME)
-        self._tell(self.path.name, "rows without a time are left out", int((~timed).sum()))
-        self._note(stamps[timed])
-        made = self._made(batch, plane)
+        whole, self._next = self._next, next(self._batches, None)
+        size = _size(whole)
         streams = []
-        for own in self.mapping.streams:
-            if not (own.only_first and self.messages[own.topic]):
-                found = self._mapped(own, batch, made)
-                rows = self._kept(own, found, timed)
-                streams.append(self._stream(own, found, rows, stamps, logged, plane))
-        self.count += len(stamps)
+        for part, its in self._parts(whole, self.count + np.arange(size)):
+            batch, _, rows = self._turned(part, its, self._time)
+            streams += self._streams(batch, rows, plane)
+        self.count += size
+        if self._is_reversed:
+            self._tell(self.path.name, "rows are newest first, and are reversed", size)
+        if self.is_done:
+            self._end()
         return streams
 
-    def _note(self, stamps: Stamps) -> None:
+    def _streams(self, batch: Batch, rows: NDArray[np.int64], plane: Plane | None) -> list[Stream]:
+        """Return the streams of rows, all of one vehicle."""
+        vehicle = self._names.get("vehicle", "")
+        if vehicle not in self._clocks:
+            if len(self._clocks) == _MOST_VEHICLES:
+                raise BadInput(
+                    f"{self.path}: column {self._vehicle} has more than {_MOST_VEHICLES} values; name "
+                    "the "
+                    "column of the vehicle, or leave `vehicle` out"
+                )
+            label = f"{self.path}: column {' and '.join(self._time.columns)}"
+            self._clocks[vehicle] = (
+                Order(label, self._time),
+                {name: Reading() for name in ("time", *self._others)},
+            )
+        order, readings = self._clocks[vehicle]
+        if self._is_reversed:  # the rows of a block are before those of the last one
+            if self._time.rollover and not (self.is_done and self.count == 0):
+                raise BadInput(
+                    f"{self.path}: its rows are newest first, and its counter begins again at "
+                    f"{self._time.rollover:g}; sort the file by its rows, the last one first"
+                )
+            order = Order(f"{self.path}: column {' and '.join(self._time.columns)}", self._time)
+            for reading in readings.values():
+                reading.begin()
+        stamps = self._read_ns(batch, self._time, rows, readings["time"])
+        others = {
+            name: self._read_ns(batch, clock, rows, readings[name])
+            for name, clock in self._others.items()
+        }
+        timed = np.all([each != NOT_A_TIME for each in (stamps, *others.values())], axis=0)
+        self._tell(self.path.name, "rows without a time are left out", int((~timed).sum()))
+        order.follow(stamps[timed], rows[timed])
+        if self._is_reversed:
+            order.end()
+        self._note(stamps[timed], vehicle)
+        clocks = _Clocks(stamps, others.get("arrival", stamps), others.get("sensor", stamps))
+        made: dict[tuple[float, ...], dict[str, NDArray]] = {}
+
+        def made_of(missing: Sequence[float]) -> dict[str, NDArray]:
+            key = tuple(missing)
+            if key not in made:
+                made[key] = self._made(batch, plane, missing)
+            return made[key]
+
+        streams = []
+        for own in self.mapping.streams:
+            if own.only_first and self.messages[self._filled(own.topic)]:
+                continue
+            if own.only_first and self._is_reversed and not self.is_done:
+                raise BadInput(
+                    f"{self.path}: its rows are newest first, and `only_first` of {own.topic} needs the "
+                    "earliest one; sort the file by its times"
+                )
+            found = self._mapped(own, batch, made_of)
+            streams.append(self._stream(own, found, self._kept(own, found, timed, rows), clocks, plane))
+        return streams
+
+    def _end(self) -> None:
+        """Tell what was decided about times, and check the order of the last rows."""
+        for order, readings in self._clocks.values():
+            if not self._is_reversed:
+                order.end()
+            for reading in readings.values():
+                for fact, count in reading.facts.items():
+                    self._tell(self.path.name, fact, count)
+
+    def _note(self, stamps: Stamps, vehicle: str) -> None:
         """Take up what stamps (n,) tell of the clock."""
         if not len(stamps):
             return
-        before = stamps[0] - 1 if self.reached_ns == NOT_A_TIME else self.reached_ns
-        steps = np.diff(stamps, prepend=before)
+        reached = self._reached.get(vehicle, int(stamps[0]) - 1)
+        steps = np.diff(stamps, prepend=reached)
         self._tell(self.path.name, "stamps repeat, and are kept", int((steps == 0).sum()))
-        self._tell(self.path.name, "stamps go back, and are sorted", int((steps < 0).sum()))
-        self.reached_ns = int(stamps[-1])
+        if not self._is_reversed or len(stamps) > 1:
+            back = steps[1:] if self._is_reversed else steps
+            self._tell(self.path.name, "stamps go back, and are sorted", int((back < 0).sum()))
+        self.reached_ns = self._reached[vehicle] = int(stamps[-1])
         low, high = self.span_ns or (self.reached_ns, self.reached_ns)
         self.span_ns = min(low, int(stamps.min())), max(high, int(stamps.max()))
 
-    def _made(self, batch: Batch, plane: Plane | None) -> dict[str, NDArray]:
-        """Make the columns that are made of others."""
+    def _made(self, batch: Batch, plane: Plane | None, missing: Sequence[float]) -> dict[str, NDArray]:
+        """Make the columns that are made of others, without numbers that stand for missing ones."""
         made: dict[str, NDArray] = {}
         if self.mapping.geodetic is not None:
-            places = self._places(batch)
+            places = self._places(batch, missing)
             self._check_place(*places[:2])
             # without a plane there is no place in the whole log
             unknown = np.full((3, _size(batch)), np.nan)
             made |= zip(PLACE, unknown if plane is None else plane.place(*places), strict=True)
         if self.mapping.attitude is not None:
-            made |= zip(QUATERNION, self._quaternion(batch, self.mapping.attitude).T, strict=True)
+            quaternion = self._quaternion(batch, self.mapping.attitude, missing)
+            made |= zip(QUATERNION, quaternion.T, strict=True)
         return made
 
-    def _places(self, batch: Batch) -> tuple[NDArray, NDArray, NDArray]:
+    def _known(self, batch: Batch, source: str, missing: Sequence[float]) -> NDArray:
+        found = self._floats(batch, source)
+        return np.where(np.isin(found, missing), np.nan, found) if missing else found
+
+    def _places(self, batch: Batch, missing: Sequence[float] = ()) -> tuple[NDArray, NDArray, NDArray]:
         """Read latitude and longitude (deg), altitude (m, 0 where no column has it) of rows (n,)."""
         own = self.mapping.geodetic
         assert own is not None
         factor = conversion(own.unit, "latitude_deg")
-        altitude = np.zeros(_size(batch)) if own.altitude is None else self._floats(batch, own.altitude)
+        altitude = (
+            np.zeros(_size(batch)) if own.altitude is None else self._known(batch, own.altitude, missing)
+        )
         return (
-            self._floats(batch, own.latitude) * factor,
-            self._floats(batch, own.longitude) * factor,
+            self._known(batch, own.latitude, missing) * factor,
+            self._known(batch, own.longitude, missing) * factor,
             altitude,
         )
 
@@ -231,12 +454,12 @@ class Rows:
         for field, values in (("latitude_deg", latitude_deg), ("longitude_deg", longitude_deg)):
             checked(str(self.path), field, values[np.isfinite(values)])
 
-    def _quaternion(self, batch: Batch, own: Attitude) -> NDArray:
+    def _quaternion(self, batch: Batch, own: Attitude, missing: Sequence[float]) -> NDArray:
         """Compute orientations (n, 4), NaN where an angle is missing."""
         factor = conversion(own.unit, "angle_rad")
         names = (own.heading or own.yaw, own.pitch, own.roll)
         zero = np.zeros(_size(batch))
-        angles = [zero if name is None else self._floats(batch, name) * factor for name in names]
+        angles = [zero if name is None else self._known(batch, name, missing) * factor for name in names]
         turns = np.stack(angles, axis=1)
         if own.heading is not None:  # clockwise from north and nose up, as aircraft have them
             turns = turns * (-1, -1, 1) + (np.pi / 2, 0, 0)
@@ -245,9 +468,22 @@ class Rows:
         quaternion[known] = Rotation.from_euler("ZYX", turns[known]).as_quat(scalar_first=True)
         return quaternion
 
-    def _mapped(self, own: TableStream, batch: Batch, made: Mapping[str, NDArray]) -> Mapped:
+    def _mapped(
+        self,
+        own: TableStream,
+        batch: Batch,
+        made_of: Callable[[Sequence[float]], Mapping[str, NDArray]],
+    ) -> Mapped:
+        made = made_of(own.missing)
+
         def read(source: str) -> NDArray:
-            return made[source] if source in made else self._floats(batch, source)
+            if source in made:
+                return made[source]
+            if source in self._exact:
+                return read_ns(
+                    batch[self.table.column(source)], 0, where=f"{self.path}: column {source}", mend=MEND
+                )
+            return self._floats(batch, source)
 
         def holds(source: str, values: Sequence[Source]) -> NDArray[np.bool_]:
             if not any(isinstance(value, str) for value in values):
@@ -257,11 +493,13 @@ class Rows:
 
         return mapped(own, _size(batch), read, holds, f"{self.path}: {self._filled(own.topic)}")
 
-    def _kept(self, own: TableStream, found: Mapped, timed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _kept(
+        self, own: TableStream, found: Mapped, timed: NDArray[np.bool_], rows: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Choose which of the messages are taken; the others are counted by reason."""
         topic = self._filled(own.topic)
         lacking = not_finite(schema_of(own, topic), found.columns)
-        keep = timed[found.rows] & ((self.count + found.rows) % own.every == 0)
+        keep = timed[found.rows] & (rows[found.rows] % own.every == 0)
         for reason, which in {**found.dropped, "NaN or infinite": lacking}.items():
             self._tell(topic, f"messages left out: {reason}", int((which & keep).sum()))
             keep = keep & ~which
@@ -272,13 +510,12 @@ class Rows:
         own: TableStream,
         found: Mapped,
         rows: NDArray[np.int64],
-        stamps: Stamps,
-        logged: Stamps,
+        clocks: "_Clocks",
         plane: Plane | None,
     ) -> Stream:
         topic, of = self._filled(own.topic), found.rows[rows]
         where = f"{self.path}: {topic}"
-        self.messages[own.topic] += len(rows)
+        self.messages[topic] += len(rows)
         metadata = own.metadata
         if own.delay_s:
             metadata["delay_s"] = repr(own.delay_s)
@@ -293,9 +530,9 @@ class Rows:
         return make_stream(
             topic,
             schema_of(own, where),
-            to_ns(stamps[of], 1, -round(own.delay_s * 1e9), where=where),
-            log_time_ns=logged[of],
-            sensor_time_ns=stamps[of],
+            to_ns(clocks.stamps[of], 1, -round(own.delay_s * 1e9), where=where),
+            log_time_ns=clocks.logged[of],
+            sensor_time_ns=clocks.sensed[of],
             metadata=metadata,
             **columns,
         )
@@ -309,9 +546,13 @@ class Rows:
     def notes(self) -> dict[str, str]:
         """Describe what was read of the file."""
         name = self.path.name
+        self._names.pop("vehicle", None)
         topics = ", ".join(self._filled(stream.topic) for stream in self.mapping.streams)
-        notes = {name: f"{self.count} rows as {topics}"}
-        if rest := [each for each in self.table.columns if each not in self._texts | self._numbers]:
+        of = f" of {len(self._clocks)} vehicles" if self._vehicle else ""
+        files = f" of {1 + len(self._more)} files" if self._more else ""
+        notes = {name: f"{self.count} rows{files} as {topics}{of}"}
+        used = self._texts | self._numbers
+        if rest := [each for each in self.table.columns if each not in used]:
             notes[f"{name}: columns not taken"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, trajectory"] = self.table.mended
@@ -320,5 +561,31 @@ class Rows:
         return notes
 
 
+class _Clocks(NamedTuple):
+    """Holds the stamps (n,) of rows: the measurement's, the recorder's and the sensor's own."""
+
+    stamps: Stamps
+    logged: Stamps
+    sensed: Stamps
+
+
 def _size(batch: Batch) -> int:
     return len(next(iter(batch.values())))
+
+
+def _times_in(stream: TableStream) -> Iterator[str]:
+    """Yield the sources of fields that are times, which are read to the last digit."""
+    times = {
+        entry.name for entry in list(schema_of(stream, stream.topic))[1:] if entry.kind == "time_ns"
+    }
+    for name in times & stream.fields.keys():
+        if isinstance(source := stream.fields[name], str):
+            yield source
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text that are not blank."""
+    with open_decompressed(path) as file:
+        for line in lines_of(file):
+            if text := line.decode("utf-8", "replace").strip():
+                yield text

@@ -2,6 +2,7 @@
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -11,17 +12,20 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
 from recorders.parameters import Parameters
 
+CountUnit = Literal["s", "ms", "us", "ns"]
+Unit = Literal["s", "ms", "us", "ns", "date"]
 # How many digits after the second (or what else the unit is) are nanoseconds.
 _DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
 _WEEK_NS = 7 * 86400 * 10**9
-_MEND = "check `unit`, and give in `zero` the date that the times count from"
+MEND = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
 # Hours ahead of UTC of zones by their short names, as far as these mean one zone.
 ZONES = {
@@ -31,6 +35,9 @@ ZONES = {
 }  # fmt: skip
 # The name of a zone at the end of a cell.
 ZONED = r"\s+([A-Z]{2,5}|[A-Z]\w+/\w+)$"
+# The offset from UTC at the end of a cell with a time.
+OWN_OFFSET = r":\d\d.*?(?:[Zz]|(?P<sign>[-+])(?P<h>[01]\d)(?::?(?P<m>\d\d))?)$"
+_OFFSET = re.compile(r"(?<=\d)( ?)([Zz]|[-+][01]\d:?\d\d)$")
 _WRITTEN = re.compile(
     r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?(?:([ T,]*)"
     r"(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
@@ -41,8 +48,10 @@ class TimeMapping(Parameters):
     """States where a row's time stands.
 
     Attributes:
-        column: one column, or several whose texts belong together, such as date and time.
-        unit: unit of numbers; "date" is for dates and times as text.
+        column: one column, or several that belong together, such as the texts of date and time, or
+            seconds and nanoseconds.
+        unit: unit of numbers; "date" is for dates and times as text. Of several columns of numbers each
+            has its own, such as ["s", "ns"], and they are added.
         zero: date that numbers count from.
         week: column of GPS weeks; `column` then has the seconds of the week.
         rate_hz: rows per second of files without stamps, from `zero` on.
@@ -54,10 +63,16 @@ class TimeMapping(Parameters):
             written.
         tag: suffix of a file beside each file that says when its counter started, and how fast it goes
             (RTKLIB's time tags).
+        rollover: the number at which the counter begins again at 0, such as 4294967296; it is then
+            continued beyond that.
+        order: in which order rows are; "rising" allows single rows to be late, and a file whose rows
+            are newest first is reversed; "any" sorts rows whatever their times are.
+        file: a file with the times of the rows, one in each line, in place of a column; a path from the
+            given folder on.
     """
 
     column: str | list[str] = []
-    unit: Literal["s", "ms", "us", "ns", "date"] = "s"
+    unit: Unit | list[CountUnit] = "s"
     zero: str = "1970-01-01"
     week: str | None = None
     rate_hz: PositiveFloat | None = None
@@ -66,13 +81,24 @@ class TimeMapping(Parameters):
     format: str = ISO
     leap_seconds: Annotated[float, Field(ge=-1e9, le=1e9)] = 0.0
     tag: str | None = None
+    rollover: PositiveFloat | None = None
+    order: Literal["rising", "any"] = "rising"
+    file: str | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "TimeMapping":
-        if bool(self.columns) == (self.rate_hz is not None):
-            raise ValueError("give either `column`, which has the times, or `rate_hz`")
-        if len(self.columns) > 1 + bool(self.week) and self.unit != "date":
-            raise ValueError('several columns together are a date; give unit = "date", or one column')
+        if bool(self.columns) + (self.rate_hz is not None) + (self.file is not None) != 1:
+            raise ValueError("give either `column`, which has the times, or `rate_hz`, or `file`")
+        counted = len(self.columns) - bool(self.week)
+        if isinstance(self.unit, list) and len(self.unit) != counted:
+            raise ValueError(f"unit has {len(self.unit)} units for {counted} columns; give one for each")
+        if counted > 1 and self.unit != "date" and not isinstance(self.unit, list):
+            raise ValueError(
+                'several columns together are a date, unit = "date", or numbers that are added, such as '
+                'unit = ["s", "ns"]'
+            )
+        if self.rollover and self.unit == "date":
+            raise ValueError('`rollover` is for counters; leave it out with unit = "date"')
         if self.zone is not None:
             offset_of(self.zone)
             if self.utc_offset_h or self.unit != "date":
@@ -97,6 +123,13 @@ class TimeMapping(Parameters):
         since = _date_ns(_GPS_ZERO if self.week else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
 
+    @property
+    def units(self) -> list[CountUnit]:
+        """Return the units of the columns of numbers, without that of weeks."""
+        if isinstance(self.unit, list):
+            return self.unit
+        return [] if self.unit == "date" else [self.unit]
+
 
 def offset_of(zone: str) -> float | ZoneInfo:
     """Return how many hours a zone is ahead of UTC, or its rules where these are not always the same.
@@ -119,15 +152,18 @@ def formats_of(cell: str) -> Iterator[str]:
     >>> list(formats_of("05.10.2026 14:03:07,25"))
     ['%d.%m.%Y %H:%M:%S,%f']
     """
-    found = _WRITTEN.fullmatch(cell) or _WRITTEN.fullmatch(re.sub(ZONED, "", cell))
-    if not (cell and found):
+    offset = _OFFSET.search(cell)
+    bare = cell[: offset.start()] if offset else cell
+    found = _WRITTEN.fullmatch(bare) or _WRITTEN.fullmatch(re.sub(ZONED, "", bare))
+    if not (bare and found):
         yield ISO
         return
-    first, mark, _, third, between, clock, second_of, point, half = found.groups()
+    first, mark, second, third, between, clock, second_of, point, half = found.groups()
     of_day = ""
     if clock:
         of_day = ("%I" if half else "%H") + ":%M" + ":%S" * bool(second_of)
         of_day += f"{point}%f" * bool(point) + (" %p" if half and half[0] == " " else "%p" * bool(half))
+    of_day += f"{offset[1]}%z" if offset else ""
     if not first:
         yield of_day
         return
@@ -138,8 +174,9 @@ def formats_of(cell: str) -> Iterator[str]:
     else:
         year = "%Y" if len(third) == 4 else "%y"
         day_first, month_first = ("%d", "%m", year), ("%m", "%d", year)
-        is_day_first = mark == "." or int(first) > 12
-        dates = [day_first] if is_day_first else [month_first, day_first]
+        dates = [day_first] if mark == "." else [month_first, day_first]
+        if year == "%y" and len(first) == len(second) == 2:
+            dates.append(("%y", "%m", "%d"))
     for parts in dates:
         yield mark.join(parts) + (between or "") + of_day
 
@@ -149,77 +186,223 @@ def _date_ns(text: str) -> int:
     return int((stamp.tz_localize("UTC") if stamp.tzinfo is None else stamp).as_unit("ns").value)
 
 
+class Reading:
+    """Holds what reading the times of a file has to remember from one block to the next.
+
+    Attributes:
+        facts: what was decided on the way, and for how many rows.
+    """
+
+    def __init__(self) -> None:
+        self.facts = Counter[str]()
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the rows before."""
+        self.count_ns = NOT_A_TIME  # the last number of a counter, as it stands in the file
+        self.turns = 0  # how often the counter has begun again
+        self.local_ns = NOT_A_TIME  # the last local time
+        self.is_second = False  # whether a doubled hour is there for the second time
+
+    def continued_ns(self, counted: Stamps, rollover_ns: int, label: str) -> Stamps:
+        """Return the numbers (n,) of a counter, continued beyond its rollovers."""
+        known = counted != NOT_A_TIME
+        if not known.any():
+            return counted
+        values = counted[known]
+        before = values[0] if self.count_ns == NOT_A_TIME else self.count_ns
+        turns = self.turns + np.cumsum(-np.rint(np.diff(values, prepend=before) / rollover_ns))
+        self.facts["rollovers of the counter, which is continued"] += int(turns[-1]) - self.turns
+        self.count_ns, self.turns = int(values[-1]), int(turns[-1])
+        continued = counted.copy()
+        continued[known] = to_ns(turns, rollover_ns, values, where=label, mend=MEND)
+        return continued
+
+
 def stamps_ns(
-    mapping: TimeMapping, columns: Mapping[str, pa.Array], first_row: int, size: int, where: str
+    mapping: TimeMapping,
+    columns: Mapping[str, pa.Array],
+    rows: NDArray[np.int64],
+    where: str,
+    reading: Reading | None = None,
 ) -> Stamps:
     """Return the stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
 
-    `first_row` is the number of rows before these. Raises BadInput, which begins with `where`, where a
-    cell holds no time, or one beyond what a log can hold.
+    `rows` are the numbers of the rows, from 0 on, and `reading` what is known from the rows before.
+    Raises BadInput, which begins with `where`, if a cell holds no time, or one beyond what a log can
+    hold.
     """
+    reading = reading or Reading()
     if mapping.rate_hz is not None:
-        seconds = (first_row + np.arange(size)) / mapping.rate_hz
-        return to_ns(seconds, 10**9, mapping.zero_ns, where=where, mend="check `rate_hz` and `zero`")
+        return to_ns(
+            rows / mapping.rate_hz,
+            10**9,
+            mapping.zero_ns,
+            where=where,
+            mend="check `rate_hz` and `zero`",
+        )
     cells = [columns[name] for name in mapping.columns]
     label = f"{where}: column {' and '.join(mapping.columns)}"
     if mapping.unit == "date":
-        found = to_ns(_dates_ns(mapping, cells, label), 1, mapping.zero_ns, where=label, mend=_MEND)
-    elif mapping.week:
-        of_week = read_ns(cells[0], _DIGITS[mapping.unit], where=label, mend=_MEND)
-        weeks = read_ns(cells[1], 0, where=label, mend=_MEND)
-        since = to_ns(of_week, 1, mapping.zero_ns, where=label, mend=_MEND)
-        found = to_ns(weeks, _WEEK_NS, since, where=label, mend=_MEND)
+        found = _dates_ns(mapping, cells, rows, label, reading)
     else:
-        found = read_ns(cells[0], _DIGITS[mapping.unit], mapping.zero_ns, where=label, mend=_MEND)
+        units = mapping.units
+        found = np.zeros(len(cells[0]), np.int64)
+        for each, unit in zip(cells, units, strict=False):
+            found = read_ns(each, _DIGITS[unit], found, where=label, mend=MEND)
+        if mapping.week:
+            weeks = read_ns(cells[-1], 0, where=label, mend=MEND)
+            found = to_ns(weeks, _WEEK_NS, found, where=label, mend=MEND)
+        if mapping.rollover is not None:
+            rollover_ns = round(mapping.rollover * 10 ** _DIGITS[units[0]])
+            found = reading.continued_ns(found, rollover_ns, label)
+        found = to_ns(found, 1, mapping.zero_ns, where=label, mend=MEND)
     if np.any(found[found != NOT_A_TIME] < 0):
-        raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {_MEND}")
+        raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {MEND}")
     return found
 
 
-def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps:
-    """Read dates as ns since 1970, as if their own offset were the mapping's."""
-    if pa.types.is_timestamp(cells[0].type):
-        return read_ns(cells[0], 0, where=label, mend=_MEND)
-    texts = [pc.utf8_trim_whitespace(each.cast(pa.string())) for each in cells]
+def _dates_ns(
+    mapping: TimeMapping, cells: list[pa.Array], rows: NDArray[np.int64], label: str, reading: Reading
+) -> Stamps:
+    """Read dates as ns since 1970 in UTC; the offset that a cell states itself comes before all else."""
+    leap_ns = round(mapping.leap_seconds * 1e9)
+    zone = offset_of(mapping.zone) if mapping.zone is not None else mapping.utc_offset_h
+    if len(cells) == 1 and pa.types.is_timestamp(cells[0].type):
+        found = read_ns(cells[0], 0, where=label, mend=MEND)
+        if cells[0].type.tz is None:
+            found = _from_zone(found, zone, rows, label, reading)
+        return to_ns(found, 1, -leap_ns, where=label, mend=MEND)
+    texts = [_padded(texts_of(each, is_part=len(cells) > 1), mapping.format) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
     if mapping.format == ISO:  # pandas knows no fractions after a comma
         joined = pc.replace_substring_regex(joined, r"(:\d\d),(\d)", r"\1.\2")
-    zones = pd.Series([mapping.zone or "UTC"]).repeat(len(joined)).to_numpy()
+        joined = pc.replace_substring_regex(joined, r"(:[\d.]+) ([-+]\d\d:?\d\d)$", r"\1\2")
+    zones = np.zeros(len(joined), dtype=object)
+    names: dict[str, float | ZoneInfo] = {}
     if "%p" not in mapping.format and pc.any(pc.match_substring_regex(joined, ZONED)).as_py():
-        named = joined.to_pandas().str.extract(ZONED, expand=False)
-        zones = named.fillna(mapping.zone or "UTC").to_numpy()
+        zones = joined.to_pandas().str.extract(ZONED, expand=False).fillna(0).to_numpy()
         joined = pc.replace_substring_regex(joined, ZONED, "")
+    own = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False).to_numpy(
+        zero_copy_only=False
+    )
     try:
+        names = {str(name): offset_of(str(name)) for name in set(zones.tolist()) - {0}}
         dates = pd.to_datetime(joined.to_pandas(), format=mapping.format, utc=True)
-        since_ns = _since_ns(dates.dt.tz_localize(None))
-        if mapping.format != ISO and not re.search("%[YyGcxs]", mapping.format):
-            since_ns[since_ns != NOT_A_TIME] -= _date_ns("1900-01-01")
-        for zone in pd.unique(zones):
-            rows = (zones == zone) & (since_ns != NOT_A_TIME)
-            since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone), label)
     except ValueError as error:
         why = str(error).splitlines()[0]
         raise BadInput(
             f"{label} has cells that are not dates ({why}); give their `format`, or the unit of numbers"
         ) from None
-    return since_ns
+    since_ns = _since_ns(dates.dt.tz_localize(None))
+    if mapping.format != ISO and not re.search("%[YyGcxs]", mapping.format):
+        of_day_ns = to_ns(since_ns, 1, -_date_ns("1900-01-01"), where=label, mend=MEND)
+        since_ns = to_ns(of_day_ns, 1, _date_ns(mapping.zero), where=label, mend=MEND)
+    for name, own_zone in names.items():
+        which = zones == name
+        since_ns[which] = _from_zone(since_ns[which], own_zone, rows[which], label, reading)
+    local = ~own & (zones == 0)
+    if zone and own.any():
+        _check_offsets(since_ns[own], joined.filter(pa.array(own)), zone, rows[own], label)
+    since_ns[local] = _from_zone(since_ns[local], zone, rows[local], label, reading)
+    return to_ns(since_ns, 1, -leap_ns, where=label, mend=MEND)
+
+
+def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
+    """Return cells as texts; of a date that is a part of a time without its midnight."""
+    if is_part and pa.types.is_timestamp(cells.type):
+        return pc.strftime(cells, format="%Y-%m-%d")
+    return pc.utf8_trim_whitespace(cells.cast(pa.string()))
+
+
+def _padded(texts: pa.Array, pattern: str) -> pa.Array:
+    """Return numbers such as hhmmss with the zeros that they may have lost at their front."""
+    if not re.search("%H%M%S|%d%m%y", pattern):
+        return texts
+    for lost in range(1, 6):
+        texts = pc.replace_substring_regex(texts, rf"^(\d{{{6 - lost}}})(\.|$)", rf"{'0' * lost}\1\2")
+    return texts
 
 
 def _since_ns(dates: pd.Series) -> Stamps:
     return dates.dt.as_unit("ns").to_numpy().astype(np.int64)
 
 
-def _from_zone(local_ns: Stamps, zone: float | ZoneInfo, label: str) -> Stamps:
-    """Change stamps (n,) by a zone's clocks to UTC; an hour that comes twice is taken for its first."""
+def _check_offsets(
+    found: Stamps, texts: pa.Array, zone: float | ZoneInfo, rows: NDArray[np.int64], label: str
+) -> None:
+    """Raise BadInput if a cell states another offset from UTC than a zone has then."""
+    parts = texts.to_pandas().str.extract(OWN_OFFSET)
+    hours = pd.to_numeric(parts["h"], errors="coerce").fillna(0).to_numpy()
+    minutes = pd.to_numeric(parts["m"], errors="coerce").fillna(0).to_numpy()
+    stated_h = np.where(parts["sign"] == "-", -1, 1) * (hours + minutes / 60)
+    if isinstance(zone, ZoneInfo):
+        there = pd.Series(found.astype("datetime64[ns]")).dt.tz_localize("UTC").dt.tz_convert(zone)
+        zone_h = (_since_ns(there.dt.tz_localize(None)) - found) / 3600e9
+    else:
+        zone_h = np.full(len(found), zone)
+    is_other = (np.abs(stated_h - zone_h) > 1e-6) & (found != NOT_A_TIME)
+    if is_other.any():
+        first = int(np.argmax(is_other))
+        raise BadInput(
+            f"{label}: row {rows[first] + 1} holds '{texts[first]}', which states another offset from "
+            "UTC "
+            f"than the mapping, {zone_h[first]:+g} h; leave `zone` and `utc_offset_h` out of `time`, as "
+            "the cells have their own"
+        )
+
+
+def _from_zone(
+    local_ns: Stamps, zone: float | ZoneInfo, rows: NDArray[np.int64], label: str, reading: Reading
+) -> Stamps:
+    """Change stamps (n,) by a zone's clocks to UTC.
+
+    In an hour that comes twice, rows are of the second one from where their times go back. Raises
+    BadInput for a time that the clocks skip.
+    """
+    known = np.flatnonzero(local_ns != NOT_A_TIME)
+    placed = local_ns.copy()
     if not isinstance(zone, ZoneInfo):
-        return to_ns(local_ns, 1, -round(3600e9 * zone), where=label, mend=_MEND)
-    local = pd.Series(local_ns.astype("datetime64[ns]"))
-    first = np.ones(len(local), bool)
-    placed = local.dt.tz_localize(zone, ambiguous=first, nonexistent="shift_forward")
+        return to_ns(local_ns, 1, -round(3600e9 * zone), where=label, mend=MEND)
+    local = pd.Series(local_ns[known].astype("datetime64[ns]"))
+    first = _since_utc(local, zone, is_first=True)
+    second = _since_utc(local, zone, is_first=False)
+    if (skipped := first == NOT_A_TIME).any():
+        index = int(np.argmax(skipped))
+        raise BadInput(
+            f"{label}: row {rows[known[index]] + 1} is of {local[index]}, a time that the clocks of "
+            f"{zone.key} skip; if the logger's clock knows no summer time, give utc_offset_h in place "
+            "of zone"
+        )
+    doubled = first != second
+    if doubled.any():
+        is_second = np.zeros(len(local), bool)
+        times = local_ns[known]
+        for index in np.flatnonzero(doubled).tolist():
+            before = times[index - 1] if index else reading.local_ns
+            is_inside = bool(doubled[index - 1]) if index else reading.is_second
+            goes_back = before != NOT_A_TIME and times[index] < before
+            reading.is_second = goes_back or (reading.is_second and is_inside)
+            is_second[index] = reading.is_second
+        first = np.where(is_second, second, first)
+        reading.facts[
+            f"times of the hour that comes twice in {zone.key}, placed by the order of rows"
+        ] += int(doubled.sum())
+    if len(known):
+        reading.local_ns = int(local_ns[known[-1]])
+        reading.is_second = reading.is_second and bool(doubled[-1])
+    placed[known] = first
+    return placed
+
+
+def _since_utc(local: pd.Series, zone: ZoneInfo, *, is_first: bool) -> Stamps:
+    """Return local times (n,) in UTC, `NOT_A_TIME` for those that the clocks skip."""
+    first = np.full(len(local), is_first)
+    placed = local.dt.tz_localize(zone, ambiguous=first, nonexistent="NaT")
     return _since_ns(placed.dt.tz_convert("UTC").dt.tz_localize(None))
 
 
-class Counter(NamedTuple):
+class Ticks(NamedTuple):
     """Describes a file's own counter, in ns: where it begins, when that was, what one ns of it takes.
 
     `cut_ns` is the last reading where its line was cut off within it, else NOT_A_TIME.
@@ -237,7 +420,7 @@ class Counter(NamedTuple):
         return to_ns(np.where(none, np.nan, since), 1, self.start_ns, where=where)
 
 
-def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
+def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Ticks:
     """Return the counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
 
     A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
@@ -266,4 +449,4 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter
         )
     rate = float(last_ms) * 1e6 / float(last - first)
     cut_ns = int(every[-1]) if every[-1] < last else NOT_A_TIME
-    return Counter(first, seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)
+    return Ticks(first, seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)

@@ -1,0 +1,355 @@
+"""Guesses what latitudes, longitudes, altitudes and speeds are in, and codes of missing ones.
+
+By names, sizes, and how far places move for the speed of the rows; what is not certain is refused.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.tables.columns import (
+    ASSUMED,
+    GuessedColumn,
+    GuessedTable,
+    known_of,
+    latitude_metres,
+    stated_unit,
+)
+from recorders.importers.units import unit
+
+# Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
+_AIS = {
+    r"(.*_)?(heading|hdg|true_heading)": (511.0,),
+    r"(.*_)?(sog|speed(_over_ground)?|velocity)": (102.3, 1023.0),
+    r"(.*_)?(cog|course(_over_ground)?)": (360.0, 3600.0),
+}
+_NOT_A_PLACE = (91.0, 181.0)
+# What latitudes may be in, and the largest latitude so.
+_SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
+_MINUTES = "ddmm.mmmm"
+_SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "kn": 1852 / 3600, "mi/h": 0.44704, "ft/s": 0.3048}
+_SPEEDS |= {"cm/s": 0.01, "mm/s": 0.001}
+_NEAR = 0.03  # of a ratio of the path to the speed
+_HIGHEST_M = 12_000.0  # that anything with a receiver mostly is
+_SOUTH_WEST = {"N", "S", "E", "W", "NORTH", "SOUTH", "EAST", "WEST"}
+
+
+class Places(NamedTuple):
+    """Holds what latitudes and longitudes are in, lines that say so, and degrees (rows,) of them."""
+
+    unit: str
+    lines: list[str]
+    latitude_deg: NDArray
+    longitude_deg: NDArray
+
+
+def without_codes(table: GuessedTable) -> GuessedTable:
+    """Return a table whose columns have no codes of what is missing; these are stated in `prepared`."""
+    plain = {column.plain for column in table.whole}
+    is_ais = any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
+    codes: dict[str, list[float]] = {}
+    for column in table.whole:
+        known: tuple[float, ...] = ()
+        if is_ais:
+            known = next((those for name, those in _AIS.items() if re.fullmatch(name, column.plain)), ())
+        if re.fullmatch(r"(.*_)?lat(itude)?", column.plain):
+            known = tuple(code for code in _NOT_A_PLACE if _is_code(column.values, code, 90.0))
+        elif re.fullmatch(r"(.*_)?(lon|lng|long)(gitude)?", column.plain):
+            known = (181.0,) if _is_code(column.values, 181.0, 180.0) else ()
+        if found := [code for code in known if np.any(column.values == code)]:
+            codes[column.name] = found
+    if not codes:
+        return table
+    table.prepared["missing"] = codes
+
+    def cleaned(columns: Sequence[GuessedColumn]) -> list[GuessedColumn]:
+        return [
+            column._replace(
+                values=np.where(
+                    np.isin(column.values, codes.get(column.name, [])), np.nan, column.values
+                )
+            )
+            for column in columns
+            if not np.isin(column.values[np.isfinite(column.values)], codes.get(column.name, [])).all()
+        ]
+
+    for name, values in codes.items():
+        count = sum(
+            int(np.isin(column.values, values).sum()) for column in table.whole if column.name == name
+        )
+        listed = " and ".join(f"{value:g}" for value in values)
+        table.made.append(f"{ASSUMED}{name}: {listed} means not available, in {count} rows; missing")
+    return table._replace(columns=cleaned(table.columns), whole=cleaned(table.whole))
+
+
+def _is_code(values: NDArray, code: float, largest: float) -> bool:
+    """Tell whether a value is a code: beyond the range of degrees that most others keep to."""
+    others = values[np.isfinite(values) & ~np.isin(values, _NOT_A_PLACE)]
+    return bool(np.any(values == code)) and (not len(others) or float(np.abs(others).max()) <= largest)
+
+
+def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
+    """Find what latitudes and longitudes are in; raises BadInput if that is not certain."""
+    latitude, longitude = place
+    signed = [
+        _signed(table, column, letters) for column, letters in zip(place, ("NS", "EW"), strict=True)
+    ]
+    pair = (signed[0], signed[1])
+    names = f"{latitude.name} and {longitude.name}"
+    fitting = [name for name in (*_SCALES, _MINUTES, "rad") if _fits(name, *pair)]
+    stated = stated_unit(latitude, "deg")
+    if stated and stated not in ("deg", "rad") and stated not in fitting:
+        fitting = [stated] if _fits(stated, *pair) else []
+    if not fitting:
+        _refuse(table, place, "no unit fits")
+    by_speed = _by_speed(table, pair, fitting)
+    comment = ""
+    if stated and stated in fitting and not (stated == "deg" and _MINUTES in fitting):
+        chosen, why = stated, "as its name says"
+    elif len(by_speed) == 1:
+        chosen, why = by_speed[0], "by which places move as fast as the speed says"
+    elif by_speed == [] and len(fitting) > 1 and "deg" not in fitting:
+        _refuse(table, place, f"as {' or '.join(fitting)} they do not move as fast as the speed says")
+    else:
+        chosen, why = _by_name(table, place, [each for each in fitting if each in by_speed] or fitting)
+        if not chosen:
+            _refuse(table, place, f"they may be {', '.join(fitting)}")
+    if chosen not in ("deg", stated):
+        comment = f"{ASSUMED}{names} are in {chosen}, {why}"
+    degrees = [_degrees(chosen, values) for values in pair]
+    lines = [f"{comment}; {_how(chosen)}"] if comment else []
+    if chosen == _MINUTES:
+        table.prepared["degrees_minutes"] = {"": [latitude.name, longitude.name]}
+    elif chosen != "deg":
+        lines += [f'units.{field} = "{chosen}"' for field in ("latitude_deg", "longitude_deg")]
+    zero = (degrees[0] == 0) & (degrees[1] == 0)
+    if zero.any() and np.abs(np.nanmedian(degrees[0])) > 0.5:
+        missing = table.prepared.setdefault("missing", {})
+        for column in place:
+            missing[column.name] = [*missing.get(column.name, []), 0.0]
+        lines.append(
+            f"{ASSUMED}{names}: 0, 0 means that there was no fix, in {zero.sum()} rows; missing"
+        )
+        degrees = [np.where(zero, np.nan, values) for values in degrees]
+    return Places(chosen, lines, *degrees)
+
+
+def _how(chosen: str) -> str:
+    return "degrees_minutes" if chosen == _MINUTES else "units"
+
+
+def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> None:
+    largest = [float(np.nanmax(np.abs(column.values))) for column in place]
+    raise BadInput(
+        f"{table.path}: it is not certain what {place[0].name} and {place[1].name}, up to "
+        f"{largest[0]:.9g} and "
+        f"{largest[1]:.9g}, are in: {why}; write a mapping by hand with `units` of latitude_deg and "
+        'longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` for '
+        "ddmm.mmmm, or `missing` for codes of missing values"
+    )
+
+
+def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray:
+    """Return a column with the signs of a column of hemispheres, if there is one."""
+    sides = [
+        name
+        for name, cells in table.texts.items()
+        if (known := {cell.strip().upper() for cell in cells if cell.strip()})
+        and known <= _SOUTH_WEST
+        and {cell[0] for cell in known} <= set(letters)
+    ]
+    if not sides:
+        return column.values
+    stem = column.plain.split("_")[0]
+    side = next((name for name in sides if name.lower().startswith(stem[:3])), sides[0])
+    table.prepared.setdefault("hemispheres", {})[column.name] = side
+    initials = np.array([cell.strip().upper()[:1] for cell in table.texts[side]])
+    sign = np.where(initials == letters[1], -1.0, np.where(initials == letters[0], 1.0, np.nan))
+    return np.where(sign < 0, -np.abs(column.values), sign * column.values)
+
+
+def _fits(name: str, latitude: NDArray, longitude: NDArray) -> bool:
+    """Tell whether latitudes and longitudes may be in a unit."""
+    sizes = [np.abs(values[np.isfinite(values)]) for values in (latitude, longitude)]
+    if not (len(sizes[0]) and len(sizes[1])):
+        return name == "deg"
+    if name == _MINUTES:
+        is_beyond = sizes[0].max() > 90.0 or sizes[1].max() > 180.0
+        in_minutes = all(np.all(np.fmod(size, 100.0) < 60.0) for size in sizes)
+        return bool(is_beyond and in_minutes and sizes[0].max() <= 9000.0 and sizes[1].max() <= 18000.0)
+    factor = unit(name).size / unit("deg").size
+    if name == "rad":
+        return bool(sizes[0].max() <= np.pi / 2 and sizes[1].max() <= np.pi)
+    if not (sizes[0].max() * factor <= 90.0 and sizes[1].max() * factor <= 180.0):
+        return False
+    if name == "deg":
+        return True
+    is_whole = all(np.all(size == np.rint(size)) for size in sizes)
+    # a degree or less from 0, 0 there is mostly sea
+    return bool(
+        is_whole
+        and max(sizes[0].max(), sizes[1].max()) * factor > 0.5
+        and max(map(np.max, sizes)) > 1000
+    )
+
+
+def _degrees(name: str, values: NDArray) -> NDArray:
+    if name == _MINUTES:
+        size = np.abs(values)
+        return np.copysign(np.floor(size / 100.0) + np.fmod(size, 100.0) / 60.0, values)
+    return np.asarray(values * (unit(name).size / unit("deg").size))
+
+
+def _by_speed(table: GuessedTable, pair: tuple[NDArray, NDArray], fitting: Sequence[str]) -> list[str]:
+    """Return the units by which places move as fast as a column of speeds says; all without one."""
+    speed = _column(table.whole, r"(.*_)?(sog|speed(_over_ground)?|ground_?speed|g_?spd|velocity|gs)")
+    if speed is None or len(fitting) == 1:
+        return list(fitting)
+    stated = stated_unit(speed, "m/s")
+    units = [unit(stated).size] if stated else _speed_sizes(table)
+    found = []
+    for name in fitting:
+        ratio = path_ratio(table, _degrees(name, pair[0]), _degrees(name, pair[1]), speed.values)
+        if ratio is None:
+            return list(fitting)
+        if any(abs(np.log(ratio / size)) < _NEAR for size in units):
+            found.append(name)
+    return found
+
+
+def _speed_sizes(table: GuessedTable) -> list[float]:
+    return [_SPEEDS["kn"]] if is_ais(table) else list(_SPEEDS.values())
+
+
+def is_ais(table: GuessedTable) -> bool:
+    """Tell whether a table holds AIS reports, by the names of its columns."""
+    plain = {column.plain for column in table.whole}
+    return any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
+
+
+def path_ratio(
+    table: GuessedTable, latitude_deg: NDArray, longitude_deg: NDArray, speed: NDArray
+) -> float | None:
+    """Return how many m/s of the path one of a speed's unit is; None if places or speeds do not tell."""
+    north, east = latitude_metres(latitude_deg, longitude_deg)
+    return plane_ratio(table, east, north, speed)
+
+
+def plane_ratio(table: GuessedTable, east: NDArray, north: NDArray, speed: NDArray) -> float | None:
+    """Return what `path_ratio` does of places in a plane."""
+    if table.time_s is None:
+        return None
+    known = np.isfinite(east) & np.isfinite(north) & np.isfinite(table.time_s)
+    if known.sum() < 5:
+        return None
+    # over several rows, so that rounding and noise of places count less
+    stride = max(1, int(known.sum()) // 12)
+    moved = np.hypot(*(each[stride:] - each[:-stride] for each in (east[known], north[known])))
+    span = np.abs(table.time_s[known][stride:] - table.time_s[known][:-stride])
+    speeds = np.abs(speed[known])
+    sums = np.cumsum(np.append(0.0, np.where(np.isfinite(speeds), speeds, 0.0)))
+    counts = np.cumsum(np.append(0, np.isfinite(speeds)))
+    with np.errstate(invalid="ignore"):
+        fast = (sums[stride:-1] - sums[: -stride - 1]) / (counts[stride:-1] - counts[: -stride - 1])
+    usable = np.isfinite(fast) & (fast > 0) & (span > 0)
+    if not usable.any():
+        return None
+    ratios = moved[usable] / span[usable] / fast[usable]
+    middle = float(np.median(ratios))
+    return middle if middle > 0 else None
+
+
+def _by_name(
+    table: GuessedTable, place: Sequence[GuessedColumn], fitting: Sequence[str]
+) -> tuple[str, str]:
+    """Return the unit that names and sizes tell, with why; empty if they do not."""
+    if "deg" in fitting and "rad" not in fitting:
+        return "deg", "by their size"
+    if fitting == ["deg", "rad"] or set(fitting) == {"deg", "rad"}:
+        return (
+            "rad",
+            f'by their size, up to {np.nanmax(np.abs(place[0].values)):.4g}; units = "deg" if not',
+        )
+    if list(fitting) == [_MINUTES]:
+        return _MINUTES, "degrees and minutes, by their size"
+    if _MINUTES in fitting and "hemispheres" in table.prepared:
+        return _MINUTES, "degrees and minutes as NMEA has them, with hemispheres"
+    plain = [column.plain for column in place]
+    if "semicircle" in fitting and plain == ["position_lat", "position_long"]:
+        return "semicircle", "as files of FIT have them"
+    if (
+        "1e-7 deg" in fitting
+        and plain[0] in ("lat", "latitude")
+        and "semicircle" in fitting
+        and len(fitting) <= 3
+    ):
+        largest = float(np.nanmax(np.abs(place[0].values)))
+        if largest > 9e7:
+            return "1e-7 deg", "as u-blox, PX4 and MAVLink have them"
+    if len(fitting) == 1:
+        return fitting[0], "by their size"
+    return "", ""
+
+
+def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) -> list[str]:
+    """Write the unit of an altitude; raises BadInput if its numbers are too large for m."""
+    if length := stated_unit(height, "m"):
+        return [f'units.altitude_m = "{length}"   # as its name says'] if length != "m" else []
+    known = known_of(height)
+    largest = float(np.abs(known).max())
+    is_whole = bool(np.all(known == np.rint(known)))
+    if is_whole and position_unit == "1e-7 deg" and largest > 1000:
+        said = f"{ASSUMED}{height.name} is in mm, as receivers with positions of 1e-7 deg have it; units"
+        return [said, 'units.altitude_m = "mm"']
+    if largest <= _HIGHEST_M:
+        return [f"{ASSUMED}{height.name} is in m, as no unit is stated; units"]
+    if is_whole and largest > 60_000:
+        said = f"{ASSUMED}{height.name} is in mm, as {largest:.6g} m is above any receiver; units"
+        return [said, 'units.altitude_m = "mm"']
+    raise BadInput(
+        f"{table.path}: it is not certain what {height.name}, up to {largest:.6g}, is in; write a "
+        "mapping by "
+        'hand with units.altitude_m, such as "ft" or "mm"'
+    )
+
+
+def speed_unit_of(table: GuessedTable, speed: GuessedColumn) -> tuple[str, str]:
+    """Return the unit of a speed, by its name or by how far places move; else m/s, and why."""
+    if stated := stated_unit(speed, "m/s"):
+        return stated, "as its name says"
+    if is_ais(table) and re.search("sog|speed", speed.plain):
+        return "kn", "as AIS has it"
+    if len(table.places) > 1:
+        ratio = plane_ratio(table, table.places[0].values, table.places[1].values, speed.values)
+        if ratio is not None:
+            nearest = min(_SPEEDS, key=lambda each: abs(np.log(_SPEEDS[each] / ratio)))
+            if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
+                return nearest, "so places move as fast"
+    return "m/s", f"a guess: the largest is {np.nanmax(np.abs(speed.values)):.4g}"
+
+
+def _column(columns: Sequence[GuessedColumn], pattern: str) -> GuessedColumn | None:
+    return next((each for each in columns if re.fullmatch(pattern, each.plain)), None)
+
+
+def prepared_lines(table: GuessedTable) -> Iterator[str]:
+    """Write the entries of the table that prepare its columns."""
+    for name, entries in table.prepared.items():
+        if name == "degrees_minutes":
+            names = ", ".join(f'"{each}"' for each in entries[""])
+            yield f"degrees_minutes = [{names}]"
+            continue
+        parts = []
+        for column, value in entries.items():
+            shown = f'"{value}"' if isinstance(value, str) else _listed(value)
+            parts.append(f'"{column}" = {shown}')
+        yield f"{name} = {{ {', '.join(parts)} }}"
+
+
+def _listed(values: Sequence[float | str]) -> str:
+    shown = [f'"{value}"' if isinstance(value, str) else f"{value:g}" for value in values]
+    return f"[{', '.join(shown)}]"

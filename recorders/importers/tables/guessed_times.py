@@ -1,0 +1,672 @@
+"""Guesses which columns of a table are its times, and in which form; what is not certain is refused.
+
+No rate is made up for a table with a column that could be a time.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.stamps import NOT_A_TIME, Stamps
+from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, latitude_metres, parted
+from recorders.importers.tables.files import Batch
+from recorders.importers.tables.order import Order, is_reversed, rollover_of
+from recorders.importers.tables.times import (
+    ISO,
+    OWN_OFFSET,
+    TimeMapping,
+    formats_of,
+    offset_of,
+    stamps_ns,
+    texts_of,
+)
+
+UNKNOWN_ZERO = "2026-01-01"
+_SIZES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# Unix time, in s, of 2000 and of 2100: what numbers that count from 1970 are between.
+_DATES_S = (946_684_800.0, 4_102_444_800.0)
+_UNIT_WORDS = {
+    "ms": r"ms|millis(ec(ond)?s?)?|msecs?",
+    "us": r"us|micros(ec(ond)?s?)?|usecs?",
+    "ns": r"ns|nanos(ec(ond)?s?)?|nsecs?",
+}
+_NAMED = re.compile(
+    r"time|stamp|utc|epoch|clock|zeit|^(s|ms|us|ns)$|"
+    r"(^|_)(t|secs?|seconds?|i?tow|millis(econds?)?|micros(econds?)?|msecs?|usecs?|nsecs?|ticks?|elapsed)"
+    r"(_|$|\d)"
+)
+_COUNTERS = re.compile(
+    r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
+    r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
+)
+# From and below how many seconds steps are, by what a table holds: three decades, so that one unit fits.
+_STEPS_S = {"inertial": 5e-4, "fix": 0.02, "other": 2e-3}
+_VEHICLES = re.compile(
+    r"(.*_)?(mmsi|imei|imo|icao(24)?|callsign|call_sign|(vehicle|veh|robot|drone|uav|aircraft|flight|device|"
+    r"tracker|tag|ship|vessel|boat|car|bus|taxi|truck|bike|trip|track|animal|individual|bird|collar|user|"
+    r"rider|runner|driver|agent|asset|unit|node|person|player|machine|entity|object)"
+    r"(_?(id|no|nr|num|number|name|code|local_identifier|identifier|ident))?)|id|name"
+)
+_PARTS = (
+    ("year|yr|yyyy", "%Y"), ("month|mon|mm", "%m"), ("day|dd", "%d"),
+    ("hour|hr|hh", "%H"), ("minute|min", "%M"), ("second|sec|ss", "%S"),
+)  # fmt: skip
+
+
+class GuessedTime(NamedTuple):
+    """Holds a table's time: as TOML, the columns it is of, and what was seen and assumed.
+
+    `stamps` (n,) are those of the rows, or None if no column has them, and `vehicle` is the column that
+    says whose row it is.
+    """
+
+    text: str
+    used: set[str]
+    comments: list[str]
+    stamps: Stamps | None
+    vehicle: str
+
+
+class _Table(NamedTuple):
+    """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,)."""
+
+    path: Path
+    batch: Batch
+    columns: Sequence[GuessedColumn]
+    texts: Sequence[str]
+    vehicle: str
+    codes: NDArray[np.int64]
+    kind: str
+
+
+def guess_time(
+    path: Path, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+) -> GuessedTime:
+    """Guess the time of a table's rows.
+
+    Raises BadInput if columns could be times, and it is not certain which they are.
+    """
+    plain = {column.plain for column in columns}
+    vehicle = _vehicle(batch, columns, texts)
+    table = _Table(path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain))
+    refusals: list[BadInput] = []
+    for mapping, comments in _candidates(table):
+        found = _tried(table, mapping, comments, refusals)
+        if found is not None:
+            return found
+    if refusals:
+        raise refusals[0]
+    return GuessedTime(
+        f'{{ rate_hz = 1, zero = "{UNKNOWN_ZERO}" }}',
+        set(),
+        [
+            f"{ASSUMED}one row a second from {UNKNOWN_ZERO} on, as no column could be a time; give "
+            "rate_hz"
+        ],
+        None,
+        vehicle,
+    )
+
+
+def _kind_of(plain: set[str]) -> str:
+    if any(re.search("acc|gyr|specific_force|angular_vel", name) for name in plain) or (
+        {"ax", "ay"} <= plain or {"gx", "gy"} <= plain
+    ):
+        return "inertial"
+    is_fix = any(re.fullmatch(r"(.*_)?lat(itude)?", name) for name in plain)
+    return "fix" if is_fix else "other"
+
+
+# Whose rows they are.
+
+
+def _vehicle(batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]) -> str:
+    """Return the column that says whose row it is, of several; empty without one."""
+    plain = {column.name: column.plain for column in columns} | {name: parted(name)[0] for name in texts}
+    is_placed = any(re.fullmatch(r"(.*_)?(lat(itude)?|x|east(ing)?)", each) for each in plain.values())
+    if not is_placed or any(re.fullmatch(r"(.*_)?(range|bearing)", each) for each in plain.values()):
+        return ""
+    return next(
+        (
+            name
+            for name, known in plain.items()
+            if _VEHICLES.fullmatch(known) and _separates(batch[name])
+        ),
+        "",
+    )
+
+
+def _separates(cells: pa.Array) -> bool:
+    """Tell whether cells are of a few values, each of which comes several times."""
+    if pa.types.is_floating(cells.type) and not _are_whole(cells.to_numpy(zero_copy_only=False)):
+        return False
+    counts = pc.value_counts(cells.drop_null()).field("counts")
+    return (
+        len(counts) > 1
+        and len(counts) <= max(len(cells) // 3, 1)
+        and float(pc.mean(counts).as_py()) >= 3
+    )
+
+
+def _are_whole(values: NDArray) -> bool:
+    known = values[np.isfinite(values)]
+    return bool(np.all(known == np.rint(known)))
+
+
+def _codes(batch: Batch, vehicle: str) -> NDArray[np.int64]:
+    if not vehicle:
+        return np.zeros(len(next(iter(batch.values()))), np.int64)
+    codes = batch[vehicle].cast(pa.string()).dictionary_encode().indices
+    return np.asarray(codes.fill_null(-1).to_numpy(zero_copy_only=False), np.int64)
+
+
+def _parts(stamps: Stamps, codes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the rows with a time, vehicle by vehicle."""
+    known = stamps != NOT_A_TIME
+    return [np.flatnonzero(known & (codes == code)) for code in np.unique(codes) if code >= 0]
+
+
+# Which columns, in which form.
+
+
+def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield what the time may be, the likeliest first; raises BadInput for what could be several."""
+    yield from _dates(table)
+    yield from _calendars(table)
+    yield from _clocks_of_day(table)
+    yield from _pairs(table)
+    named = [column for column in table.columns if _NAMED.search(column.plain)]
+    named.sort(key=lambda column: _epoch_unit(column) == "")
+    first = [] if named else table.columns[:1]
+    is_clock = all(not _COUNTERS.fullmatch(each.plain) and _rises(each.values) for each in first)
+    for column in (*named, *(first if is_clock else ())):
+        yield from _counted(table, column)
+
+
+def _rises(values: NDArray) -> bool:
+    """Tell whether numbers rise nearly always, and to another one than the first."""
+    known = values[np.isfinite(values)]
+    return len(known) > 1 and float(np.mean(np.diff(known) >= 0)) >= 0.9 and bool(known[-1] > known[0])
+
+
+def _tried(
+    table: _Table, mapping: TimeMapping, comments: list[str], refusals: list[BadInput]
+) -> GuessedTime | None:
+    """Return the time by one candidate; None if it is none, with a refusal if it may be one."""
+    columns = mapping.columns
+    try:
+        stamps = _stamps(table, mapping)
+    except BadInput as error:
+        refusals.append(error)
+        return None
+    known = stamps[stamps != NOT_A_TIME]
+    label = f"{table.path}: column {' and '.join(columns)}"
+    if len(known) < 2 or known.min() == known.max():
+        if len(known) > 1:
+            refusals.append(
+                BadInput(
+                    f"{label} could be the time, and is the same in all rows; write a mapping by hand "
+                    "with "
+                    "the `time` of the rows, as docs/your-log.md says"
+                )
+            )
+        return None
+    vehicle, codes = table.vehicle, table.codes
+    parts = _parts(stamps, codes)
+    back = -1 if is_reversed([stamps[part] for part in parts]) else 1
+    if any(np.any(np.diff(stamps[part][::back]) < 0) for part in parts):
+        rollover = 0 if mapping.unit == "date" else _rollover(table, mapping, parts, back)
+        if rollover:
+            mapping = mapping.model_copy(update={"rollover": float(rollover)})
+            comments = [
+                *comments,
+                f"{ASSUMED}{columns[0]} begins again at {rollover}, and goes on beyond that; rollover",
+            ]
+            stamps = _stamps(table, mapping)
+        elif back == 1 and not vehicle:
+            vehicle = _separating(table, stamps, columns)
+            codes = _codes(table.batch, vehicle) if vehicle else codes
+        parts = _parts(stamps, codes)
+    if back == -1:
+        comments = [*comments, f"{ASSUMED}rows are newest first, as their times fall; they are reversed"]
+    try:
+        for part in parts:
+            order = Order(label, mapping)
+            order.follow(stamps[part][::back], part[::back])
+            order.end()
+    except BadInput as error:
+        refusals.append(error)
+        return None
+    if vehicle:
+        comments = [
+            *comments,
+            f"{ASSUMED}{vehicle} says whose row it is: a namespace of topics for each of its "
+            f"{len(parts)} "
+            "values; vehicle",
+        ]
+    seen = _seen([stamps[part] for part in parts])
+    return GuessedTime(_toml(mapping), {*columns}, [*seen, *comments], stamps, vehicle)
+
+
+def _stamps(table: _Table, mapping: TimeMapping) -> Stamps:
+    rows = np.arange(len(table.codes))
+    return stamps_ns(mapping, table.batch, rows, str(table.path))
+
+
+def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.int64]], back: int) -> int:
+    """Return at which number a counter begins again, of each vehicle the same; 0 if it does not."""
+    column = next(each for each in table.columns if each.name == mapping.columns[0])
+    found = set()
+    for part in parts if len(mapping.columns) == 1 else ():
+        counts = np.asarray(column.values)[part][::back]
+        steps = np.diff(counts)
+        if np.any(steps < 0):
+            found.add(
+                rollover_of(counts, float(np.median(steps[steps > 0]))) if np.any(steps > 0) else 0
+            )
+    return found.pop() if len(found) == 1 else 0
+
+
+def _separating(table: _Table, stamps: Stamps, used: Sequence[str]) -> str:
+    """Return the column whose values separate rows so that the times of each rise."""
+    others = [*table.texts, *(column.name for column in table.columns)]
+    for name in others:
+        if name in used or not _separates(table.batch[name]):
+            continue
+        parts = _parts(stamps, _codes(table.batch, name))
+        if all(np.all(np.diff(stamps[part]) > 0) for part in parts):
+            return str(name)
+    return ""
+
+
+def _toml(mapping: TimeMapping) -> str:
+    given = mapping.model_dump(exclude_defaults=True)
+    if mapping.week or not isinstance(given["column"], list):
+        pass
+    elif len(given["column"]) == 1:
+        given["column"] = given["column"][0]
+    if given.get("rollover"):
+        given["rollover"] = int(given["rollover"])
+    given.setdefault("unit", mapping.unit)
+    order = ["column", "week", "unit", "zone", "zero"]
+    names = [*(name for name in order if name in given), *(name for name in given if name not in order)]
+    parts = [f"{name} = {json.dumps(given[name], ensure_ascii=False)}" for name in names]
+    return f"{{ {', '.join(parts)} }}"
+
+
+# Texts.
+
+
+def _dates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield dates and times as texts; raises BadInput for a column of times in no known format."""
+    plain = {name: parted(name)[0] for name in table.texts}
+    days = [name for name in plain if re.fullmatch("(.*_)?(date|day)", plain[name])]
+    hours = [name for name in plain if re.fullmatch("(.*_)?(time|clock|utc|hour)", plain[name])]
+    offsets = [name for name in plain if re.fullmatch("(.*_)?(utc_?of+se?t|utcofst)", plain[name])]
+    pairs = [[day, hour, *offsets[:1]] for day in days for hour in hours]
+    named = sorted(
+        table.texts, key=lambda name: not _NAMED.search(plain[name] + " date" * (name in days))
+    )
+    for names in (*pairs, *([name] for name in named)):
+        if found := _dated(table, names):
+            yield found
+    for name in table.texts:
+        cell = _first_cell(table.batch[name])
+        if re.search(r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}", cell):
+            raise BadInput(
+                f"{table.path}: column {name} holds times such as '{cell}', whose format is not known; "
+                "write "
+                f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
+                "as docs/your-log.md says"
+            )
+
+
+def _first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
+    return next((text for text in texts_of(cells, is_part=is_part).to_pylist() if text), "")
+
+
+def _first_cells(table: _Table, names: Sequence[str]) -> str:
+    return " ".join(_first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
+
+
+def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
+    """Return the time of columns of texts; None if they hold none."""
+    cell = _first_cells(table, names)
+    if not re.search(r"\d", cell):
+        return None
+    given: dict[str, Any] = {"column": list(names), "unit": "date"}
+    comments = []
+    if zone := _zone(names):
+        given["zone"] = zone
+    elif not re.search(OWN_OFFSET, cell) and not _has_zone(table.batch[names[0]].type):
+        comments = [
+            f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
+            'zone = "Europe/Berlin" or utc_offset_h'
+        ]
+    if re.match(r"\d{1,2}:\d{2}", cell) is not None:
+        given["zero"] = UNKNOWN_ZERO
+        comments.append(f"{ASSUMED}times of the day {UNKNOWN_ZERO}, as no date is stated; zero")
+    fitting: dict[str, Stamps] = {}
+    for pattern in formats_of(cell):
+        mapping = TimeMapping.model_validate({**given, "format": pattern})
+        try:
+            stamps = _stamps(table, mapping.model_copy(update={"zone": None}))
+        except BadInput:
+            continue
+        if np.any(stamps != NOT_A_TIME):
+            fitting[pattern] = stamps
+        if pattern == ISO and fitting:
+            break
+    if not fitting:
+        return None
+    pattern = _continuous(table, names, fitting)
+    others = [each for each in fitting if not np.array_equal(fitting[each], fitting[pattern])]
+    if others:
+        comments.append(
+            f"{ASSUMED}{' and '.join(names)} has {_first_part(pattern)} first, {pattern}, so that rows "
+            "follow "
+            f"one another; with {_first_part(others[0])} first they leap; format"
+        )
+    return TimeMapping.model_validate({**given, "format": pattern}), comments
+
+
+def _first_part(pattern: str) -> str:
+    """Name what a format begins with."""
+    return {"%d": "the day", "%m": "the month"}.get(pattern[:2], "the year")
+
+
+def _has_zone(kind: pa.DataType) -> bool:
+    return pa.types.is_timestamp(kind) and kind.tz is not None
+
+
+def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Stamps]) -> str:
+    """Return the format by which rows follow one another, without leaps of months or years.
+
+    Raises BadInput if several do so alike: what the day is cannot be told.
+    """
+    spans = {}
+    for pattern, stamps in stamps_by.items():
+        steps = [np.diff(stamps[part]) for part in _parts(stamps, table.codes)]
+        moved = np.abs(np.concatenate(steps)) if steps else np.empty(0)
+        spans[pattern] = float(moved.max(initial=0.0))
+    best = min(spans, key=lambda each: spans[each])
+    alike = [
+        each
+        for each in spans
+        if spans[each] <= 2.0 * spans[best] and not np.array_equal(stamps_by[each], stamps_by[best])
+    ]
+    if alike:
+        cell = _first_cells(table, names)
+        first, second = (pd.Timestamp(_first_known(stamps_by[each])) for each in (best, alike[0]))
+        raise BadInput(
+            f"{table.path}: column {' and '.join(names)} holds dates such as '{cell}', which may be "
+            f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping by hand with `format` in `time`, "
+            f'"{best}" or "{alike[0]}"'
+        )
+    return best
+
+
+def _first_known(stamps: Stamps) -> int:
+    return int(stamps[stamps != NOT_A_TIME][0])
+
+
+def _zone(names: Sequence[str]) -> str:
+    """Return the zone that a column's name states in brackets."""
+    for text in re.findall(r"[\[(]\s*([^\])]+?)\s*[\])]", " ".join(names)):
+        try:
+            offset_of(text)
+        except ValueError:
+            continue
+        return str(text)
+    return ""
+
+
+# Numbers of calendars and clocks.
+
+
+def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield year, month, day, hour, minute and second in columns of their own."""
+    found, taken = [], []
+    for pattern, letters in _PARTS:
+        column = next(
+            (each for each in table.columns if re.fullmatch(f"(.*_)?({pattern})", each.plain)), None
+        )
+        if column is None:
+            return
+        found.append(column.name)
+        taken.append(letters)
+    cells = [_first_cell(table.batch[name]) for name in found]
+    if not re.fullmatch(r"\d{4}", cells[0].partition(".")[0]):
+        return
+    parts = [letters + ".%f" * ("." in cell) for letters, cell in zip(taken, cells, strict=True)]
+    mapping = TimeMapping(column=found, unit="date", format=" ".join(parts))
+    yield (
+        mapping,
+        [f"{ASSUMED}{', '.join(found)} are in UTC, as no zone is stated; utc_offset_h or zone"],
+    )
+
+
+def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield times as hhmmss, as NMEA has them, with or without a date as ddmmyy or yyyymmdd."""
+    for column in table.columns:
+        cell = _first_cell(table.batch[column.name])
+        if not (
+            re.search("time|utc|clock|hour", column.plain) and re.fullmatch(r"\d{5,6}(\.\d+)?", cell)
+        ):
+            continue
+        known = known_of(column)
+        whole = np.floor(known)
+        is_of_day = (
+            np.all(known < 240_000) and np.all(whole % 100 < 60) and np.all(whole // 100 % 100 < 60)
+        )
+        day = next((each for each in table.columns if re.fullmatch("(.*_)?date", each.plain)), None)
+        is_sure = np.ptp(known) >= 60 or cell.startswith("0") or day is not None
+        if not (is_of_day and is_sure):
+            continue
+        clock = "%H%M%S" + ".%f" * ("." in cell)
+        if day is None:
+            mapping = TimeMapping(column=column.name, unit="date", format=clock, zero=UNKNOWN_ZERO)
+            yield (
+                mapping,
+                [f"{ASSUMED}{column.name} is hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
+            )
+            continue
+        digits = len(_first_cell(table.batch[day.name]).partition(".")[0])
+        date = "%Y%m%d" if digits == 8 else "%d%m%y"
+        mapping = TimeMapping(column=[day.name, column.name], unit="date", format=f"{date} {clock}")
+        how = "yyyymmdd" if digits == 8 else "ddmmyy, as NMEA has it,"
+        yield mapping, [f"{ASSUMED}{day.name} is {how} and {column.name} hhmmss in UTC; format"]
+
+
+# Numbers that count.
+
+
+def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield GPS weeks with seconds of the week, and seconds with parts of them in another column."""
+    by_plain = {column.plain: column for column in table.columns}
+    week = next(
+        (
+            by_plain[name]
+            for name in by_plain
+            if re.fullmatch(r"(gps_?|gnss_?)?(week|wn)(_?(no|nr|num|number))?", name)
+        ),
+        None,
+    )
+    tow = next(
+        (
+            by_plain[name]
+            for name in by_plain
+            if re.fullmatch(r"(gps_?)?(i?tow|time_of_week|seconds_of_week|sow)", name)
+        ),
+        None,
+    )
+    if week is not None and tow is not None and np.nanmin(week.values) > 500:
+        unit = tow.unit if tow.unit in _SIZES else "ms" if np.nanmax(tow.values) > 604_800 else "s"
+        mapping = TimeMapping(column=tow.name, week=week.name, unit=unit)  # type: ignore[arg-type]
+        yield mapping, [f"{ASSUMED}GPS time is kept as it is; leap_seconds = 18 makes it UTC"]
+    for whole in table.columns:
+        stem = re.fullmatch(r"(.*?)_?(secs?|seconds?|s)", _full(whole))
+        if not stem or not _are_whole(whole.values):
+            continue
+        for pattern, unit, most in (
+            (r"nsecs?|nano_?secs?|nanoseconds?|nanos?|ns", "ns", 1e9),
+            (r"usecs?|micro_?secs?|microseconds?|micros?|us", "us", 1e6),
+            (r"msecs?|milli_?secs?|milliseconds?|millis?|ms", "ms", 1e3),
+        ):
+            part = next(
+                (
+                    each
+                    for each in table.columns
+                    if re.fullmatch(rf"{re.escape(stem[1])}_?({pattern})", _full(each))
+                    and np.nanmin(each.values) >= 0
+                    and np.nanmax(each.values) < most
+                ),
+                None,
+            )
+            if part is None:
+                continue
+            is_date = _DATES_S[0] < np.nanmedian(whole.values) < _DATES_S[1]
+            zero = {} if is_date else {"zero": UNKNOWN_ZERO}
+            given = {"column": [whole.name, part.name], "unit": ["s", unit], **zero}
+            comments = [] if is_date else [f"{ASSUMED}times count from {UNKNOWN_ZERO}; zero"]
+            yield TimeMapping.model_validate(given), comments
+
+
+def _full(column: GuessedColumn) -> str:
+    """Return a column's name in lower case with underlines, its unit at the end."""
+    return f"{column.plain}_{column.unit}" if column.unit in _SIZES else column.plain
+
+
+def _stated_unit(column: GuessedColumn) -> str:
+    """Return the unit of a column of times that its name states; empty without one."""
+    if column.unit in _SIZES:
+        return column.unit
+    last = column.plain.rpartition("_")[2]
+    return next((unit for unit, words in _UNIT_WORDS.items() if re.fullmatch(words, last)), "")
+
+
+def _epoch_unit(column: GuessedColumn) -> str:
+    """Return the unit in which a column's numbers are dates from 2000 to 2100; empty without one."""
+    known = known_of(column)
+    if not len(known):
+        return ""
+    middle = float(np.median(known))
+    units = [stated] if (stated := _stated_unit(column)) else list(_SIZES)
+    return next((unit for unit in units if _DATES_S[0] < middle * _SIZES[unit] < _DATES_S[1]), "")
+
+
+def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield a column of numbers as times; raises BadInput if its unit is not to be told."""
+    known = known_of(column)
+    steps = np.abs(np.diff(known))
+    steps = steps[steps > 0]
+    if not len(steps):
+        if _NAMED.search(column.plain):
+            yield TimeMapping(column=column.name, zero=UNKNOWN_ZERO), []
+        return
+    step, largest = float(np.median(steps)), float(np.abs(known).max())
+    unit, comments, zero = _epoch_unit(column), [], {}
+    if not unit:
+        zero = {"zero": UNKNOWN_ZERO}
+        unit, why = _stated_unit(column), ""
+        if not unit:
+            unit, why = _relative_unit(table, column, step)
+        if largest * _SIZES[unit] > _DATES_S[1]:
+            raise BadInput(
+                f"{table.path}: column {column.name} could be the time, and reaches {largest:.6g}, "
+                "which is "
+                f"beyond 2100 in {unit}; write a mapping by hand with the `unit` and `zero` of `time`"
+            )
+        comments = [
+            f"# Stamps begin at {known[0]:g}.",
+            f"{ASSUMED}{column.name} counts in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; "
+            "unit, zero",
+        ]
+    given = {"column": column.name, "unit": unit, **zero}
+    yield TimeMapping.model_validate(given), comments
+
+
+def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:
+    """Return the unit of a counter of unknown zero, and why: by its steps, if speeds do not tell."""
+    if (ratio := _seconds_a_count(table, column)) is not None:
+        nearest = min(_SIZES, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
+        if abs(np.log10(_SIZES[nearest] / ratio)) < 1.0:
+            return nearest, ", by which places move as fast as the speed says,"
+    least_s = _STEPS_S[table.kind]
+    fitting = [unit for unit, size in _SIZES.items() if least_s <= step * size < 1000 * least_s]
+    unit = fitting[0] if fitting else "s" if step >= 1 else "ns"
+    rate_hz = 1.0 / (step * _SIZES[unit])
+    if not 1e-5 < rate_hz < 2e4:
+        raise BadInput(
+            f"{table.path}: column {column.name} could be the time, and goes in steps of {step:.3g}, "
+            "which are "
+            "those of no unit; write a mapping by hand with the `unit` and `zero` of `time`"
+        )
+    return unit, f", {rate_hz:.4g} rows a second,"
+
+
+def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
+    """Return how many seconds one count of a column is, by the distance and the speed of rows."""
+    named: dict[str, NDArray] = {}
+    for key, pattern in (
+        ("lat", r"(.*_)?lat(itude)?"), ("lon", r"(.*_)?(lon|lng|long)(gitude)?"),
+        ("x", r"(.*_)?(x|east(ing)?)"), ("y", r"(.*_)?(y|north(ing)?)"),
+        ("speed", r"(.*_)?(speed|sog|velocity|v)"),
+    ):  # fmt: skip
+        match = next((each for each in table.columns if re.fullmatch(pattern, each.plain)), None)
+        if match is not None:
+            named[key] = np.asarray(match.values)
+    if "speed" not in named:
+        return None
+    if {"lat", "lon"} <= named.keys():
+        latitude, longitude = named["lat"], named["lon"]
+        if np.nanmax(np.abs(latitude)) > 90 or np.nanmax(np.abs(latitude)) < 1.6:
+            return None
+        north, east = latitude_metres(latitude, longitude)
+    elif {"x", "y"} <= named.keys():
+        east, north = named["x"], named["y"]
+    else:
+        return None
+    known = np.isfinite(east) & np.isfinite(north) & np.isfinite(column.values)
+    counts = np.abs(np.diff(np.asarray(column.values)[known]))
+    moved = np.hypot(np.diff(east[known]), np.diff(north[known]))
+    speed = float(np.nanmedian(np.abs(named["speed"])))
+    if not (len(counts) and speed > 0 and moved.sum() > 0 and counts.sum() > 0):
+        return None
+    return float(moved.sum() / counts.sum() / speed)
+
+
+# What was seen.
+
+
+def _seen(parts: Sequence[Stamps]) -> list[str]:
+    """Say the rate, gaps and repetitions of stamps, those of each vehicle by themselves."""
+    steps_s = np.concatenate([np.diff(part) for part in parts]) * 1e-9
+    if is_reversed(parts):
+        steps_s = -steps_s
+    forward = steps_s[steps_s > 0]
+    if not len(forward):
+        return ["# All rows have one stamp."]
+    usual_s = float(np.median(forward))
+    gaps = forward[forward > 5 * usual_s]
+    rate = f"{1 / usual_s:.4g}"
+    comment = f"# {rate} {'row' if rate == '1' else 'rows'} a second"
+    if len(gaps):
+        what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        comment += f"; {what} over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
+    for one, many, which in (
+        ("repeats", "repeat", steps_s == 0),
+        ("goes back", "go back", steps_s < 0),
+    ):
+        if which.any():
+            comment += f"; 1 stamp {one}" if which.sum() == 1 else f"; {which.sum()} stamps {many}"
+    return [f"{comment}."]

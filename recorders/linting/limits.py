@@ -1,0 +1,195 @@
+"""Checks physical limits: heights, positions, speeds between fixes, turns, and dates."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.models.orientation import heading
+from recorders.models.planar import wrap_angle
+from recorders.plausibility.finding import Finding
+
+FEWEST = 10
+HIGHEST_M, LOWEST_M = 50_000.0, -12_000.0
+ZERO_DEG = 0.01  # around latitude and longitude 0, where there is only sea
+FASTEST_MPS, FARTHEST_M = 1500.0, 1000.0
+ZIGZAG = 5.0  # by how much a step is longer than two together
+SIDEWAYS_MPS2, SLOWEST_MPS = 10.0, 1.0
+EARLIEST_NS, LATEST_NS = 31_536_000 * 10**9, 946_684_800 * 10**9  # 1971 and 2000
+FAR_H, NEAR_S = 14, 30.0
+METRES = 111_195.0  # of a degree
+_PLACED = (schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name)
+
+Floats = NDArray[np.float64]
+
+
+def heights(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find altitudes that no receiver has, as of mm read as m."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
+        return
+    known = stream["altitude_m"][np.isfinite(stream["altitude_m"])]
+    beyond = known[(known > HIGHEST_M) | (known < LOWEST_M)]
+    if len(beyond):
+        worst = float(beyond[np.abs(beyond).argmax()])
+        yield _found(
+            stream,
+            "altitude_m",
+            worst,
+            f"{len(beyond)} of its altitudes are beyond {LOWEST_M:g} to {HIGHEST_M:g} m, up to "
+            f"{worst:.6g} m",
+            'units.altitude_m = "mm" in the mapping, or missing = [...] for codes of missing values',
+        )
+
+
+def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find fixes that are all close to latitude and longitude 0, as of degrees scaled once too often."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
+        return
+    latitude, longitude = (np.abs(stream[name]) for name in ("latitude_deg", "longitude_deg"))
+    if len(stream) < FEWEST or max(np.nanmedian(latitude), np.nanmedian(longitude)) > ZERO_DEG:
+        return
+    if np.all(latitude == 0) and np.all(longitude == 0):
+        return  # told as places without a fix
+    yield _found(
+        stream,
+        "latitude_deg",
+        float(np.nanmedian(latitude)),
+        f"its fixes are about 0, 0, {np.nanmedian(latitude):.3g} and {np.nanmedian(longitude):.3g} deg "
+        "from it, "
+        "where there is only sea: they are in another unit than the mapping says",
+        "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
+    )
+
+
+def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find steps between fixes that nothing is fast enough for, and fixes that go to and fro."""
+    if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
+        return
+    order = np.argsort(stream.publish_time_ns, kind="stable")
+    times_s, places = 1e-9 * stream.publish_time_ns[order].astype(float), _places(stream)[order]
+    steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    span_s = np.diff(times_s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fast = (steps_m > FARTHEST_M) & (steps_m / span_s > FASTEST_MPS)
+    if fast.any():
+        first = int(np.argmax(fast))
+        yield _found(
+            stream,
+            "",
+            float(fast.sum()),
+            f"{int(fast.sum())} of its steps are faster than {FASTEST_MPS:g} m/s, the first by "
+            f"{steps_m[first] / 1000:.4g} km in {span_s[first]:.3g} s, "
+            f"{times_s[first] - times_s[0]:.4g} s after its "
+            "first stamp",
+            "check the unit and the codes of missing values of its positions, whether its rows are "
+            "those of "
+            "several vehicles (`vehicle` in the mapping), and `time`",
+        )
+        return
+    two_m = np.linalg.norm(places[2:] - places[:-2], axis=1)
+    back = (steps_m[:-1] > ZIGZAG * two_m) & (steps_m[1:] > ZIGZAG * two_m)
+    if back.mean() > 0.5 and float(np.median(steps_m)) > 10.0 * _noise_m(places):
+        yield _found(
+            stream,
+            "",
+            float(back.mean()),
+            f"its fixes go to and fro, {np.median(steps_m):.3g} m from one to the next and "
+            f"{np.median(two_m):.3g} m to the one after it: they are two rows of fixes, sorted into "
+            "one another",
+            "`vehicle`, or `order` and `zone` of `time`, in the mapping; leave one recording out",
+        )
+
+
+def _noise_m(places: Floats) -> float:
+    """Return how far fixes scatter about a straight line of every second one."""
+    every = places[::2]
+    bend = every[2:] - 2.0 * every[1:-1] + every[:-2]
+    return float(np.median(np.linalg.norm(bend, axis=1)) / np.sqrt(6.0)) if len(bend) else np.inf
+
+
+def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find headings that turn faster than the speed of the fixes allows, as of another unit."""
+    if stream.schema.full_name != schemas.ORIENTATION.full_name or len(stream) < FEWEST:
+        return
+    speed = max((_speed(other) for other in streams.values()), default=0.0)
+    angle = heading(stream["quaternion"])
+    span_s = 1e-9 * np.diff(stream.publish_time_ns)
+    moving = span_s > 0
+    if speed < SLOWEST_MPS or not moving.any():
+        return
+    rate = float(np.median(np.abs(wrap_angle(np.diff(angle)))[moving] / span_s[moving]))
+    if rate * speed > SIDEWAYS_MPS2:
+        yield _found(
+            stream,
+            "quaternion",
+            rate,
+            f"its heading turns by {rate:.3g} rad/s, half of the time more, at {speed:.3g} m/s: that is "
+            f"{rate * speed:.3g} m/s^2 sideways",
+            "the unit of the angle in the mapping",
+        )
+
+
+def _speed(stream: Stream) -> float:
+    """Return the median speed of fixes in m/s, 0 for another topic."""
+    if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
+        return 0.0
+    moved = np.linalg.norm(np.diff(_places(stream), axis=0), axis=1)
+    span_s = 1e-9 * np.diff(stream.publish_time_ns)
+    moving = span_s > 0
+    return float(np.nanmedian(moved[moving] / span_s[moving])) if moving.any() else 0.0
+
+
+def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find stamps before 2000 that do not count from 1970, days that leap by months, and zones."""
+    first_ns, last_ns = int(stream.publish_time_ns.min()), int(stream.publish_time_ns.max())
+    if EARLIEST_NS < first_ns < LATEST_NS:
+        yield _stamps(
+            stream,
+            f"its stamps begin on {pd.Timestamp(first_ns):%Y-%m-%d}, before there were such logs",
+            "`unit` and `zero` of `time` in the mapping",
+        )
+    days = pd.to_datetime(np.unique(stream.publish_time_ns // (86400 * 10**9)) * 86400 * 10**9)
+    if (
+        first_ns > LATEST_NS
+        and len(days) >= 2
+        and len(set(days.day)) == 1
+        and len(stream) >= 5 * len(days)
+    ):
+        yield _stamps(
+            stream,
+            f"its stamps are of {len(days)} days, each the {days[0].day}. of a month, the first on "
+            f"{days[0]:%Y-%m-%d}: day and month are swapped",
+            "`format` of `time` in the mapping",
+        )
+    for other in streams.values():
+        apart_ns = int(other.publish_time_ns.min()) - first_ns
+        hours = round(apart_ns / 3600e9)
+        is_near = abs(apart_ns - hours * 3600 * 10**9) < NEAR_S * 1e9
+        if 0 < hours <= FAR_H and is_near and int(other.publish_time_ns.min()) > last_ns:
+            yield _stamps(
+                other,
+                f"it begins {hours} h after {stream.topic}, which has ended by then: a time zone is "
+                "stated for "
+                "one of them alone, or twice",
+                "`zone` or `utc_offset_h` of `time` in the mapping",
+            )
+            return
+
+
+def _places(stream: Stream) -> Floats:
+    """Return places (n, 2) in m."""
+    if stream.schema.full_name == schemas.POSITION_FIX.full_name:
+        return np.asarray(stream["position_m"][:, :2])
+    latitude = stream["latitude_deg"]
+    shrunk = METRES * np.cos(np.radians(np.nanmedian(latitude)))
+    return np.column_stack([shrunk * stream["longitude_deg"], METRES * latitude])
+
+
+def _found(stream: Stream, field: str, value: float, words: str, mapping: str) -> Finding:
+    return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", mapping=mapping)
+
+
+def _stamps(stream: Stream, words: str, mapping: str) -> Finding:
+    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", mapping=mapping)

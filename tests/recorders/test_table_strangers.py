@@ -1,0 +1,435 @@
+"""Inputs of the kinds that strangers reported: read right, or refused by a sentence that helps."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from recorders.errors import BadInput
+from recorders.importers.tables.guessing import assumptions, guess
+from recorders.importers.tables.importer import TableParameters, read
+from recorders.log import Stream
+
+ROWS = range(40)
+EPOCH = 1_700_000_000
+
+
+class Got:
+    """What came of a table: streams by topic, notes, and what the guess assumed."""
+
+    def __init__(self, path: Path, mapping: str | None = None) -> None:
+        text = guess([path]) if mapping is None else mapping
+        place = path.parent / "mapping.toml"
+        place.write_text(text, encoding="utf-8")
+        found = read(path, TableParameters(mapping=str(place))).together()
+        self.streams: dict[str, Stream] = {each.topic: each for each in found.streams}
+        self.notes, self.said, self.text = found.notes, "; ".join(assumptions(text)), text
+
+    def times(self, topic: str) -> list[str]:
+        """The stamps of a topic as text."""
+        stamps = self.streams[topic].publish_time_ns
+        return [str(pd.Timestamp(each)) for each in stamps.tolist()]
+
+
+def text_of(folder: Path, head: str, row: Callable[[int], str], rows: Sequence[int] = ROWS) -> Path:
+    """Write a table, a line for each row."""
+    path = folder / "own.csv"
+    path.write_text("\n".join([head, *map(row, rows)]) + "\n", encoding="utf-8")
+    return path
+
+
+# Whole numbers of times.
+
+
+@pytest.mark.parametrize(
+    "kind", ["int64", "uint64", "Int64", "jsonl", "npz", "timestamp", "zoned", "duration"]
+)
+def test_whole_numbers_of_ns_are_times(kind: str, tmp_path: Path) -> None:
+    stamps = 1_700_000_000_123_456_789 + 100_000_000 * np.arange(40)
+    frame = pd.DataFrame({"stamp": stamps, "speed": 1.5, "yaw_rate": 0.0})
+    path = tmp_path / f"own.{kind if kind in ('jsonl', 'npz') else 'parquet'}"
+    if kind == "jsonl":
+        frame.to_json(path, orient="records", lines=True)
+    elif kind == "npz":
+        np.savez(path, **{name: frame[name].to_numpy() for name in frame})
+    elif kind == "duration":
+        frame.assign(stamp=pd.to_timedelta(frame["stamp"])).to_parquet(path)
+    elif kind in ("timestamp", "zoned"):
+        times = pd.to_datetime(frame["stamp"])
+        frame["stamp"] = (
+            times if kind == "timestamp" else times.dt.tz_localize("UTC").dt.tz_convert("CET")
+        )
+        frame.to_parquet(path)
+    else:
+        frame.astype({"stamp": kind}).to_parquet(path)
+    got = Got(path)
+    assert got.streams["/odometry"].publish_time_ns.tolist() == stamps.tolist()
+
+
+def test_no_rate_is_made_up_beside_a_column_that_could_be_a_time(tmp_path: Path) -> None:
+    same = text_of(tmp_path, "timestamp,speed,yaw_rate", lambda row: f"{EPOCH},1,{row}")
+    with pytest.raises(BadInput, match="could be the time, and is the same in all rows"):
+        Got(same)
+    tiny = text_of(tmp_path, "time,speed,yaw_rate", lambda row: f"{45000 + row / 86400e3:.11f},1,{row}")
+    with pytest.raises(BadInput, match="which are those of no unit"):
+        Got(tiny)
+    free = Got(text_of(tmp_path, "speed,yaw_rate", lambda row: f"1,{row}"))
+    assert "one row a second" in free.said
+
+
+# Order.
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "bits"),
+    [("time_us", "us", 32), ("ms", "ms", 16), ("tick_us", "us", 24), ("time_ms", "ms", 32)],
+)
+def test_counters_are_continued_beyond_their_rollover(
+    name: str, unit: str, bits: int, tmp_path: Path
+) -> None:
+    step = 10 if bits < 32 else 10_000
+    path = text_of(
+        tmp_path,
+        f"{name},speed,yaw_rate",
+        lambda row: f"{(2**bits - 9 * step + step * row) % 2**bits},1,{row}",
+    )
+    got = Got(path)
+    steps = np.diff(got.streams["/odometry"].publish_time_ns)
+    assert set(steps.tolist()) == {step * {"us": 1000, "ms": 1_000_000}[unit]}
+    assert np.all(np.diff(got.streams["/odometry"]["turn_radps"]) > 0)
+    assert f"begins again at {2**bits}" in got.said
+    by_hand = (
+        f"[[tables]]\ntime = {{ column = '{name}', unit = '{unit}' }}\n[[tables.streams]]\n"
+        "topic = '/v'\nbecomes = 'VectorMeasurement'\nfields.value = ['speed']\ncomponents = 'v'\n"
+    )
+    with pytest.raises(BadInput, match=f"at row 10 the time falls .*`rollover = {2**bits}`"):
+        Got(path, by_hand)
+
+
+@pytest.mark.parametrize("restart", [20, 33, 38])
+def test_a_clock_that_restarts_is_refused(restart: int, tmp_path: Path) -> None:
+    path = text_of(tmp_path, "t,speed,yaw_rate", lambda row: f"{0.5 * (row % restart):.1f},1,0.1")
+    with pytest.raises(BadInput, match=rf"at row {restart + 1} the time falls .*split the file there"):
+        Got(path)
+
+
+def test_rows_that_are_newest_first_are_reversed(tmp_path: Path) -> None:
+    got = Got(text_of(tmp_path, "time,speed,yaw_rate", lambda k: f"2025-06-01 12:00:{59 - k:02d},{k},0"))
+    assert got.streams["/odometry"]["forward_mps"].tolist() == list(reversed(ROWS))
+    assert "newest first" in got.said
+    assert got.notes["own.csv: rows are newest first, and are reversed"] == "40"
+
+
+@pytest.mark.parametrize("column", ["vehicle", "device_id", "group"])
+def test_several_vehicles_of_a_file_are_told_apart(column: str, tmp_path: Path) -> None:
+    """One after the other by any column, of which the times of each rise."""
+    path = text_of(
+        tmp_path,
+        f"t,{column},lat,lon",
+        lambda row: f"{EPOCH + row % 20},{'AB'[row // 20]},{48 + 1e-5 * row:.6f},11",
+    )
+    got = Got(path)
+    assert {topic: len(each) for topic, each in got.streams.items()} == {"/A/fix": 20, "/B/fix": 20}
+    assert f"{column} says whose row it is" in got.said
+
+
+# Places.
+
+
+def row_of_place(lat: str, lon: str, more: str = "") -> Callable[[int], str]:
+    return lambda row: f"{EPOCH + row},{lat.format(row)},{lon.format(row)}{more}"
+
+
+PLACES: dict[str, tuple[str, Callable[[int], str], float, float]] = {
+    "semicircles by their names": (
+        "t,position_lat,position_long",
+        lambda k: f"{EPOCH + k},{598290819 + k},{107670058 + k}",
+        50.1481571,
+        9.0248000,
+    ),
+    "semicircles by the speed": (
+        "t,lat,lon,speed_mps",
+        lambda k: f"{EPOCH + k},{598290819 + 1073 * k},{107670058},10.0",
+        50.1481571,
+        9.0248000,
+    ),
+    "1e-7 deg by the speed": (
+        "t,lat,lon,speed_mps",
+        lambda k: f"{EPOCH + k},{501481679 + 899 * k},{90248083},10.0",
+        50.1481679,
+        9.0248083,
+    ),
+    "microdegrees by the speed": (
+        "t,lat,lon,speed_mps",
+        lambda k: f"{EPOCH + k},{50148168 + 90 * k},{9024808},10.0",
+        50.148168,
+        9.024808,
+    ),
+    "microdegrees by their names": (
+        "t,lat_e6,lon_e6",
+        row_of_place("50148168", "9024808"),
+        50.148168,
+        9.024808,
+    ),
+    "a row of units": (
+        "t,lat,lon\ns,1e-6 deg,1e-6 deg",
+        row_of_place("50148168", "9024808"),
+        50.148168,
+        9.024808,
+    ),
+    "south and west": (
+        "t,lat,NS,lon,EW",
+        lambda k: f"{EPOCH + k},33.{8688 + k},S,70.6,W",
+        -33.8688,
+        -70.6,
+    ),
+    "ddmm, south and west": (
+        "t,latitude,lat_dir,longitude,lon_dir",
+        lambda k: f"{EPOCH + k},3352.12,S,07036.{k:02d},W",
+        -33.8686667,
+        -70.6,
+    ),
+    "ddmm near the equator": (
+        "t,lat,n_s,lon,e_w",
+        lambda k: f"{EPOCH + k},0117.5,N,10351.{k:02d},E",
+        1.2916667,
+        103.85,
+    ),
+    "as WKT": ("t,place", lambda k: f"{EPOCH + k},POINT (8.7 47.{50 + k})", 47.5, 8.7),
+    "in one cell": ("t,GPS", lambda k: f'{EPOCH + k},"47.{50 + k}, 8.70"', 47.5, 8.7),
+    "east of 91 deg": ("t,lat,lon", row_of_place("22.5", "91.{:02d}"), 22.5, 91.0),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_latitudes_and_longitudes_are_read_in_their_unit(name: str, tmp_path: Path) -> None:
+    head, row, latitude, longitude = PLACES[name]
+    fix = Got(text_of(tmp_path, head, row)).streams["/fix"]
+    assert len(fix) == len(ROWS)
+    assert fix["latitude_deg"][0] == pytest.approx(latitude, abs=1e-6)
+    assert fix["longitude_deg"][0] == pytest.approx(longitude, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("t,lat,lon", lambda k: f"{EPOCH + k},{50148168 + k},{9024808 + k}"),
+        ("t,lat,lon", lambda k: f"{EPOCH + k},{4811700 + k},{1152300 + k}"),
+        ("t,lat,lon", lambda k: f"{EPOCH + k},48.1,{9.1e9 + k}"),
+    ],
+)
+def test_an_uncertain_unit_of_places_is_refused(
+    head: str, row: Callable[[int], str], tmp_path: Path
+) -> None:
+    with pytest.raises(BadInput, match=r"not certain what lat and lon.*`units` of latitude_deg"):
+        Got(text_of(tmp_path, head, row))
+
+
+def test_codes_of_ais_are_missing_values(tmp_path: Path) -> None:
+    """Each in its own column alone: a longitude of 91 deg is one, and so is a speed of 51.1 kn."""
+    path = text_of(
+        tmp_path,
+        "time,mmsi,lat,lon,sog,cog,heading",
+        lambda k: (
+            f"2025-06-01 12:00:{k:02d},219000001,"
+            + ("91,181,102.3,360,511" if k in (3, 7) else f"55.5,{91 + 8.14e-5 * k:.6f},10.0,90,90")
+        ),
+    )
+    got = Got(path)
+    assert len(got.streams["/fix"]) == len(got.streams["/heading"]) == 38
+    assert np.abs(got.streams["/fix"]["longitude_deg"] - 91.0).max() < 0.01
+    assert got.notes["own.csv: heading: 511 is missing"] == "2"
+    assert "lat: 91 means not available, in 2 rows" in got.said
+
+
+def test_a_column_of_codes_alone_gives_nothing(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},219000001,55.5,{11 + 1e-4 * k:.4f},511"  # noqa: E731
+    assert set(Got(text_of(tmp_path, "t,mmsi,lat,lon,heading", row)).streams) == {"/fix", "/values"}
+
+
+def test_altitudes_and_headings_are_read_in_their_unit(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},{481170000 + 900 * k},115000000,{105_000 + k},{100_000 + k}"  # noqa: E731
+    got = Got(text_of(tmp_path, "t,lat,lon,height,heading", row))
+    assert got.streams["/fix"]["altitude_m"][0] == pytest.approx(105.0)
+    half = 0.5 * (np.pi / 2 - np.radians(1.0))
+    assert np.abs(got.streams["/heading"]["quaternion"][0, 0]) == pytest.approx(np.cos(half), abs=1e-6)
+    high = text_of(tmp_path, "t,lat,lon,altitude", lambda k: f"{EPOCH + k},48,11,{35_000 + k}")
+    with pytest.raises(BadInput, match="not certain what altitude, up to 35039, is in"):
+        Got(high)
+
+
+# Zones and dates.
+
+
+def by_zone(stated: str) -> str:
+    return (
+        f"[[tables]]\ntime = {{ column = 'time', unit = 'date'{stated} }}\n[[tables.streams]]\n"
+        "topic = '/v'\nbecomes = 'VectorMeasurement'\nfields.value = ['v']\ncomponents = 'v'\n"
+    )
+
+
+def test_the_offset_of_a_cell_comes_first(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "time,v", lambda k: f"2025-07-01T12:00:{k:02d}+02:00,{k}")
+    for stated in ("", ", zone = 'Europe/Berlin'", ", utc_offset_h = 2"):
+        assert Got(path, by_zone(stated)).times("/v")[0] == "2025-07-01 10:00:00"
+    with pytest.raises(BadInput, match=r"row 1 holds .*another offset from UTC than the mapping"):
+        Got(path, by_zone(", zone = 'CET'"))
+
+
+def test_timestamps_without_a_zone_are_local_times(tmp_path: Path) -> None:
+    path = tmp_path / "own.parquet"
+    local = pd.date_range("2025-07-01 12:00", periods=3, freq="1s")
+    for times, stated, stamp in (
+        (local, ", zone = 'Europe/Berlin'", "2025-07-01 10:00:00"),
+        (local, ", utc_offset_h = -7", "2025-07-01 19:00:00"),
+        (local.tz_localize("Europe/Berlin"), ", zone = 'Europe/Berlin'", "2025-07-01 10:00:00"),
+    ):
+        pd.DataFrame({"time": times, "v": 1.0}).to_parquet(path)
+        assert Got(path, by_zone(stated)).times("/v")[0] == stamp
+
+
+def test_skipped_local_times_are_refused_and_doubled_ones_are_told_by_their_order(
+    tmp_path: Path,
+) -> None:
+    zone = by_zone(", zone = 'America/New_York'")
+    path = text_of(tmp_path, "time,v", lambda k: f"2025-03-09 0{1 + k // 20}:{3 * k % 60:02d}:00,{k}")
+    with pytest.raises(BadInput, match="row 21 is of 2025-03-09 02:00:00, a time that the clocks"):
+        Got(path, zone)
+    utc = pd.date_range("2025-11-02T04:30Z", periods=40, freq="5min")
+    local = utc.tz_convert("America/New_York")
+    path = text_of(tmp_path, "time,v", lambda k: f"{local[k]:%Y-%m-%d %H:%M:%S},{k}")
+    got = Got(path, zone)
+    assert got.streams["/v"].publish_time_ns.tolist() == utc.as_unit("ns").asi8.tolist()
+    assert any("the hour that comes twice in America/New_York" in note for note in got.notes)
+
+
+def test_continuity_tells_the_day_from_the_month(tmp_path: Path) -> None:
+    times = pd.date_range("2019-09-07 22:00", periods=40, freq="10min")
+    for pattern in ("%d/%m/%Y %H:%M", "%m/%d/%Y %H:%M", "%d-%m-%y %H:%M", "%y/%m/%d %H:%M"):
+        got = Got(text_of(tmp_path, "when,speed,yaw_rate", lambda k, at=pattern: f"{times[k]:{at}},1,0"))
+        assert got.times("/odometry")[0] == "2019-09-07 22:00:00", pattern
+        assert "first" in got.said
+    one_day = text_of(tmp_path, "when,speed,yaw_rate", lambda k: f"07/09/2019 10:{k:02d},1,0")
+    with pytest.raises(BadInput, match="may be 9 July 2019 or 7 September 2019"):
+        Got(one_day)
+
+
+def test_dates_without_a_time_of_day_are_dates(tmp_path: Path) -> None:
+    days = pd.date_range("2024-01-25", periods=40, freq="1D")
+    got = Got(text_of(tmp_path, "when,speed,yaw_rate", lambda k: f"{days[k]:%d/%m/%Y},1,0"))
+    assert got.times("/odometry")[-1] == "2024-03-04 00:00:00"
+
+
+def test_iso_dates_are_certain(tmp_path: Path) -> None:
+    got = Got(text_of(tmp_path, "time,speed,yaw_rate", lambda k: f"2025-06-01T12:00:{k:02d}Z,1,0"))
+    assert "first" not in got.said
+    assert "UTC" not in got.said
+
+
+@pytest.mark.parametrize(
+    ("head", "cells", "stamp"),
+    [
+        (
+            "secs,nsecs",
+            lambda k: f"{EPOCH + k // 10},{k % 10 * 100_000_000 + 7}",
+            "2023-11-14 22:13:20.000000007",
+        ),
+        (
+            "header.stamp.sec,header.stamp.nanosec",
+            lambda k: f"{EPOCH + k},5",
+            "2023-11-14 22:13:20.000000005",
+        ),
+        ("time_s,time_us", lambda k: f"{EPOCH + k},12", "2023-11-14 22:13:20.000012"),
+        ("year,month,day,hour,min,sec", lambda k: f"2025,6,1,9,5,{k}.25", "2025-06-01 09:05:00.250000"),
+        ("date,utc_time", lambda k: f"010625,0905{k:02d}.50", "2025-06-01 09:05:00.500000"),
+        ("week,tow", lambda k: f"2300,{3600 + k}", "2024-02-04 01:00:00"),
+        (
+            "Lcl Date,Lcl Time,UTCOfst",
+            lambda k: f"2025-06-01,09:05:{k:02d},-07:00",
+            "2025-06-01 16:05:00",
+        ),
+    ],
+)
+def test_times_in_several_columns_are_together(
+    head: str, cells: Callable[[int], str], stamp: str, tmp_path: Path
+) -> None:
+    got = Got(text_of(tmp_path, f"{head},speed,yaw_rate", lambda k: f"{cells(k)},1,0"))
+    assert got.times("/odometry")[0] == stamp
+
+
+# Text.
+
+
+TEXTS = {
+    "digits at the front": ("t,1RSS(dB),3DFix,lat,lon", "{t},-57,1,48.1,11.5"),
+    "units below the names": ("t,lat,lon\n(s),(deg),(deg)", "{t},48.1,11.5"),
+    "units without brackets": ("t;lat;lon;mode\ns;deg;deg;", "{t};48.1;11.5;AUTO"),
+    "a comma in a name": ('t,"hypot(VX,VY)",lat,lon', "{t},1.5,48.1,11.5"),
+    "a comma in the first row": ("t,place,lat,lon", '{t},"Solent, east",48.1,11.5'),
+    "a newline in a name": ('t,"speed\nover ground",lat,lon', "{t},1.5,48.1,11.5"),
+    "sep=": ("sep=;\nt;lat;lon", "{t};48.1;11.5"),
+    "lines above": ("Logger 3\nFirmware 1.2\n\nt,lat,lon", "{t},48.1,11.5"),
+    "quoted cells": ('"t","lat","lon"', '"{t}","48.1","11.5"'),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_text_is_read_as_other_readers_read_it(name: str, tmp_path: Path) -> None:
+    head, row = TEXTS[name]
+    got = Got(text_of(tmp_path, head, lambda k: row.format(t=EPOCH + k)))
+    assert len(got.streams["/fix"]) == len(ROWS)
+    assert got.streams["/fix"]["latitude_deg"].tolist() == [48.1] * len(ROWS)
+
+
+def test_repeated_headers_are_no_rows(tmp_path: Path) -> None:
+    path = text_of(
+        tmp_path, "t,lat,lon", lambda k: f"{EPOCH + k},48.1,11.5" + "\nt,lat,lon" * (k in (5, 20))
+    )
+    got = Got(path)
+    assert len(got.streams["/fix"]) == len(ROWS)
+    assert got.notes["own.csv: rows left out, that repeat the names of the columns"] == "2"
+
+
+def test_lines_are_skipped_and_cells_split_by_the_mapping(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "1,2,3\n4,5,6\nt,where,v", lambda k: f"{EPOCH + k},(8.7 47.5),{k}")
+    got = Got(
+        path,
+        "[[tables]]\nskip = 2\nsplit = { where = ['lon', 'lat'] }\ntime = { column = 't' }\n"
+        "[[tables.streams]]\ntopic = '/fix'\nbecomes = 'GeodeticFix'\n"
+        "fields = { latitude_deg = 'lat', longitude_deg = 'lon' }\n",
+    )
+    assert got.streams["/fix"]["latitude_deg"].tolist() == [47.5] * len(ROWS)
+
+
+def test_a_code_of_a_missing_value_holds_in_an_attitude(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "t,hdg", lambda k: f"{EPOCH + k},{511 if k == 5 else 90}")
+    whole = (
+        "[[tables]]\n{table}\ntime = {{ column = 't' }}\nattitude = "
+        "{{ heading = 'hdg' }}\n[[tables.streams]]\n"
+        "topic = '/heading'\nbecomes = 'Orientation'\n{stream}\n"
+        "fields.quaternion = ['quaternion_w', 'quaternion_x', 'quaternion_y', 'quaternion_z']\n"
+    )
+    for table, stream in (("missing = { hdg = [511] }", ""), ("", "missing = [511]")):
+        got = Got(path, whole.format(table=table, stream=stream))
+        assert len(got.streams["/heading"]) == len(ROWS) - 1
+
+
+def test_files_of_one_row_are_one_table(tmp_path: Path) -> None:
+    """As KITTI has OXTS: the times and the names of the columns are in files of their own."""
+    folder = tmp_path / "oxts"
+    (folder / "data").mkdir(parents=True)
+    for k in ROWS:
+        (folder / "data" / f"{k:010d}.txt").write_text(f"{49 + 1e-6 * k:.6f} 8.4 115.0 {0.1 * k:.1f}")
+    stamps = [f"2011-09-26 13:02:{k:02d}.{964389445 + k}" for k in ROWS]
+    (folder / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    names = ["lat: latitude (deg)", "lon: longitude (deg)", "alt: altitude (m)", "roll: roll (rad)"]
+    (folder / "dataformat.txt").write_text("\n".join(names) + "\n")
+    got = Got(folder)
+    assert 'file = "timestamps.txt"' in got.text
+    assert got.times("/fix") == stamps
+    assert got.streams["/fix"]["latitude_deg"][-1] == 49.000039
+    (folder / "data" / f"{40:010d}.txt").write_text("49 8.4 115 0")
+    with pytest.raises(BadInput, match=r"timestamps.txt: has 40 times, and there are more rows"):
+        Got(folder, got.text)
