@@ -1,8 +1,8 @@
 """Pairs targets with tracks as CLEAR MOT does: a pair is kept for as long as it is within the cutoff.
 
 Source: Bernardin, Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT
-metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. A target remembers its track while it is
-missed, too, as in motmetrics, so that a target that comes back with its track has not switched.
+metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. A target remembers its track
+while it is missed, too, as in motmetrics: a target that comes back with its track has not switched.
 """
 
 from collections.abc import Sequence

@@ -24,7 +24,8 @@ from replay.engine.arrays import Integers
 from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
 from replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
 from replay.judging.errors.evaluation import Floats
-from replay.judging.tracks.errors import NONE, TrackErrors, instants_of, track_errors, tracks_at
+from replay.judging.tracks.clear_mot import NONE
+from replay.judging.tracks.errors import TrackErrors, instants_of, track_errors, tracks_at
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
 from replay.timeline.drawing.events import Happened, above_events, draw_events
 from replay.timeline.drawing.plane import (
