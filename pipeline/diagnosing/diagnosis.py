@@ -261,7 +261,8 @@ def diagnose(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
-    trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
+    is_own = isinstance(settings.get("kind"), Estimator)
+    trying = Trying(label, alterations_of(source), is_own, gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
     of_log = without_filter(source, streamed, undone_by(bound))

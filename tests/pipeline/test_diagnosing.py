@@ -15,6 +15,7 @@ from rerun.chunk import RrdReader
 import fuselog as fl
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing import diagnosis, study
+from pipeline.altering import sources as altering
 from pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from pipeline.diagnosing.consistency import of_each_component
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
@@ -230,6 +231,51 @@ def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
     assert {each.kind for each in found[:2]} == {"bias or turned frame", "measurement noise"}
     assert found[0].cause.gain > found[1].cause.gain
     assert len(found) == 2
+
+
+BESIDE_ITS_PLACE = {"/robot1/fix.origin": "1.0,-2.0"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "part", "right"),
+    [
+        ({"/robot1/fix.delay_s": -0.25}, {"fix_delay_s": 0.15}, {"fix_delay_s": 0.25}),
+        (
+            {"/robot1/odometry.turn_bias": 0.02},
+            {"turn_bias_radps": 0.008},
+            {"turn_bias_radps": 0.02},
+        ),
+        (
+            {"/robot1/range_bearing.range_scale": 1.25},
+            {"/robot1/range_bearing.range_scale": 0.9},
+            {"/robot1/range_bearing.range_scale": 0.8},
+        ),
+        (BESIDE_ITS_PLACE, {"/robot1/fix.origin": "0.5,0"}, {"/robot1/fix.origin": (-1.0, 2.0)}),
+    ],
+)
+def test_advice_is_the_total_to_set_where_part_of_it_is_set(
+    wrong: dict[str, Any], part: dict[str, Any], right: dict[str, Any]
+) -> None:
+    """The first advice gives the right value, and the likelihood rises with it, in place of the part."""
+    fix = {"rate_hz": 2.0, "sigma_m": 0.1}
+    log = fl.record("landmarks", seed=3, duration_s=30.0, speed_mps=2.0, fix=fix)
+    damaged = altering.alter(log, wrong)
+    streams = {topic: replace(damaged.streams[topic]) for topic in damaged.streams}
+    recording = replace(log, streams=streams)
+
+    def likelihood(settings: dict[str, Any]) -> float:
+        of_topics, own = altering.split_settings({**OPEN, **settings})
+        metrics = fl.replay(
+            altering.alter(recording, of_topics), {"ekf": {"kind": "ekf", **own}}
+        ).metrics
+        return float(metrics.set_index("quantity")["value"]["log_likelihood"])
+
+    setting = fl.diagnose(recording, "ekf", set=part).sentences[0].setting
+    key, _, value = setting.partition("=")
+    [(wanted_key, wanted)] = right.items()
+    assert key == wanted_key
+    assert np.array(value.split(","), float) == pytest.approx(np.atleast_1d(wanted), abs=0.04)
+    assert likelihood({**part, key: value if "," in value else float(value)}) > likelihood(part) + 5.0
 
 
 def test_causes_that_explain_nearly_as_much_are_said_to() -> None:

@@ -218,7 +218,5 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
         which = "some measurements" if reopens_s == REOPENS_S else "the measurements of whole stretches"
         return f"{which} are outliers: of something else, or false"
 
-    is_closed = (getattr(parameters, "gate_probability", None) or 1.0) <= GATE
-    advice = None if is_closed else Advice("gate_probability", GATE)
-    found = supposed("outliers", "gate_probability", "", without, "", advice)
+    found = supposed("outliers", "gate_probability", "", without, "", Advice("gate_probability", GATE))
     yield replace(found, words=words, specials=(REOPENS_S, NEVER_S) if reopens else (REOPENS_S,))
