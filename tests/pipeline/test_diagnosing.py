@@ -14,8 +14,8 @@ from rerun.chunk import RrdReader
 
 import fuselog as fl
 from pipeline.altering import alterations as alter
-from pipeline.diagnosing import diagnosis, study
 from pipeline.altering import sources as altering
+from pipeline.diagnosing import diagnosis, study
 from pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from pipeline.diagnosing.consistency import of_each_component
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages

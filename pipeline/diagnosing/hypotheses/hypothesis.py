@@ -140,7 +140,7 @@ def has(parameters: Parameters | None, name: str) -> bool:
 
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
-    """Return the value of a parameter that a topic is read with: given, stated by the channel, or zero."""
+    """Return a parameter that a topic is read with: as given, or stated by the channel, or zero."""
     if not has(parameters, name):
         return 0.0
     value = getattr(parameters, name)
