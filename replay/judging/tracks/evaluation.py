@@ -18,9 +18,9 @@ from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import split_topic
 from replay.judging.metrics.measuring import Metric
+from replay.judging.tracks.clear_mot import NONE
 from replay.judging.tracks.errors import (
     BURN_IN_S,
-    NONE,
     PERIOD_S,
     VELOCITY,
     Judged,
