@@ -76,11 +76,11 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Return a sentence for what was mended in a trajectory, and where no time offset helps."""
+        """Return a sentence for what was mended or is in doubt, and if no time offset helps."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         notes = [in_vain] if sought and not self.compared.time_offset_s else []
-        return [*self.estimate.notes, *self.truth.notes, *notes]
+        return [*self.estimate.notes, *self.truth.notes, *notes, *self.compared.doubts]
 
     @property
     def poses(self) -> pd.DataFrame:
@@ -220,6 +220,11 @@ class ComparedLogs:
             for (estimator, case), runs in self.compared.items()
             for quantity, value in trajectory_metrics(runs).items()
         }
+
+    @property
+    def notes(self) -> list[str]:
+        """Return a sentence for what figures do not mean."""
+        return [each for runs in self.compared.values() for run in runs for each in run.doubts]
 
     @property
     def figures(self) -> dict[str, "Chart | Figure"]:

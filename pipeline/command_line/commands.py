@@ -186,7 +186,7 @@ def evaluate_logs(
         written=[out] if out else [],
         details={"coverage": [row._asdict() for row in found.coverage]},
         more=found.compared.metrics,
-        unused=sentences(found.coverage),
+        unused=[*sentences(found.coverage), *found.compared.notes],
     )
 
 

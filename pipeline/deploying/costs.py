@@ -140,12 +140,26 @@ def _sampling(sampled: SampledFunction) -> Cost:
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
     )
     values = _in_loop(sampled.value, sampled.varying, count)
-    own = added(once, values, Cost(size * size * count))
+    own = added(once, values, Cost(size * size * count), _narrowing(sampled))
     mean = Cost(2 * count * sampled.size)
     if sampled.recentre is None:
         return added(own, mean, Cost(sampled.size))
     again = added(mean, _cost_of_step(sampled.move), _in_loop(sampled.recentre, SETTLING, count))
     return added(own, *[again] * MEANS)
+
+
+def _narrowing(sampled: SampledFunction) -> Cost:
+    """Count what it takes to keep angles at samples within half a turn, where one is hardly known."""
+    if not sampled.turns:
+        return NOTHING
+    count, size = sampled.points.shape
+    rows = [row for first, width, _ in sampled.turns for row in range(first, first + width)]
+    entries, turns = sum(row + 1 for row in rows), len(sampled.turns)
+    looked = Cost(2 * entries + 3 * turns)
+    bounded = Cost(4 * entries + len(rows), len(rows))
+    reach = Cost(count * (2 * entries + 2 * len(rows)) + turns, turns)
+    back = Cost(1 + size * (size + 1) // 2 + count * size + sampled.size * (count + 1))
+    return added(looked, bounded, reach, back)
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:

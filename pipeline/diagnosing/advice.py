@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 
@@ -15,6 +16,7 @@ class Advice(NamedTuple):
         free: the parameter that may be tuned instead.
         otherwise: what may be done instead, in words.
         more: what is set beside it, by its key.
+        is_moved: whether the value is metres along several axes, to which those that are set are added.
     """
 
     key: str
@@ -22,6 +24,7 @@ class Advice(NamedTuple):
     free: str = ""
     otherwise: str = ""
     more: tuple[tuple[str, float | str], ...] = ()
+    is_moved: bool = False
 
     @classmethod
     def of(cls, setting: str) -> "Advice":
@@ -51,15 +54,26 @@ class Trying:
         label: the estimator's.
         applied: how the log is altered already.
         is_own: whether the estimator is a program's own, which no command can name.
+        gate: the probability of the gate that is set.
     """
 
     label: str
     applied: Mapping[str, Any]
     is_own: bool
+    gate: float = 1.0
+
+    def is_set(self, advice: Advice) -> bool:
+        """Tell whether the advice is a gate, and one as narrow is set already."""
+        return advice.key == "gate_probability" and self.gate <= float(advice.value)
 
     def over(self, advice: Advice) -> Advice:
-        """Return the advice with what is set already, which it would replace."""
+        """Return the advice as the total to set: with what is set already, which it would replace."""
         before, now = self.applied.get(advice.key), advice.value
+        if advice.is_moved and before is not None:
+            both = zip_longest(
+                *(map(float, str(each).split(",")) for each in (before, now)), fillvalue=0.0
+            )
+            return advice._replace(value=",".join(f"{precise(sum(each))}" for each in both))
         if isinstance(before, bool) or not isinstance(before, int | float) or isinstance(now, str):
             return advice
         is_factor = advice.key.endswith("_scale")

@@ -37,6 +37,7 @@ from pipeline.diagnosing.findings import (
     undone_by,
     without_filter,
 )
+from pipeline.diagnosing.hypotheses.parameters import NEVER_S
 from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
 from pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
 from pipeline.output.charts import Chart
@@ -260,15 +261,22 @@ def diagnose(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
-    trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
+    is_own = isinstance(settings.get("kind"), Estimator)
+    trying = Trying(label, alterations_of(source), is_own, gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
     of_log = without_filter(source, streamed, undone_by(bound))
     sentences += ranked(sought.causes, of_log, trying, rest)
     no_judges = judged_by_itself(source, streamed)
-    has_outliers = any(each.kind == "outliers" for each in sentences)
+    outliers = [each.value for each in sought.causes if each.hypothesis.kind == "outliers"]
     findings: list[Finding] = [
-        *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
+        *of_innovations(
+            innovations,
+            gate,
+            source.epoch_ns,
+            has_outliers=bool(outliers),
+            in_stretches=NEVER_S in outliers,
+        ),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(
             each

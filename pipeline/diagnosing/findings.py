@@ -155,9 +155,17 @@ def _kurtosis(values: Floats) -> float:
 
 
 def of_innovations(
-    innovations: Mapping[str, Stream], gate: float | None, epoch_ns: int, *, has_outliers: bool
+    innovations: Mapping[str, Stream],
+    gate: float | None,
+    epoch_ns: int,
+    *,
+    has_outliers: bool,
+    in_stretches: bool = False,
 ) -> Iterator[Finding]:
-    """Yield what the gate (its probability, if it is ours) keeps out, and where a filter diverges."""
+    """Yield what the gate (its probability, if it is ours) keeps out, and where a filter diverges.
+
+    Outliers that come in stretches are kept out for long, as they should be.
+    """
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
         is_in = stream["accepted"] != 0
@@ -168,7 +176,7 @@ def of_innovations(
             of_all += f", where {100.0 * (1.0 - gate):.2g} % are expected"
             reopened = "; --set gate_probability=1, or gate_reopens_s=1"
             opened = "; --set gate_probability=1 until the cause is mended"
-        locked_out = _long_runs(~is_in, LOCKED_OUT)
+        locked_out = [] if in_stretches else _long_runs(~is_in, LOCKED_OUT)
         if locked_out:
             begin, end = locked_out[0]
             more = f" and {_times(len(locked_out) - 1)} again" if len(locked_out) > 1 else ""

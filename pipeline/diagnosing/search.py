@@ -20,6 +20,7 @@ END = 1e-3  # of how far an end is: what it need not be known better by
 SHARES = 0.05, 0.95  # of a bracket, between which its next value is
 ROUNDS = 14  # of a refinement at most
 DOUBLINGS = 12  # of the way to an end
+NARROWINGS = 40  # of the bracket of an end at most
 LARGEST = 1e12  # a loss, of what cannot be used
 NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
 CLEAR = 0.05  # of the same, where a peak is of several numbers
@@ -226,7 +227,8 @@ def end(at: Peak, scale: float) -> Generator[Sequence[Number], Sequence[float], 
     """Search for an end of the 95 % interval of a number: where the gain is DROP_95 below its greatest.
 
     `scale` is how far off it is about, with its side. An end that is not found is infinite. The gain is
-    about a parabola, so that the root of what it falls by is about a line.
+    about a parabola, so that the root of what it falls by is about a line. If the gain is a spike, the
+    bracket stops narrowing after `NARROWINGS` values and its outer end is returned.
     """
     assert isinstance(at.value, float)
     inner, outer = at.value, at.value + scale
@@ -239,31 +241,42 @@ def end(at: Peak, scale: float) -> Generator[Sequence[Number], Sequence[float], 
     else:
         return float(np.copysign(np.inf, scale))
     value, most = outer, fallen
-    while abs(fallen / ROOT_95 - 1.0) > END and abs(outer - inner) > END * abs(outer - at.value):
+    for _ in range(NARROWINGS):
+        if abs(fallen / ROOT_95 - 1.0) <= END:
+            return value
+        if abs(outer - inner) <= END * abs(outer - at.value):
+            return value
         share = float(np.clip((ROOT_95 - least) / (most - least), *SHARES))
         value = inner + share * (outer - inner)
+        if value in (inner, outer):  # numbers have no room between them
+            break
         fallen = _root_of_fall(at, (yield [value]))
         if fallen > ROOT_95:
             outer, most = value, fallen
         else:
             inner, least = value, fallen
-    return value
+    return outer
 
 
 def _root_of_fall(at: Peak, gains: Sequence[float]) -> float:
     [gain] = gains
-    return float(np.sqrt(np.clip(at.gain - gain, 0.0, LARGEST)))
+    fall = at.gain - gain if gain < at.gain else 0.0
+    return float(np.sqrt(min(fall, LARGEST)))
 
 
 def side_by_side(
     searches: Sequence[Generator[Sequence[Number], Sequence[float], Result]],
     gains_of: Callable[[Sequence[tuple[int, Number]]], Sequence[float]],
 ) -> list[Result]:
-    """Let searches go on together, by the gains of what all of them ask for: places and values."""
+    """Run searches together, by the gains of what all of them ask for: places and values.
+
+    A gain that is NaN counts as minus infinity: a value that cannot be used.
+    """
     asked = {place: list(next(search)) for place, search in enumerate(searches)}
     results: dict[int, Result] = {}
     while asked:
-        found = iter(gains_of([(place, at) for place, each in asked.items() for at in each]))
+        gains = gains_of([(place, at) for place, each in asked.items() for at in each])
+        found = iter(-np.inf if np.isnan(gain) else gain for gain in gains)
         answers = {place: [next(found) for _ in each] for place, each in asked.items()}
         asked = {}
         for place, answer in answers.items():

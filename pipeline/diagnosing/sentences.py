@@ -147,7 +147,7 @@ def _sentence(
     """
     of, words = cause.hypothesis, cause.words
     mend = of.mend(cause.value)
-    if mend is None:
+    if mend is None or trying.is_set(mend):
         words += "; the gate that is set keeps these out"
         return Sentence(of.kind, of.topic, words, None, cause)
     advice = trying.over(mend)

@@ -49,6 +49,16 @@ QUANTITIES: dict[str, Quantity] = {
         "HOTA", "How well targets are found and kept apart, together; 1 is best.", TRACKING
     ),
     "idf1": Quantity("IDF1", "Share of time with the right identity; 1 is best.", TRACKING),
+    "referenced_hota": Quantity(
+        "HOTA near known targets",
+        "As HOTA, without tracks that never come near a target with a truth.",
+        TRACKING,
+    ),
+    "referenced_idf1": Quantity(
+        "IDF1 near known targets",
+        "As IDF1, without tracks that never come near a target with a truth.",
+        TRACKING,
+    ),
     "missed_targets": Quantity(
         "missed targets at a time", "Targets without a track, mean over time.", TRACKING
     ),

@@ -21,6 +21,7 @@ Cost = Callable[[Floats], Floats]
 
 STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
+DESCENTS = 20  # each of which ends where another parameter's change costs less
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
 LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
 FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
@@ -179,15 +180,19 @@ def least(
         Where the cost is least (k,), in coordinates, and whether the search came to its end.
     """
     point = _scanned(cost, coordinates, start)
-    while True:
+    for _ in range(DESCENTS):
         ended, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
         point = _scanned(cost, coordinates, ended)
         if point is ended or not has_converged:
             return ended, has_converged
+    return point, False
 
 
 def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """Find a point (k,) from which no change of one positive parameter costs less."""
+    """Find a point (k,) from which no change of one positive parameter costs less.
+
+    Ends after `ITERATIONS` changes where the cost falls without an end.
+    """
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
@@ -198,13 +203,14 @@ def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
         or [np.empty((0, len(start)))]
     )
     point = start
-    while True:
+    for _ in range(ITERATIONS):
         points = np.clip(np.array([point, *(point + changes)]), low, high)
-        costs = cost(coordinates.values(points))
+        costs = np.fmin(cost(coordinates.values(points)), np.inf)  # NaN cannot be used either
         best = int(np.argmin(costs))
-        if costs[best] > costs[0] - LEAST_GAIN:
-            return point
+        if best == 0 or costs[best] > costs[0] - LEAST_GAIN:
+            break
         point = points[best]
+    return point
 
 
 def _minimum(
@@ -218,10 +224,11 @@ def _minimum(
     if all(each.is_kept for each in coordinates.free):
         return low, True
     # what cannot be used is a wall that a search turns back from
-    wall = 10.0 * abs(float(cost(coordinates.values(start[None]))[0])) + 1e6
+    at_start = float(cost(coordinates.values(start[None]))[0])
+    wall = (10.0 * abs(at_start) if np.isfinite(at_start) else 0.0) + 1e6
 
     def costs(points: Floats) -> Floats:
-        return np.minimum(cost(coordinates.values(points)), wall)
+        return np.fmin(cost(coordinates.values(points)), wall)
 
     def with_gradient(point: Floats) -> tuple[float, Floats]:
         steps = STEP * np.eye(len(point))

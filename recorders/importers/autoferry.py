@@ -11,6 +11,7 @@ younger one is late by the difference. Every scan is there, empty ones too.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -156,7 +157,8 @@ def read(folder: Path, parameters: AutoferryParameters) -> Recording:
             streams += _sensor_streams(f"/{name}", rows, scans, stated)
             _tell(notes, name, rows, scans)
     for target, (time_ns, place) in truths.items():
-        streams.append(truth_stream(f"/target{target}/truth", time_ns, PLANE, place))
+        truth = truth_stream(f"/target{target}/truth", time_ns, PLANE, place)
+        streams.append(replace(truth, metadata={**truth.metadata, "covers": "some targets"}))
     return Recording(streams, int(scans.time_ns.min()), notes)
 
 

@@ -22,6 +22,7 @@ OF_STAMPS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ..
 OF_MOTION: tuple[Callable[[Motion], Iterator[Finding]], ...] = (
     turns.gravity,
     turns.quaternions,
+    speeds.leaps,
     speeds.clocks,
     speeds.delays,
     speeds.factors,

@@ -17,9 +17,11 @@ from recorders.plausibility.timing import Timing, timing
 from recorders.plausibility.windows import (
     FEWEST,
     Windows,
+    chords,
     clear_moves,
     courses,
     distances,
+    noise_of,
     places_of,
     travelled,
     turned,
@@ -28,6 +30,7 @@ from recorders.plausibility.windows import (
 SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
 LEAST_LAG_S = 0.15
 LONG_S = 1.0  # a lag that no body makes whose course is not where it heads
+CHORD = 1.3  # of the variance that `noise_of` finds: what noise adds to the square of a chord
 ALIKE, PLAIN = 0.8, 0.95  # correlations; the latter where the course need not be the heading
 
 
@@ -36,8 +39,8 @@ class Slope(NamedTuple):
 
     Attributes:
         value: the multiple, by least squares through zero.
-        likeness: the correlation about zero.
-        spread: how much single windows differ from that, of its size.
+        likeness: the correlation about zero; zero if the multiple is that of few windows only.
+        spread: how much single windows differ from that, of its size; infinite if it is of few.
         windows: how many there are.
     """
 
@@ -69,9 +72,38 @@ def slope(x: Floats, y: Floats) -> Slope:
     if len(x) < FEWEST or not (xx > 0.0 and yy > 0.0):
         return Slope(np.nan, 0.0, np.inf, len(x))
     value = float(xy / xx)
+    if not _agree(value, usual_slope(x, y)):
+        return Slope(value, 0.0, np.inf, len(x))
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = float(np.nanmedian(np.abs(y / x - value)) / abs(value)) if value else np.inf
     return Slope(value, float(xy / np.sqrt(xx * yy)), spread, len(x))
+
+
+def usual_slope(x: Floats, y: Floats) -> float:
+    """Compute the slope of y on x through zero by least absolute deviations.
+
+    It is the median of y / x under the weights |x| (Laplace), so that few windows, however far off, do
+    not decide it.
+
+    Args:
+        x: (k,), known.
+        y: (k,), known.
+
+    Returns:
+        The slope; NaN if all x are zero.
+    """
+    is_moved = x != 0.0
+    if not is_moved.any():
+        return np.nan
+    ratios, weights = y[is_moved] / x[is_moved], np.abs(x[is_moved])
+    order = np.argsort(ratios)
+    total = np.cumsum(weights[order])
+    return float(ratios[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _agree(value: float, usual: float) -> bool:
+    """Tell whether least squares and most windows say about the same."""
+    return bool(ALIKE * abs(value) <= np.sign(value) * usual <= abs(value) / ALIKE)
 
 
 def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
@@ -203,8 +235,17 @@ class Motion:
             return None
         if (moved := clear_moves(self.places)) is None:
             return None
-        distances = travelled(self.aligned(source), moved.begin_s, moved.end_s)
-        return slope(distances, np.linalg.norm(moved.values, axis=1))
+        aligned = self.aligned(source)
+        found = slope(
+            travelled(aligned, moved.begin_s, moved.end_s), np.linalg.norm(moved.values, axis=1)
+        )
+        # windows were chosen by how far places moved: all of them have to say the same
+        every = chords(self.places, float(np.median(moved.end_s - moved.begin_s)))
+        distances = travelled(aligned, every.begin_s, every.end_s)
+        known = np.isfinite(distances)
+        squares = np.sum(every.values[known] ** 2, axis=1) - CHORD * noise_of(self.places.values) ** 2
+        usual = usual_slope(distances[known], np.sqrt(np.maximum(squares, 0.0)))
+        return found if _agree(found.value, usual) else found._replace(likeness=0.0, spread=np.inf)
 
     def turn(self, source: Series) -> Slope | None:
         """Return how much the course turns for each radian of a turn rate.

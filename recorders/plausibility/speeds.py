@@ -8,6 +8,7 @@ import numpy as np
 from recorders.plausibility.body import Fixes, Floats, Series
 from recorders.plausibility.finding import Finding, digits
 from recorders.plausibility.motion import Motion
+from recorders.plausibility.windows import jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
 UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}
@@ -16,10 +17,40 @@ SCALE = (0.8, 1.25)  # what a metre of a speed may move places by
 SPREAD = 0.25
 LEAP_S = {18.0: "GPS time runs 18 s ahead of UTC since 2017"}
 LEAP_TOLERANCE_S = 0.6
+LEAPED = 2.0  # of what a speed moves between nearly all fixes: beyond it, the body may have moved
 REST = 0.05  # of the larger speeds
 FEWEST_AT_REST = 10
 TAIL_SIGMAS = 3.2905  # beyond which, to each side, a Gaussian is in .0005 of all cases
 LEAST_RATIO = 1.5  # of variances, a difference that matters
+
+
+def leaps(motion: Motion) -> Iterator[Finding]:
+    """Find places that jump while a speed says that the body moves as usual."""
+    sources = [*motion.body.speeds, *motion.body.velocities]
+    for fixes in motion.body.fixes:
+        places = np.flatnonzero(jumps(fixes))
+        source = next((each for each in sources if each.topic != fixes.topic), None)
+        if source is None or not len(places):
+            continue
+        moved = travelled(source, fixes.times_s[:-1], fixes.times_s[1:])
+        with np.errstate(invalid="ignore"):
+            is_jump = moved[places] <= LEAPED * np.nanquantile(moved, 0.95)
+        if not is_jump.all():
+            continue
+        lengths_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)[places]
+        largest = int(np.argmax(lengths_m))
+        at_s = fixes.times_s[1:][places]
+        times = f"{len(places)} times, from {at_s[0]:.1f} s to {at_s[-1]:.1f} s, "
+        yield Finding(
+            "place",
+            fixes.topic,
+            fixes.field,
+            float(lengths_m[largest]),
+            f"{fixes.topic}: its position jumps {times if len(places) > 1 else ''}by up to "
+            f"{lengths_m[largest]:.3g} m at {at_s[largest]:.1f} s, while {source.topic} moves "
+            f"{moved[places][largest]:.2g} m",
+            mapping="cut these messages out, or keep a gate (gate_probability) that rejects them",
+        )
 
 
 def delays(motion: Motion) -> Iterator[Finding]:

@@ -46,6 +46,8 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     best_s = float(lags_s[np.nanargmax(np.abs(coarse))])
     fine_s = best_s + np.arange(-STEP_S, STEP_S + 0.5 * FINE_S, FINE_S)
     near = _likeness(windows, source, account, fine_s)
+    if not np.isfinite(near).any():  # at an end of the lags, where all windows are too few
+        return None
     best = int(np.nanargmax(np.abs(near)))
     lag_s, likeness = float(fine_s[best]), float(near[best])
     gain, gained_s, gained = _gained(few, source, account)

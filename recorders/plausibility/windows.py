@@ -12,6 +12,10 @@ SPANS_S = (2.0, 5.0, 10.0)
 FEWEST = 12  # windows, below which nothing is said
 CLEAR = 12.0  # times the noise of a place, which a window has to be long
 WANDERS = 3.0  # standard deviations that places state, within which a body is not seen to move
+JUMP = 5.0  # times the noise of a place, and so many times what nearly all steps are long
+JUMP_STEPS = 2.0
+JUMPS = 0.05  # of the steps; more are how the body moves
+NEAR = 4  # steps to either side, whose median velocity a step is compared with
 MOST = 2000  # windows; of more every second, third, ... is taken
 
 
@@ -64,9 +68,32 @@ def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np
     return first, later[first]
 
 
+def jumps(fixes: Series) -> NDArray[np.bool_]:
+    """Find the steps (n - 1,) from one place to the next that are jumps of the receiver.
+
+    A jump is a single step that is far from what the steps next to it say: beyond the noise, and beyond
+    what nearly all steps are long. Several in one direction are a motion, and so are many.
+    """
+    steps, step_s = np.diff(fixes.values, axis=0), np.diff(fixes.times_s)
+    if len(steps) < FEWEST:
+        return np.zeros(len(steps), bool)
+    padded = np.pad(steps / step_s[:, None], ((NEAR, NEAR), (0, 0)), mode="edge")
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * NEAR + 1, axis=0), axis=-1)
+    excess = steps - usual * step_s[:, None]
+    most_m = JUMP_STEPS * np.quantile(np.linalg.norm(steps, axis=1), 1.0 - JUMPS)
+    found = np.linalg.norm(excess, axis=1) > max(JUMP * noise_of(fixes.values), most_m)
+    goes_on = found[1:] & found[:-1] & (np.sum(excess[1:] * excess[:-1], axis=1) > 0.0)
+    found[1:] &= ~goes_on
+    found[:-1] &= ~goes_on
+    return found if found.mean() <= JUMPS else np.zeros(len(steps), bool)
+
+
 def chords(fixes: Series, span_s: float) -> Windows:
-    """Return how places move (k, 2) in windows of a span."""
+    """Return how places move (k, 2) in windows of a span, without those in which they jump."""
     first, second = pairs(fixes.times_s, span_s)
+    jumped = np.concatenate([[0], np.cumsum(jumps(fixes))])
+    is_whole = jumped[first] == jumped[second]
+    first, second = first[is_whole], second[is_whole]
     return Windows(
         fixes.times_s[first], fixes.times_s[second], fixes.values[second] - fixes.values[first]
     )

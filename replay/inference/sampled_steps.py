@@ -10,6 +10,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function
 from replay.engine.vectors.tangent import WIDTHS
+from replay.inference.kalman.wide_angles import turning, unsuspected_rad
 from replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
@@ -36,11 +37,13 @@ class SampledFunction(NamedTuple):
         variances: the noise's, `variance` (noises).
         centre: the function at the mean, without noise: `centre`, of its values.
         value: of (..., away, centre), the function at the mean moved by a tangent vector, behind which
-            the noise stands (t + noises): `value` (v), the tangent vector to there from the centre.
+            is the noise (t + noises): `value` (v), the tangent vector to there from the centre.
         move: of (mean, covariance, shift, centre): `centre`, moved by the shift (v).
         recentre: of (mean, covariance, shift, value): `value` from the moved centre, and `again`,
             whether the values may still not sum to zero; None where they are linear.
         given: how many arguments the step is given.
+        turns: the state's angles and rotations, by which samples are narrowed, see `wide_angles`.
+        unsuspected: the standard deviation up to which they are not.
     """
 
     points: Floats
@@ -51,6 +54,8 @@ class SampledFunction(NamedTuple):
     move: Step
     recentre: Step | None
     given: int
+    turns: tuple[tuple[int, int, float], ...]
+    unsuspected: float
 
     @property
     def steps(self) -> list[Step]:
@@ -145,6 +150,8 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         traced_step(what, move, (*gaussian, shift, centre)),
         None if straight else traced_step(what, recentre, (*gaussian, shift, shift)),
         len(given),
+        turning(kinds),
+        unsuspected_rad(points),
     )
 
 

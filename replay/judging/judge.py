@@ -41,6 +41,7 @@ from replay.judging.metrics.measuring import (
 from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.tracks.errors import SOME_ARE_KNOWN
 from replay.judging.tracks.errors import Judged as Targets
 from replay.judging.tracks.evaluation import targets_of, track_blocks
 
@@ -96,6 +97,7 @@ class Judge:
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
         self._targets: list[Targets | None] | None = None
+        self._of_targets: list[str] = []
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -147,6 +149,8 @@ class Judge:
         if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
             if self._targets is None:
                 self._targets = [targets_of(source) for source in self._sources]
+                if any(targets is not None and targets.is_partial for targets in self._targets):
+                    self._of_targets = [SOME_ARE_KNOWN]
             for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
                 self._measured.add(topic, tracks)
         return judged
@@ -205,6 +209,7 @@ class Judge:
                 self._quantities[topic].merge(quantities)
             else:
                 self._quantities[topic] = quantities
+        self._of_targets = self._of_targets or other._of_targets
         self._means.merge(other._means)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
@@ -281,7 +286,7 @@ class Judge:
         Those for what was assumed, as of where to begin, come first.
         """
         averaged = "averaged along the true trajectories, since"
-        return self._diagnostics.notes() + [
+        return [*self._diagnostics.notes(), *self._of_targets] + [
             f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
             for what, bounds in self._bounds.items()
             if bounds.complaint

@@ -28,6 +28,8 @@ from tests.deployed.own_models import own_models
 from tests.pipeline.conftest import run_here
 from tests.replay.estimators.test_attitude import carried
 
+# two sensors that state different sigmas under one name
+ROBOT = {"duration_s": 10.0, "range": {"rate_hz": 2.0, "sigma_range_m": 0.5}}
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler here")
 
 
@@ -39,27 +41,31 @@ def recorded(tmp_path: Path, scenario: str, **parameters: Any) -> Path:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("scenario", "label", "by_all"),
+    ("scenario", "recording", "label", "by_all"),
     [
-        ("landmarks", "ekf", False),
-        ("landmarks", "iekf", False),
-        ("landmarks", "ukf", False),
-        ("landmarks", "sqrt:ukf", True),
-        ("batch-reactor", "ekf", False),
-        ("batch-reactor", "ukf", False),
+        ("landmarks", ROBOT, "ekf", False),
+        ("landmarks", ROBOT, "iekf", False),
+        ("landmarks", ROBOT, "ukf", False),
+        ("landmarks", ROBOT, "sqrt:ukf", True),
+        ("landmarks", {**ROBOT, "prior_sigma_rad": 3.0}, "ukf", False),
+        ("landmarks", {**ROBOT, "prior_sigma_rad": 3.0}, "sqrt:ukf", False),
+        ("batch-reactor", {}, "ekf", False),
+        ("batch-reactor", {}, "ukf", False),
     ],
 )
 @pytest.mark.paper
 def test_estimates_are_equal_to_the_last_bit(
-    tmp_path: Path, scenario: str, label: str, by_all: bool
+    tmp_path: Path, scenario: str, recording: dict[str, Any], label: str, by_all: bool
 ) -> None:
-    """By one compiler, or all of them with sanitizers; `make deployed` has every model by all."""
+    """By one compiler, or all of them with sanitizers; `make deployed` has every model by all.
+
+    Where the heading is hardly known, samples are narrowed alike, but for rounding.
+    """
     options: dict[str, Any] = {"model": "robot"} if scenario == "landmarks" else {}
-    # two sensors that state different sigmas under one name
-    robot = {"duration_s": 10.0, "range": {"rate_hz": 2.0, "sigma_range_m": 0.5}}
-    log = recorded(tmp_path, scenario, **(robot if scenario == "landmarks" else {}))
+    log, wide = recorded(tmp_path, scenario, **recording), recording.get("prior_sigma_rad", 0.0) > 1.0
     folder = fl.deploy(log, label, tmp_path / "filter_c", **options)
-    assert (furthest_of_all(folder) if by_all else furthest(compiled(folder))) == 0.0
+    away = furthest_of_all(folder) if by_all else furthest(compiled(folder))
+    assert away <= 1e-12 * wide
     if sys.platform == "win32":
         return
     library = compiled(folder, "-shared", "-fPIC")
@@ -72,7 +78,9 @@ def test_estimates_are_equal_to_the_last_bit(
         ours, theirs = (each.read([topic])[topic] for each in (own, foreign))
         for name in ("mean", "covariance", "innovation", "normalised_innovation_squared", "accepted"):
             if name in ours.columns:
-                np.testing.assert_array_equal(ours[name], theirs[name], err_msg=f"{topic} {name}")
+                np.testing.assert_allclose(
+                    ours[name], theirs[name], rtol=1e-12 * wide, err_msg=f"{topic} {name}"
+                )
 
 
 @pytest.mark.paper

@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 
 import fuselog as fl
 from pipeline.altering import alterations as alter
+from pipeline.altering import sources as altering
 from pipeline.diagnosing import diagnosis, study
 from pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from pipeline.diagnosing.consistency import of_each_component
@@ -51,13 +52,8 @@ def gains_of(source: fl.MemorySource, settings: dict[str, float]) -> dict[str, P
 
 def found_by(of: Hypothesis, gains: Gains, floor: float = 0.0) -> Peak:
     """The peak of a single search."""
-    search = peak(of, floor)
-    asked = next(search)
-    while True:
-        try:
-            asked = search.send(gains(asked))
-        except StopIteration as end:
-            return end.value
+    [found] = side_by_side([peak(of, floor)], lambda asked: gains([value for _, value in asked]))
+    return found
 
 
 def parabola(*tried: float, limit: float = np.inf) -> Hypothesis:
@@ -91,6 +87,43 @@ def test_a_peak_far_from_where_the_search_begins_has_its_interval() -> None:
     assert ends == pytest.approx((29.804, 30.196), abs=2e-3)
     assert found_by(parabola(-1.0, 1.0, limit=10.0), gain, 5.0).value == pytest.approx(10.0, abs=0.02)
     assert found_by(parabola(-1.0, 1.0), little, 5.0)[:2] == (0.0, 0.0)
+
+
+GAINS_WITHOUT_A_PEAK = {
+    "flat": lambda x: 0.0 * x,
+    "spike at the start": lambda x: 100.0 if x == 0.0 else -1e3,
+    "spike elsewhere": lambda x: 100.0 if x == 1.0 else -1e3,
+    "narrow": lambda x: 100.0 - abs(x - 1.0) / 1e-14,
+    "step": lambda x: 100.0 if x >= 0.5 else 0.0,
+    "rise": lambda x: x,
+    "never known": lambda x: np.nan * x,
+    "unknown beyond 1": lambda x: 50.0 * x if x <= 1.0 else np.nan,
+    "infinite": lambda x: np.inf if x > 0.5 else -np.inf,
+    "underflow": lambda x: 100.0 * np.exp(-((x / 1e-3) ** 2)),
+    "least number": lambda x: 100.0 if abs(x) < 5e-324 else 0.0,
+}
+
+
+@pytest.mark.parametrize("name", GAINS_WITHOUT_A_PEAK)
+def test_every_search_ends(name: str) -> None:
+    """A search asks for a bounded number of values whatever the gain is; an end is beyond its peak."""
+    asked_for = 0
+
+    def gain(values: Sequence[float]) -> list[float]:
+        nonlocal asked_for
+        asked_for += len(values)
+        assert asked_for < 1000
+        return [GAINS_WITHOUT_A_PEAK[name](value) for value in values]
+
+    def ends(at: Peak, scale: float) -> list[float]:
+        searches = [end(at, -scale), end(at, scale)]
+        return side_by_side(searches, lambda asked: gain([value for _, value in asked]))
+
+    found = found_by(parabola(-1.0, 1.0, 0.5, limit=1e3), gain, 5.0)
+    assert not np.isnan(found.gain)
+    for at, scale in ((found, 1.0), (Peak(0.0, 100.0), 1.0), (Peak(1.0, 100.0), 1e-3), (found, 5e-324)):
+        low, high = ends(at, scale)
+        assert low <= at.value <= high
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +209,21 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     assert (told.kind, told.topic) == ("clock drift", SEEN)
 
 
+def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
+    """No noise explains it: the likelihood of a noise that lets the filter follow is a spike."""
+    fix, seen = {"rate_hz": 5.0, "sigma_m": 0.3}, {"rate_hz": 0.0}
+    log = fl.record("landmarks", seed=3, duration_s=60.0, fix=fix, range_bearing=seen)
+    right = log.streams["/robot1/fix"]
+    since_s = 1e-9 * (right.publish_time_ns - right.publish_time_ns[0])
+    moved = right["position_m"] + np.outer((since_s > 25.0) & (since_s < 33.0), (6.0, -4.0))
+    glitch = replace(right, columns={**right.columns, "position_m": moved})
+    found = fl.diagnose(replace(log, streams={**log.streams, right.topic: glitch}), "ekf").sentences
+    assert [(each.kind, each.topic) for each in found] == [
+        ("outliers", "gate_probability"),
+        ("values", "/robot1/fix"),
+    ]
+
+
 def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
     """The second gains what it gains after the first is undone."""
     faulty = alter.altered(run, SEEN, alter.shifted("range_m"), 0.2)
@@ -183,6 +231,51 @@ def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
     assert {each.kind for each in found[:2]} == {"bias or turned frame", "measurement noise"}
     assert found[0].cause.gain > found[1].cause.gain
     assert len(found) == 2
+
+
+BESIDE_ITS_PLACE = {"/robot1/fix.origin": "1.0,-2.0"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "part", "right"),
+    [
+        ({"/robot1/fix.delay_s": -0.25}, {"fix_delay_s": 0.15}, {"fix_delay_s": 0.25}),
+        (
+            {"/robot1/odometry.turn_bias": 0.02},
+            {"turn_bias_radps": 0.008},
+            {"turn_bias_radps": 0.02},
+        ),
+        (
+            {"/robot1/range_bearing.range_scale": 1.25},
+            {"/robot1/range_bearing.range_scale": 0.9},
+            {"/robot1/range_bearing.range_scale": 0.8},
+        ),
+        (BESIDE_ITS_PLACE, {"/robot1/fix.origin": "0.5,0"}, {"/robot1/fix.origin": (-1.0, 2.0)}),
+    ],
+)
+def test_advice_is_the_total_to_set_where_part_of_it_is_set(
+    wrong: dict[str, Any], part: dict[str, Any], right: dict[str, Any]
+) -> None:
+    """The first advice gives the right value, and the likelihood rises with it, in place of the part."""
+    fix = {"rate_hz": 2.0, "sigma_m": 0.1}
+    log = fl.record("landmarks", seed=3, duration_s=30.0, speed_mps=2.0, fix=fix)
+    damaged = altering.alter(log, wrong)
+    streams = {topic: replace(damaged.streams[topic]) for topic in damaged.streams}
+    recording = replace(log, streams=streams)
+
+    def likelihood(settings: dict[str, Any]) -> float:
+        of_topics, own = altering.split_settings({**OPEN, **settings})
+        metrics = fl.replay(
+            altering.alter(recording, of_topics), {"ekf": {"kind": "ekf", **own}}
+        ).metrics
+        return float(metrics.set_index("quantity")["value"]["log_likelihood"])
+
+    setting = fl.diagnose(recording, "ekf", set=part).sentences[0].setting
+    key, _, value = setting.partition("=")
+    [(wanted_key, wanted)] = right.items()
+    assert key == wanted_key
+    assert np.array(value.split(","), float) == pytest.approx(np.atleast_1d(wanted), abs=0.04)
+    assert likelihood({**part, key: value if "," in value else float(value)}) > likelihood(part) + 5.0
 
 
 def test_causes_that_explain_nearly_as_much_are_said_to() -> None:

@@ -10,7 +10,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.experiment import load_experiment, run_experiment
 from pipeline.studies.toolkit.repetitions import mean_interval
 from pipeline.studies.tracking.tracking import figures_of, measure_changes
-from replay.judging.tracks.errors import TracksAt
+from replay.judging.tracks.errors import UNREFERENCED_M, TracksAt
 
 
 def test_figures_of_whole_tracks():
@@ -24,12 +24,16 @@ def test_figures_of_whole_tracks():
         number = [1] if instant < 5 else [] if instant == 5 else [2]
         place = [[0.5, 0.0]] * len(number)
         told.append(TracksAt(np.array([*number, 9]), np.array([*place, [0.0, 900.0]])))
-    figures = figures_of(told, truths)
+    figures = figures_of(told, truths, UNREFERENCED_M)
     assert (figures["tracks"], figures["track_length_s"]) == (2, pytest.approx((2.0 + 1.5) / 2))
     assert figures["trajectory_gospa_m"] == pytest.approx(np.sqrt((9 * 0.25 + 200 + 100) / 10))
     assert (figures["switches"], figures["breaks"]) == (1, 1)
     assert figures["target1_coverage"] == 0.9
     assert figures["unreferenced_targets"] == 1
+    every = figures_of(told, truths)
+    assert (every["tracks"], every["false_targets"]) == (3, 1)
+    assert every["trajectory_gospa_m"] == pytest.approx(np.sqrt((9 * 0.25 + 200 + 100) / 10 + 200))
+    assert every["idf1"] < figures["referenced_idf1"]
 
 
 def test_an_interval_of_a_mean():

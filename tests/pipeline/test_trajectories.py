@@ -33,6 +33,55 @@ def spiral(name: str, noise_m: float = 0.0) -> Trajectory:
     return Trajectory(name, noisy, rotation, np.rint(time_s * 1e9).astype(np.int64))
 
 
+def turned(truth: Trajectory, noise_m: float, seed: int) -> Trajectory:
+    """An estimate with white errors of its positions, in a frame of its own."""
+    own = Rotation.from_rotvec([0.3, -0.2, 1.1])
+    noise = np.random.default_rng(seed).normal(0.0, noise_m, truth.position_m.shape)
+    assert truth.rotation is not None
+    position_m, rotation = own.apply(truth.position_m + noise), own.as_matrix() @ truth.rotation
+    return replace(truth, name="estimate", position_m=position_m, rotation=rotation)
+
+
+@pytest.mark.parametrize("written", [[0.0, 0.0, 0.0], [0.4, -0.2, 0.8]])
+def test_a_truth_of_positions_has_no_rotation_errors(written: list[float]) -> None:
+    """Identity, or another orientation that never turns: RPE is that of the positions."""
+    truth = spiral("truth")
+    one = Rotation.from_rotvec(written).as_matrix()
+    placed = replace(truth, rotation=np.tile(one, (len(truth), 1, 1)))
+    done = fl.evaluate(turned(truth, 0.01, 0), truth=placed, align="se3", delta=2.0, delta_unit="m")
+    assert not [name for name in done.metrics if "rotation" in name]
+    assert done.metrics["rpe_translation_rmse_m"] == pytest.approx(0.01 * np.sqrt(6), rel=0.2)
+    assert "orientations never turn" in done.notes[0]
+    right = fl.evaluate(turned(truth, 0.01, 0), truth=truth, align="se3", delta=2.0, delta_unit="m")
+    assert "ape_rotation_rmse_deg" in right.metrics
+    assert not right.notes
+    along = replace(placed, position_m=np.outer(np.arange(len(truth)), [0.1, 0.0, 0.0]))
+    straight = fl.evaluate(along, truth=along)  # what drives straight on need not turn
+    assert straight.metrics["ape_rotation_max_deg"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_the_interval_of_an_alignment_is_that_of_its_rotation() -> None:
+    """A path that is straight but for 0.3 m: of 100 alignments the stated 95 % hold about so many."""
+    time_s = np.linspace(0.0, 20.0, 101)
+    place = np.stack([time_s, 0.3 * np.sin(time_s), 0.1 * np.cos(2.0 * time_s)], axis=1)
+    still = np.tile(np.eye(3), (101, 1, 1))
+    path = Trajectory("truth", place, still, np.rint(time_s * 1e9).astype(np.int64))
+    truth = replace(path, rotation=Rotation.from_euler("z", 0.1 * time_s[:, None]).as_matrix())
+    within, stated = 0, []
+    for seed in range(100):
+        done = fl.evaluate(turned(truth, 0.2, seed), truth=truth, align="se3")
+        [note] = done.notes
+        stated.append(float(note.partition("within ")[2].split()[0]))
+        away = done.compared.alignment.rotation @ Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix()
+        about_x = np.degrees(Rotation.from_matrix(away).as_rotvec()[0])
+        within += abs(about_x) < stated[-1]
+    assert 88 <= within <= 100
+    assert 5.0 < np.mean(stated) < 20.0
+    rests = replace(truth, position_m=1e-3 * np.random.default_rng(1).normal(size=place.shape))
+    [note] = fl.evaluate(turned(rests, 0.05, 0), truth=rests, align="se3").notes
+    assert "not at all" in note
+
+
 @pytest.mark.paper
 def test_two_files(fuselog: Fuselog) -> None:
     """The keys and numbers that programs read; the same from Python; figures, tables and a report."""

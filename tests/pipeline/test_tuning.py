@@ -20,7 +20,7 @@ import fuselog as fl
 from pipeline.output.results import read_result
 from pipeline.runs.executors import InlineExecutor
 from pipeline.tuning.objective import Best, Objective
-from pipeline.tuning.search import Cost, curvature
+from pipeline.tuning.search import Coordinates, Cost, Free, curvature, least
 from pipeline.tuning.tuning import ENOUGH
 from recorders.log import RunMetadata
 from recorders.recording import Recording
@@ -508,6 +508,36 @@ def test_processes_tune_as_the_command_says(world: Path, tmp_path: Path, fuselog
     tune = ("tune", world / "log.mcap", "-e", "ekf", "--free", "sigma_range_m", "--json", "--out")
     shared = fuselog(*tune, tmp_path / "shared", "--workers", "2").json
     assert shared["parameters"] == fuselog(*tune, tmp_path / "alone").json["parameters"]
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda x: 0.0 * x,
+        lambda x: np.where(x == 1.0, -100.0, 100.0),
+        lambda x: np.full_like(x, np.nan),
+        lambda x: np.full_like(x, np.inf),
+        lambda x: np.where(x > 2.0, np.nan, -x),
+        lambda x: np.where(x > 0.5, 0.0, 100.0),
+        lambda x: np.log(np.maximum(x, 1e-300)),
+        lambda x: np.exp(-x),
+    ],
+    ids=["flat", "spike", "nan", "infinite", "edge", "step", "without an end", "underflow"],
+)
+@pytest.mark.parametrize("is_smooth", [True, False])
+def test_a_search_ends_whatever_the_cost_is(cost: Callable[[Any], Any], is_smooth: bool) -> None:
+    """A search stops within a bounded number of values and stays within its bounds."""
+    asked_for = 0
+
+    def counted(values: Any) -> Any:
+        nonlocal asked_for
+        asked_for += len(values)
+        assert asked_for < 10_000
+        return cost(values[:, 0])
+
+    coordinates = Coordinates([Free("sigma_m", 1.0, 0.0, np.inf, is_positive=True)], np.ones(1))
+    found, _ = least(counted, coordinates, np.zeros(1), is_smooth=is_smooth)
+    assert not np.isnan(found).any()
 
 
 @pytest.mark.paper

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fuselog as fl
 from pipeline.diagnosing.battery import battery
 from pipeline.diagnosing.battery.car import (
     FAULTS,
@@ -78,6 +79,27 @@ def test_a_winding_road_at_a_steady_speed_says_nothing() -> None:
     for seed in (0, 1, 4, 7, 18, 24):
         odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
         assert not findings({each.topic: each for each in (odometry, fix)})
+
+
+@pytest.mark.parametrize(
+    ("seed", "off_m"), [(3, (3.0, -2.0)), (3, (6.0, -4.0)), (4, (6.0, -4.0)), (5, (3.0, -2.0))]
+)
+def test_a_receiver_that_jumps_is_named_and_not_the_wheels(
+    seed: int, off_m: tuple[float, float]
+) -> None:
+    """For eight seconds fixes are metres off, on a robot that drives 0.6 m/s with right wheels."""
+    fix, log = {"rate_hz": 5.0, "sigma_m": 0.3}, {"seed": seed, "duration_s": 60.0}
+    streams = dict(fl.record("landmarks", **log, fix=fix, range_bearing={"rate_hz": 0.0}).streams)
+    right = streams["/robot1/fix"]
+    since_s = 1e-9 * (right.publish_time_ns - right.publish_time_ns[0])
+    moved = right["position_m"] + np.outer((since_s > 25.0) & (since_s < 33.0), off_m)
+    streams[right.topic] = replace(right, columns={**right.columns, "position_m": moved})
+    assert {(each.cause, each.topic) for each in findings(streams)} <= {("place", right.topic)}
+    assert not findings({**streams, right.topic: right})
+    if np.hypot(*off_m) > 5.0:
+        [found] = findings(streams)
+        assert found.value == pytest.approx(np.hypot(*off_m), abs=1.5)
+        assert "at 25.2 s" in found.words or "at 33.0 s" in found.words
 
 
 @pytest.mark.parametrize("name", SHEET)

@@ -4,12 +4,16 @@ Names as in `algebra`; SAMPLES, DRAWN, VALUES and PLACES are how many samples, n
 components and components of a function's values there are at most.
 """
 
+import re
 from collections.abc import Collection
 from typing import Any
+
+import numpy as np
 
 from pipeline.deploying.c_source.names import CFilter, filled
 from pipeline.deploying.c_source.statements import Inputs, body, entries
 from replay.inference.kalman.regression import MEANS
+from replay.inference.kalman.wide_angles import QUARTER_RAD, UNIFORM_RAD, WIDE_RAD
 from replay.inference.linear_algebra.manifold import SETTLED
 from replay.inference.sampled_steps import SETTLING, SampledFunction
 from replay.tracing.c_text import c_lines, truth_text
@@ -46,6 +50,79 @@ static void find_shift(drawn_samples *samples, int count, const REAL *weights, i
             entry += weights[k] * samples->values[k][i];
         samples->shift[i] = entry;
     }
+}
+"""
+
+NARROWING = """\
+/* The variances of so many tangent components, summed. */
+static REAL squared_length(const drawn_samples *samples, int first, int width)
+{
+    REAL squared = 0.0_S;
+    for (int row = first; row < first + width; row++)
+        for (int k = 0; k <= row; k++)
+            squared += samples->factor[row][k] * samples->factor[row][k];
+    return squared;
+}
+
+/* The share of the factor at which samples are taken, so that no angle comes round: 1 unless one is
+ * hardly known. A motion (`bounded`) samples no angle wider than uniform. */
+static REAL narrow(drawn_samples *samples, int count, int size, const REAL *points, REAL unsuspected,
+                   int bounded)
+{
+    static const int first[TURNS] = {FIRST}, width[TURNS] = {WIDTH};
+    static const REAL times[TURNS] = {TIMES};
+    REAL widest = 0.0_S, reach = 0.0_S;
+    int suspected = 0;
+    for (int turn = 0; turn < TURNS; turn++)
+        if (times[turn] * times[turn] * squared_length(samples, first[turn], width[turn]) >
+            unsuspected * unsuspected)
+            suspected = 1;
+    if (!suspected)
+        return 1.0_S;
+    for (int turn = 0; turn < TURNS; turn++) {
+        REAL most = 0.0_S;
+        for (int row = first[turn]; row < first[turn] + width[turn]; row++) {
+            REAL wide = times[turn] * sqrt_S(squared_length(samples, row, 1));
+            if (bounded && wide > UNIFORM_RAD) {
+                for (int k = 0; k <= row; k++)
+                    samples->factor[row][k] *= UNIFORM_RAD / wide;
+                wide = UNIFORM_RAD;
+            }
+            widest = wide > widest ? wide : widest;
+        }
+        for (int index = 0; index < count; index++) {
+            REAL squared = 0.0_S;
+            for (int row = first[turn]; row < first[turn] + width[turn]; row++) {
+                REAL away = 0.0_S;
+                for (int k = 0; k <= row; k++)
+                    away += samples->factor[row][k] * points[index * size + k];
+                squared += away * away;
+            }
+            most = squared > most ? squared : most;
+        }
+        most = times[turn] * sqrt_S(most);
+        reach = most > reach ? most : reach;
+    }
+    if (reach <= QUARTER_RAD || (widest <= WIDE_RAD && reach <= HALF_RAD))
+        return 1.0_S;
+    const REAL share = QUARTER_RAD / reach;
+    for (int row = 0; row < size; row++)
+        for (int k = 0; k <= row; k++)
+            samples->factor[row][k] *= share;
+    return share;
+}
+
+/* Offsets and values of narrowed samples, as wide as they are meant. */
+static void widen(drawn_samples *samples, int count, int drawn, int size, REAL share)
+{
+    for (int index = 0; index < count; index++) {
+        for (int row = 0; row < drawn; row++)
+            samples->offsets[index][row] /= share;
+        for (int i = 0; i < size; i++)
+            samples->values[index][i] /= share;
+    }
+    for (int i = 0; i < size; i++)
+        samples->shift[i] /= share;
 }
 """
 
@@ -101,6 +178,7 @@ def samples_text(made: CFilter) -> list[str]:
         f"enum {{ {listed} }};\n",
         *tables.values(),
         filled(made, TYPE),
+        *_narrowing(made, functions[0]),
         *(
             text
             for number, each in enumerate(made.steps.sampled)
@@ -108,6 +186,26 @@ def samples_text(made: CFilter) -> list[str]:
             for text in (*_settling(made, number), _sampling(made, number)[0])
         ),
     ]
+
+
+def _narrowing(made: CFilter, sampled: SampledFunction) -> list[str]:
+    """Write the functions that keep samples within half a turn; none without angles in the state."""
+    if not sampled.turns:
+        return []
+    first, width, times = zip(*sampled.turns, strict=True)
+    number = made.precision.number
+    words = {
+        "TURNS": str(len(first)),
+        "FIRST": ", ".join(map(str, first)),
+        "WIDTH": ", ".join(map(str, width)),
+        "TIMES": ", ".join(map(number, times)),
+        "UNIFORM_RAD": number(UNIFORM_RAD),
+        "QUARTER_RAD": number(QUARTER_RAD),
+        "WIDE_RAD": number(WIDE_RAD),
+        "HALF_RAD": number(np.pi),
+    }
+    text = re.sub(r"\b(" + "|".join(words) + r")\b", lambda found: words[found[0]], NARROWING)
+    return [filled(made, text)]
 
 
 def _table(made: CFilter, sampled: SampledFunction) -> str:
@@ -163,6 +261,8 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
     own = {"away": "samples->offsets[index]", "centre": "samples->centre"}
     used = [each for each in own if any(text.startswith(f"{each}[") for text in names.values())]
     first = size - len(variances)
+    drawn = f"samples, {count}, {size}"
+    narrow = f"narrow({drawn}, &points_{size}[0][0], {made.precision.number(sampled.unsuspected)}, "
     lines = [
         *declared,
         *c_lines(variances, names, made.precision, "u"),
@@ -170,6 +270,7 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
             f"samples->factor[{first + k}][{first + k}] = sqrt_S({each});"
             for k, each in enumerate(variances)
         ),
+        *([f"const REAL share = {narrow}{int(number == 0)});"] if sampled.turns else []),
         *c_lines(at_mean, names, made.precision),
         *before,
         f"for (int index = 0; index < {count}; index++) {{",
@@ -184,6 +285,8 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
         lines.append(f"find_shift(samples, {weighed(sampled)}, {sampled.size});")
         lines.append(f"for (int i = 0; i < {sampled.size}; i++)")
         lines.append("    samples->centre[i] += samples->shift[i];")
+    if sampled.turns:
+        lines += ["if (share < 1)", f"    widen({drawn}, {sampled.size}, share);"]
     given = {
         "filter->": ("const NAME *filter", "filter"),
         "duration_s": ("REAL duration_s", "duration_s"),

@@ -9,7 +9,14 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import AXES, bare, entry_of
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind, in_sense, in_topic, supposed
+from pipeline.diagnosing.hypotheses.hypothesis import (
+    Hypothesis,
+    Kind,
+    in_sense,
+    in_topic,
+    supposed,
+    value_of,
+)
 from recorders.importers.units import unit_of
 from recorders.log import Stream
 from recorders.parameters import Parameters
@@ -118,7 +125,7 @@ def of_components(
         return
     span_s = 1e-9 * float(np.ptp(stream.publish_time_ns)) or 1.0
     for each in entries:
-        own = _Own.of(stream.topic, each, reading, parameters)
+        own = _Own.of(stream, each, reading, parameters)
         if each.is_heading:
             yield from _of_heading(stream.topic, first_ns, span_s)
             continue
@@ -156,14 +163,14 @@ class _Own(NamedTuple):
 
     @staticmethod
     def of(
-        topic: str, entry: Entry, reading: Reading | None, parameters: Parameters | None
+        stream: Stream, entry: Entry, reading: Reading | None, parameters: Parameters | None
     ) -> "_Own | None":
         if reading is None or entry.number is None:
             return None
-        key = topic, entry.number
+        key = stream.topic, entry.number
         bias, factor = reading.biases.get(key, ""), reading.factors.get(key, "")
-        value = float(getattr(parameters, bias) or 0.0) if bias else 0.0
-        return _Own(bias, -1.0 if topic in reading.controls else 1.0, value, factor)
+        sign = -1.0 if stream.topic in reading.controls else 1.0
+        return _Own(bias, sign, value_of(parameters, bias, stream), factor)
 
 
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number
 from pipeline.diagnosing.likelihood import Likelihood, Trial
+from recorders.log import Stream
 from recorders.parameters import Parameters
 from replay.distributions import chi2
 
@@ -136,6 +137,14 @@ def in_topic(
 def has(parameters: Parameters | None, name: str) -> bool:
     """Tell whether there is a parameter of this name."""
     return parameters is not None and name in type(parameters).model_fields
+
+
+def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
+    """Return a parameter that a topic is read with: as given, or stated by the channel, or zero."""
+    if not has(parameters, name):
+        return 0.0
+    value = getattr(parameters, name)
+    return float(stream.metadata.get(name, 0.0) if value is None else value)
 
 
 def times(at: float, low: float, high: float) -> str:

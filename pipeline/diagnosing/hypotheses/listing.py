@@ -52,7 +52,8 @@ def hypotheses(
         if len(streamed) > 1:
             controls = reading.controls if reading else ()
             lags_s = lag_of(stream, [source.streams[each] for each in controls if each != topic])
-            found += of_stamps(stream, reading, first_ns, hold_of(source.streams, controls), lags_s)
+            hold_s = hold_of(source.streams, controls)
+            found += of_stamps(stream, reading, parameters, first_ns, hold_s, lags_s)
     for topic in dict.fromkeys(stated):
         found += of_start(source.streams[topic])
     return [*found, *of_numbers(bound, source, innovations)]

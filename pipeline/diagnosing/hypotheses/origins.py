@@ -39,7 +39,8 @@ def _of_positions(stream: Stream) -> Hypothesis:
         )
 
     def mend(at: Metres) -> Advice:
-        return Advice(f"{stream.topic}.origin", ",".join(f"{precise(-each)}" for each in at))
+        place = ",".join(f"{precise(-each)}" for each in at)
+        return Advice(f"{stream.topic}.origin", place, is_moved=True)
 
     return _origin(stream, "x_m, y_m", without, words, mend)
 

@@ -2,6 +2,7 @@
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -30,6 +31,7 @@ from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
 
 GATE = 0.999
+REOPENS_S, NEVER_S = 1.0, 1e9
 LARGEST_SCALE = 12.0  # a logarithm
 # By unit the step from which a parameter is searched; without one a share.
 STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0.1, "": 0.02}
@@ -199,19 +201,22 @@ def _parameters(
 
 
 def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
-    """Suppose that some measurements are of something else; a gate keeps these out."""
+    """Suppose that some measurements are of something else; a gate keeps these out.
+
+    The number is after how many seconds the gate opens again: `REOPENS_S` for single outliers, and
+    `NEVER_S` for a stretch of them, of which another one would be accepted each second.
+    """
     if not has(parameters, "gate_probability"):
         return
+    reopens = has(parameters, "gate_reopens_s")
 
-    def without(trial: Trial, _: float) -> Trial:
-        settings = {**trial.settings, "gate_probability": GATE, **_reopens(parameters)}
-        return trial._replace(settings=settings)
+    def without(trial: Trial, reopens_s: float) -> Trial:
+        settings = {**trial.settings, "gate_probability": GATE}
+        return trial._replace(settings=settings | ({"gate_reopens_s": reopens_s} if reopens else {}))
 
-    is_closed = (getattr(parameters, "gate_probability", None) or 1.0) <= GATE
-    words = "some measurements are outliers: of something else, or false"
-    advice = None if is_closed else Advice("gate_probability", GATE)
-    yield supposed("outliers", "gate_probability", "", without, words, advice)
+    def words(reopens_s: float, *_: float) -> str:
+        which = "some measurements" if reopens_s == REOPENS_S else "the measurements of whole stretches"
+        return f"{which} are outliers: of something else, or false"
 
-
-def _reopens(parameters: Parameters | None) -> dict[str, Any]:
-    return {"gate_reopens_s": 1.0} if has(parameters, "gate_reopens_s") else {}
+    found = supposed("outliers", "gate_probability", "", without, "", Advice("gate_probability", GATE))
+    yield replace(found, words=words, specials=(REOPENS_S, NEVER_S) if reopens else (REOPENS_S,))

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic, value_of
 from recorders.log import Stream
+from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import Reading
 
 Floats = NDArray[np.float64]
@@ -22,19 +23,26 @@ MOST_CELLS = 1_000_000  # of lags and speeds that are held at once
 
 
 def of_stamps(
-    stream: Stream, reading: Reading | None, first_ns: int, hold_s: float, lags_s: tuple[float, ...]
+    stream: Stream,
+    reading: Reading | None,
+    parameters: Parameters | None,
+    first_ns: int,
+    hold_s: float,
+    lags_s: tuple[float, ...],
 ) -> Iterator[Hypothesis]:
     """Yield a topic's delay and its clock.
 
     Args:
         stream: the topic's messages.
         reading: of what is estimated.
+        parameters: the estimator's, one of which may be this delay.
         first_ns: where the run begins.
         hold_s: half of how long a control holds: a smaller delay is how it is held, and no fault.
         lags_s: what else may be its delay.
     """
     topic = stream.topic
     own = reading.delays.get(topic, "") if reading else ""
+    set_s = value_of(parameters, own, stream)
 
     def late(at: float, low: float, high: float) -> str:
         about = f", {SPECIAL_S[at]}" if at in SPECIAL_S else ""
@@ -47,7 +55,7 @@ def of_stamps(
         return f"{topic}: comes {size} late ({least} to {most}) by its stamps{about}"
 
     def mend_late(at: float) -> Advice:
-        return Advice(own or f"{topic}.delay_s", precise(at))
+        return Advice(own, precise(set_s + at)) if own else Advice(f"{topic}.delay_s", precise(at))
 
     def gaining(at: float, low: float, high: float) -> str:
         does, at, low, high = in_sense(at, low, high, ("gains", "loses"))

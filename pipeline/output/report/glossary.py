@@ -86,8 +86,8 @@ def glossary(keys: set[str], *, draws: bool) -> list[Term]:
         "tie": draws,
         "likelihood": "log_likelihood" in keys,
         "gospa": any("gospa" in key for key in keys),
-        "hota": "hota" in keys,
-        "idf1": "idf1" in keys,
+        "hota": any("hota" in key for key in keys),
+        "idf1": any("idf1" in key for key in keys),
         "gate": "gated_share" in keys,
     }
     return [term for name, term in _TERMS.items() if needed[name]]

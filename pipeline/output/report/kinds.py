@@ -341,4 +341,13 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
     return Chart(title=title, panels=panels, legend=False)
 
 
-FOREST = ("nees", "position_nees", "nis_per_component", "nees_steps_within_95", "hota", "idf1")
+FOREST = (
+    "nees",
+    "position_nees",
+    "nis_per_component",
+    "nees_steps_within_95",
+    "hota",
+    "idf1",
+    "referenced_hota",
+    "referenced_idf1",
+)

@@ -16,13 +16,15 @@ from recorders.log import Stream
 from replay.engine.arrays import Floats
 from replay.engine.streams.blocks import Ragged
 from replay.judging.errors.evaluation import Innovations
-from replay.judging.tracks.distances import hota, idf1, trajectory_gospa
+from replay.judging.tracks.distances import trajectory_gospa
 from replay.judging.tracks.errors import (
     CUTOFF_M,
     PERIOD_S,
     Judged,
     TracksAt,
     as_trajectories,
+    figures_of_whole_tracks,
+    near_tracks,
     track_errors,
     track_figures,
     tracks_at,
@@ -51,31 +53,33 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
     return sizes, tracks
 
 
-def figures_of(tracked: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
+def figures_of(
+    tracked: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
+) -> dict[str, float]:
     """Compute what the tracks of a run are worth.
 
-    Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
-    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root of
-    the number of instants, so that it is as large as GOSPA.
+    If truths cover some targets, figures of whole tracks leave out those that are never within the
+    cutoff of a target. A track's length is the time from its first to its last instant, and trajectory
+    GOSPA is divided by the root of the number of instants, so that it is as large as GOSPA.
 
     Args:
         tracked: the tracks at k instants.
         truths: (targets, k, 2), where the targets are at these, in m; NaN where one is not there.
+        unreferenced_m: see `Judged`.
 
     Returns:
         The figures by name.
     """
-    tracks = as_trajectories(tracked)
-    away = np.linalg.norm(tracks[:, None] - truths[None], axis=3)
-    near = tracks[np.nanmin(away, axis=(1, 2), initial=np.inf) < CUTOFF_M]
-    lengths_s = [np.ptp(np.flatnonzero(there)) * PERIOD_S for there in np.isfinite(near[..., 0])]
-    whole = trajectory_gospa(near, truths, CUTOFF_M, SWITCH_PENALTY_M)
-    return track_figures(track_errors(tracked, truths)) | {
-        "tracks": float(len(near)),
+    is_partial = np.isfinite(unreferenced_m)
+    tracks = near_tracks(tracked, truths)[0] if is_partial else as_trajectories(tracked)
+    lengths_s = [np.ptp(np.flatnonzero(there)) * PERIOD_S for there in np.isfinite(tracks[..., 0])]
+    whole = trajectory_gospa(tracks, truths, CUTOFF_M, SWITCH_PENALTY_M)
+    errors = track_errors(tracked, truths, unreferenced_m=unreferenced_m)
+    return track_figures(errors) | {
+        "tracks": float(len(tracks)),
         "track_length_s": float(np.mean(lengths_s)) if lengths_s else float("nan"),
         "trajectory_gospa_m": whole.total / np.sqrt(truths.shape[1]),
-        "hota": float(hota(near, truths, CUTOFF_M).hota.mean()),
-        "idf1": idf1(near, truths, CUTOFF_M),
+        **figures_of_whole_tracks(tracked, truths, unreferenced_m),
     }
 
 
@@ -90,7 +94,7 @@ def table_of(
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
             tracked = tracks_at(*sets_of(outputs, label, run), at.time_ns, round(delay_s * 1e9))
-            rows.append({"estimator": label, "run": name, **figures_of(tracked, at.truths)})
+            rows.append({"estimator": label, "run": name, **figures_of(tracked, *at[1:])})
     return pd.DataFrame(rows)
 
 

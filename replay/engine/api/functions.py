@@ -182,6 +182,10 @@ def recursive(
 
         def begin(given: dict[str, Ragged]) -> _Carried | None:
             maps = {each: given[topic.name] for each, topic in bound.static.items()}
+            stated = {topic.name for topic in bound.static.values()}
+            maps |= {
+                each: rows for each, rows in given.items() if each not in stated
+            }  # found at the start
             return started(maps, next(iter(maps.values())).runs) if maps else None
 
         def begun(carried: _Carried | None, block: Block) -> _Carried:

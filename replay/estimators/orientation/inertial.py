@@ -43,7 +43,7 @@ class InertialModel(NamedTuple):
     """Holds what the filter takes for granted, the same for all logs.
 
     Attributes:
-        rest_s: how long the body rests at the start.
+        rest_s: how long the body rests at the start, at most.
         block_s: how much time is averaged into one attitude.
         attitude_sigma_rad: standard deviation of a block's attitude about each axis.
         drift_sigma_rad: standard deviation of one second's dead reckoning about each axis.
@@ -88,6 +88,7 @@ class InertialState(NamedTuple):
         increment: the rotation since, (runs, 4).
         force: sum over the block, carried to the last sample, (runs, 3).
         field: the same of the magnetometer, (runs, 3).
+        rest_s: how long the body rests, if that is less than the model says, (runs,).
     """
 
     time_ns: Integers
@@ -99,6 +100,7 @@ class InertialState(NamedTuple):
     increment: Floats
     force: Floats
     field: Floats
+    rest_s: Floats
 
 
 class OrientationEstimates(NamedTuple):
@@ -119,24 +121,30 @@ class ReckoningState(NamedTuple):
         time_ns: of the first sample and the last one, (runs, 2); -1 for none yet.
         sums: of gyro, accelerometer and magnetometer over the rest, (runs, 3, 3).
         rest_samples: how many samples they have (runs,).
+        rest_s: how long the body rests, if that is less than the model says, (runs,).
     """
 
     orientation: Floats
     time_ns: Integers
     sums: Floats
     rest_samples: Integers
+    rest_s: Floats
 
 
-def start_reckoning(runs: int) -> ReckoningState:
-    """Return the state before the first sample: nothing known."""
+def start_reckoning(runs: int, rest_s: Floats | None = None) -> ReckoningState:
+    """Return the state before the first sample; rests (runs,) that are known end before the model's."""
     none_yet = np.full((runs, 2), -1)
     return ReckoningState(
-        np.zeros((runs, 4)), none_yet, np.zeros((runs, 3, 3)), np.zeros(runs, np.int64)
+        np.zeros((runs, 4)),
+        none_yet,
+        np.zeros((runs, 3, 3)),
+        np.zeros(runs, np.int64),
+        np.full(runs, np.inf) if rest_s is None else rest_s,
     )
 
 
-def start_inertial_filter(runs: int) -> InertialState:
-    """Return the state before the first sample: nothing known."""
+def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialState:
+    """Return the state before the first sample; rests (runs,) that are known end before the model's."""
     return InertialState(
         np.full((runs, 3), -1),
         np.zeros((runs, 3)),
@@ -147,6 +155,7 @@ def start_inertial_filter(runs: int) -> InertialState:
         np.tile(np.eye(4)[0], (runs, 1)),
         np.zeros((runs, 3)),
         np.zeros((runs, 3)),
+        np.full(runs, np.inf) if rest_s is None else rest_s,
     )
 
 
@@ -261,7 +270,8 @@ def _reckon(
     times[1] = time_ns
     if duration_s > model.gap_s:
         orientation[:] = np.nan
-    if elapsed_s < model.rest_s:
+    rest_s = min(model.rest_s, state.rest_s[run])
+    if elapsed_s < rest_s:
         for i in range(3):
             sums[0, i] += rate[i]
             sums[1, i] += force[i]
@@ -278,7 +288,7 @@ def _reckon(
         turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
     compose(orientation.copy(), turn_quaternion(turn[0], turn[1], turn[2]), orientation)
     estimates.orientation[row] = orientation
-    variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
+    variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - rest_s)
     for i in range(3):
         for j in range(3):
             estimates.covariance[row, i, j] = variance if i == j else 0.0
@@ -320,7 +330,7 @@ def _accumulate(
         state.concentrations[run] = 0.0
         _start_block(state, run, time_ns)
     times[1] = time_ns
-    if (time_ns - times[0]) * _NS < model.rest_s:
+    if (time_ns - times[0]) * _NS < min(model.rest_s, state.rest_s[run]):
         for i in range(3):
             state.rate_sum[run, i] += rate[i]
         state.rest_samples[run] += 1

@@ -26,6 +26,7 @@ from replay.estimators.orientation.inertial import (
     start_inertial_filter,
     start_reckoning,
 )
+from replay.estimators.orientation.resting import LONGEST_S, finding_rest, rests_of
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
@@ -38,14 +39,14 @@ class InertialParameters(Parameters):
     """States noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
-        rest_s: the body rests for so long first.
+        rest_s: the body rests for so long first; without it that is found, up to 20 s.
         block_s: an attitude of accelerometer and magnetometer is averaged over so long.
         attitude_sigma_deg: standard deviation of such an attitude.
         drift_sigma_deg: random walk of the gyro's orientation, in deg/sqrt(s).
         gap_s: a longer silence is a gap.
     """
 
-    rest_s: NonNegativeFloat = 20.0
+    rest_s: NonNegativeFloat | None = None
     block_s: PositiveFloat = 1.0
     attitude_sigma_deg: Annotated[float, Field(gt=0, le=90)] = 10.0
     drift_sigma_deg: Annotated[float, Field(gt=0, le=90)] = 0.4
@@ -55,7 +56,7 @@ class InertialParameters(Parameters):
     def model(self) -> InertialModel:
         """Return the same in radians."""
         return InertialModel(
-            rest_s=self.rest_s,
+            rest_s=LONGEST_S if self.rest_s is None else self.rest_s,
             block_s=self.block_s,
             attitude_sigma_rad=math.radians(self.attitude_sigma_deg),
             drift_sigma_rad=math.radians(self.drift_sigma_deg),
@@ -110,12 +111,14 @@ def of_inertial_samples(
 
 
 def _start_bingham(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
-    return (given.parameters.model, run_inertial_filter), start_inertial_filter(given.runs)
+    return (given.parameters.model, run_inertial_filter), start_inertial_filter(
+        given.runs, rests_of(given, given.runs)
+    )
 
 
 def _start_gyro(given: Given[GyroParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
     advance = partial(run_dead_reckoning, unbiased=given.parameters.unbiased)
-    return (given.parameters.model, advance), start_reckoning(given.runs)
+    return (given.parameters.model, advance), start_reckoning(given.runs, rests_of(given, given.runs))
 
 
 def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
@@ -127,17 +130,21 @@ def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel,
     return (given.parameters.model, advance), start_reckoning(given.runs)
 
 
-BINGHAM_INERTIAL = of_inertial_samples(
-    "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
-    InertialParameters,
-    _start_bingham,
-    follow_all=_follow_all,
+BINGHAM_INERTIAL = finding_rest(
+    of_inertial_samples(
+        "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
+        InertialParameters,
+        _start_bingham,
+        follow_all=_follow_all,
+    )
 )
-GYRO = of_inertial_samples(
-    "the gyro alone, from the attitude of the rest at the start on",
-    GyroParameters,
-    _start_gyro,
-    follow_all=_follow_all,
+GYRO = finding_rest(
+    of_inertial_samples(
+        "the gyro alone, from the attitude of the rest at the start on",
+        GyroParameters,
+        _start_gyro,
+        follow_all=_follow_all,
+    )
 )
 TRIAD = of_inertial_samples(
     "the TRIAD attitude of every sample's accelerometer and magnetometer",

@@ -2,7 +2,8 @@
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
 (24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
-vectors, and means are intrinsic: the weighted differences from them sum to zero.
+vectors, and means are intrinsic: the weighted differences from them sum to zero. Where an angle is
+hardly known, samples are taken nearer to the mean: see `replay.inference.kalman.wide_angles`.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from replay.engine.arrays import Floats, Function, varying
 from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
 from replay.inference.kalman.steps import Interval, Measurement, Workspace
 from replay.inference.kalman.update import message_layout, residual_of, sensor_noise
+from replay.inference.kalman.wide_angles import narrowing, turning, unsuspected_rad, widen
 from replay.inference.linear_algebra.gaussian import cholesky
 from replay.inference.linear_algebra.manifold import (
     boxminus,
@@ -38,6 +40,7 @@ class SampleMemory(NamedTuple):
 
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
+        unsuspected: the standard deviation up to which angles are no matter, see `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) the samples' tangent vectors from the mean.
         point, noise: (n,), one sample, and (noises,), the variances.
@@ -49,6 +52,7 @@ class SampleMemory(NamedTuple):
     weights: Floats
     first: int
     stride: int
+    unsuspected: float
     factor: Floats
     offsets: Floats
     point: Floats
@@ -73,6 +77,7 @@ def sample_memory(
     values = tangent_size(outputs)
     return SampleMemory(
         *sets,
+        unsuspected=unsuspected_rad(sets.points),
         factor=np.zeros((dimension, dimension)),
         offsets=np.empty((count, dimension)),
         point=np.empty(len(kinds)),
@@ -84,7 +89,12 @@ def sample_memory(
 
 
 def sampling(
-    function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
+    function: Function,
+    kinds: tuple[str, ...],
+    noises: int,
+    outputs: tuple[str, ...],
+    *,
+    is_motion: bool = False,
 ) -> Function:
     """Make the evaluation of `function(state, noise, arguments)` at weighted samples.
 
@@ -101,6 +111,7 @@ def sampling(
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset = lower_of(size), offset_of(size)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
+    turns, narrow = bool(turning(kinds)), narrowing(kinds, size, bounded=is_motion)
 
     def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
         """Fill the offsets of all samples, and the function's values as differences from the centre."""
@@ -131,15 +142,23 @@ def sampling(
         fill_noise(memory.noise, variances)
         for k in range(noises):
             memory.factor[t + k, t + k] = np.sqrt(memory.noise[k])
+        share = narrow(memory.factor, memory.points[chosen], memory.unsuspected) if turns else 1.0
         evaluate(mean, memory.points[chosen], arguments, memory)
         settle(memory.weights[chosen], memory.values, memory.centre, memory.shift)
+        if share < 1.0:
+            widen(share, memory)
         return memory.weights[chosen]
 
     return sample
 
 
 def regression(
-    function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
+    function: Function,
+    kinds: tuple[str, ...],
+    noises: int,
+    outputs: tuple[str, ...],
+    *,
+    is_motion: bool = False,
 ) -> Function:
     """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
 
@@ -148,7 +167,8 @@ def regression(
     False where the state's covariance is not positive definite. `spread` may be that covariance itself.
     """
     t, v = tangent_size(kinds), tangent_size(outputs)
-    sample, moments = sampling(function, kinds, noises, outputs), moments_of(t, v)
+    sample = sampling(function, kinds, noises, outputs, is_motion=is_motion)
+    moments = moments_of(t, v)
 
     def regress(
         mean: Floats,
@@ -209,7 +229,8 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     """
     model, motion = stage.model, stage.motion
     entering = motion.noise if motion.noises else None
-    regress = regression(moved_with_noise(motion), model.kinds, motion.noises, model.kinds)
+    moved = moved_with_noise(motion)
+    regress = regression(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
     variances_of = entering or no_variances
     add_noise = nothing if entering else motion_noise(model, motion)
     linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing

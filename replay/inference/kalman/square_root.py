@@ -150,7 +150,8 @@ def _sampled_motion(stage: Stage, samples: int) -> Function:
     def variances_of(state: Any, given: Any) -> Any:
         return variances(state, given[1], given[2])
 
-    sample = sampling(moved_with_noise(motion), model.kinds, motion.noises, model.kinds)
+    moved = moved_with_noise(motion)
+    sample = sampling(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
     spread_samples = _sampled(sample, variances_of, "state", model.size, samples)
 
     def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:

@@ -157,7 +157,12 @@ def _assignments(n: int, m: int) -> Floats:
 
 
 def hota(
-    estimates: ArrayLike, truths: ArrayLike, cutoff: float, thresholds: ArrayLike = THRESHOLDS
+    estimates: ArrayLike,
+    truths: ArrayLike,
+    cutoff: float,
+    thresholds: ArrayLike = THRESHOLDS,
+    *,
+    others: int = 0,
 ) -> Hota:
     """Compute HOTA of tracks and trajectories, at every threshold.
 
@@ -171,6 +176,7 @@ def hota(
         truths: (m, steps, axes), NaN where a target is not there.
         cutoff: points as far apart are not similar, in their unit.
         thresholds: of the similarity, 0 to 1.
+        others: how many points further tracks have, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
@@ -184,16 +190,17 @@ def hota(
     matches = np.zeros((len(levels), *shared.shape))
     for step in similarity:
         pair = linear_sum_assignment(alignment * step, maximize=True)
-        matches[:, *pair] += step[pair] >= np.maximum(levels[:, None], np.finfo(float).tiny)
+        least = np.maximum(levels[:, None] - np.finfo(float).eps, np.finfo(float).tiny)
+        matches[:, *pair] += step[pair] >= least
     true_positive = matches.sum(axis=(1, 2))
-    either_count = in_track.sum() + in_target.sum() - true_positive
+    either_count = in_track.sum() + others + in_target.sum() - true_positive
     detection = true_positive / np.maximum(either_count, 1)
     jaccard = matches / np.maximum(in_track[:, None] + in_target - matches, 1)
     association = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(true_positive, 1)
     return Hota(np.sqrt(detection * association), detection, association)
 
 
-def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float) -> float:
+def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float, *, others: int = 0) -> float:
     """Compute IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
 
     IDTP is how many points of the trajectories are nearer than the cutoff to the one track that each is
@@ -203,12 +210,13 @@ def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float) -> float:
         estimates: (n, steps, axes), NaN where a track is not there.
         truths: (m, steps, axes), NaN where a target is not there.
         cutoff: no pair is farther apart, in the unit of the points.
+        others: how many points further tracks have, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
     first, second = _tracks(estimates, truths)
     together = (_distances(first, second) < cutoff).sum(axis=0)
-    points = int(_present(first).sum() + _present(second).sum())
+    points = int(_present(first).sum() + _present(second).sum()) + others
     found = together[linear_sum_assignment(together, maximize=True)].sum()
     return 2.0 * float(found) / points if points else float("nan")
 

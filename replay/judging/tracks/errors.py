@@ -1,14 +1,16 @@
 """Compares tracks with the trajectories of targets, at instants that no sensor sets.
 
 At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
-alpha 2). The pairs say how far a track is from its target, for how much of the time a target is
-followed, and how often by another track than before (switch) or after a gap (break).
+alpha 2). The pairs say how far a track is from its target, and for how much of the time a target is
+followed. How often it is followed by another track than before (switch), or after a gap (break), is
+counted by the pairs of CLEAR MOT, which are kept while they are within the cutoff.
 
-Where the reference knows some of the targets alone, a track of another one is no false track. Those that
-are farther than a limit from all targets with a reference are counted on their own, as unreferenced.
+By default every track counts. If the metadata of a truth says that truths cover some of the targets
+(`COVERS`), a track of another target is not a false track: tracks farther than a limit from all targets
+with a truth are counted separately, as unreferenced, and figures without them have names of their own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,13 +21,20 @@ from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
 from replay.judging.sets.distances import gospa, gospa_pairs
+from replay.judging.tracks.clear_mot import NONE, clear_mot, switches_and_breaks
 
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
 # The first instant, when tracks have had time to begin, and how far apart the others are.
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
-NONE = -1
+# In the metadata of a truth: there are targets that no topic of the log has the truth of.
+COVERS, SOME_TARGETS = "covers", "some targets"
+SOME_ARE_KNOWN = (
+    "the truths say that they cover some of the targets: a track more than "
+    f"{UNREFERENCED_M:g} m from all of them counts as unreferenced, not as false, and referenced_hota "
+    f"and referenced_idf1 leave out tracks that never come within {CUTOFF_M:g} m of one"
+)
 VELOCITY = ("vx_mps", "vy_mps")
 
 
@@ -42,10 +51,11 @@ class TrackErrors(NamedTuple):
     Attributes:
         gospa_all: (k,), of all tracks.
         gospa, localisation, missed, false: (k,), without those that have no reference.
-        unreferenced: (k,), how many these are.
-        track: (targets, k), the track that each target is paired with, or NONE.
+        unreferenced: (k,), how many these are; None if the truths cover all targets.
+        track: (targets, k), the track that each target is paired with by GOSPA, or NONE.
         distance: (targets, k), NaN where it is not.
         present: (targets, k), whether the target is there.
+        kept: (targets, k), the track that each target is paired with by CLEAR MOT, or NONE.
     """
 
     gospa_all: Floats
@@ -53,17 +63,28 @@ class TrackErrors(NamedTuple):
     localisation: Floats
     missed: Floats
     false: Floats
-    unreferenced: Integers
+    unreferenced: Integers | None
     track: Integers
     distance: Floats
     present: Booleans
+    kept: Integers
 
 
 class Judged(NamedTuple):
-    """Holds the instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2)."""
+    """Holds the instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2).
+
+    `unreferenced_m` is how far from all of them a track is of a target without a truth; infinite if
+    they cover all targets.
+    """
 
     time_ns: Integers
     truths: Floats
+    unreferenced_m: float = np.inf
+
+    @property
+    def is_partial(self) -> bool:
+        """Tell whether there may be targets without a truth."""
+        return bool(np.isfinite(self.unreferenced_m))
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
@@ -96,7 +117,13 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
         for truth in truths.values()
         for place in [read_vectors(truth, "state", PLANE)]
     ]
-    return Judged(at_ns, np.array(places).transpose(0, 2, 1))
+    return Judged(at_ns, np.array(places).transpose(0, 2, 1), unreferenced_m(truths.values()))
+
+
+def unreferenced_m(truths: Iterable[Stream]) -> float:
+    """Return from where on a track is of a target without a truth, by the metadata of all truths."""
+    covered = {truth.metadata.get(COVERS, "") for truth in truths}
+    return UNREFERENCED_M if SOME_TARGETS in covered else np.inf
 
 
 def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
@@ -131,7 +158,7 @@ def track_errors(
     tracks: Sequence[TracksAt],
     truths: Floats,
     cutoff_m: float = CUTOFF_M,
-    unreferenced_m: float = UNREFERENCED_M,
+    unreferenced_m: float = np.inf,
 ) -> TrackErrors:
     """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there.
 
@@ -149,22 +176,24 @@ def track_errors(
         localisation=np.zeros(instants),
         missed=np.zeros(instants),
         false=np.zeros(instants),
-        unreferenced=np.zeros(instants, np.int64),
+        unreferenced=np.zeros(instants, np.int64) if np.isfinite(unreferenced_m) else None,
         track=np.full((targets_in_all, instants), NONE),
         distance=np.full((targets_in_all, instants), np.nan),
         present=present,
+        kept=clear_mot([(at.number, at.place) for at in tracks], truths, cutoff_m),
     )
     for instant, at in enumerate(tracks):
         targets = np.flatnonzero(present[:, instant])
         true = truths[targets, instant]
         away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
-        known = (away <= unreferenced_m).any(axis=1)
+        known = (away <= unreferenced_m).any(axis=1) | np.isinf(unreferenced_m)
         place = at.place[known]
         found.gospa_all[instant] = gospa(at.place, true, cutoff_m).total
         parts = gospa(place, true, cutoff_m)
         found.gospa[instant], found.localisation[instant] = parts.total, parts.localisation
         found.missed[instant], found.false[instant] = parts.missed, parts.false
-        found.unreferenced[instant] = np.count_nonzero(~known)
+        if found.unreferenced is not None:
+            found.unreferenced[instant] = np.count_nonzero(~known)
         estimate, paired = gospa_pairs(place, true, cutoff_m)
         found.track[targets[paired], instant] = at.number[known][estimate]
         found.distance[targets[paired], instant] = away[known][estimate, paired]
@@ -174,18 +203,20 @@ def track_errors(
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
     """Return the means over the instants, and of each target, from 1 on, RMSE and coverage.
 
-    Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed.
+    Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed. GOSPA of
+    all tracks and the number of those without a reference are given if the truths cover some targets.
     """
     alone = cutoff_m**2 / 2.0
-    figures = {
-        "gospa_m": float(errors.gospa.mean()),
-        "gospa_all_m": float(errors.gospa_all.mean()),
+    figures = {"gospa_m": float(errors.gospa.mean())}
+    if errors.unreferenced is not None:
+        figures["gospa_all_m"] = float(errors.gospa_all.mean())
+    figures |= {
         "localisation_m2": float(errors.localisation.mean()),
         "missed_targets": float(errors.missed.mean()) / alone,
         "false_targets": float(errors.false.mean()) / alone,
-        "unreferenced_targets": float(errors.unreferenced.mean()),
     }
-    switches = breaks = 0
+    if errors.unreferenced is not None:
+        figures["unreferenced_targets"] = float(errors.unreferenced.mean())
     for target, (track, distance, present) in enumerate(
         zip(errors.track, errors.distance, errors.present, strict=True), start=1
     ):
@@ -194,9 +225,44 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
             float(np.sqrt(np.mean(distance[followed] ** 2))) if len(followed) else float("nan")
         )
         figures[f"target{target}_coverage"] = len(followed) / max(int(present.sum()), 1)
-        switches += int(np.count_nonzero(np.diff(track[followed])))
-        breaks += int(np.count_nonzero(np.diff(followed) > 1))
+    switches, breaks = switches_and_breaks(errors.kept, errors.present)
     return figures | {"switches": float(switches), "breaks": float(breaks)}
+
+
+def figures_of_whole_tracks(
+    tracks: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
+) -> dict[str, float]:
+    """Return HOTA and IDF1 of the tracks at k instants by the truths (targets, k, 2), cutoff 20 m.
+
+    Of all tracks; if truths cover some targets, of those that are ever within the cutoff of a target,
+    under names of their own.
+    """
+    from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
+
+    near, others = near_tracks(tracks, truths)
+    is_partial = bool(np.isfinite(unreferenced_m))
+    name, more = ("referenced_", 0) if is_partial else ("", others)
+    return {
+        f"{name}hota": float(hota(near, truths, CUTOFF_M, others=more).hota.mean()),
+        f"{name}idf1": idf1(near, truths, CUTOFF_M, others=more),
+    }
+
+
+def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int]:
+    """Return the tracks (tracks, k, 2) that are ever within the cutoff of a target.
+
+    And how many points all other tracks have.
+    """
+    near: set[int] = set()
+    for at, true in zip(tracks, truths.transpose(1, 0, 2), strict=True):
+        away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
+        near.update(at.number[(away < CUTOFF_M).any(axis=1)].tolist())
+    kept, others = [], 0
+    for at in tracks:
+        is_near = np.isin(at.number, list(near))
+        kept.append(TracksAt(at.number[is_near], at.place[is_near]))
+        others += int(np.count_nonzero(~is_near))
+    return as_trajectories(kept), others
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:

@@ -18,18 +18,18 @@ from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import split_topic
 from replay.judging.metrics.measuring import Metric
+from replay.judging.tracks.clear_mot import NONE
 from replay.judging.tracks.errors import (
     BURN_IN_S,
-    CUTOFF_M,
-    NONE,
     PERIOD_S,
     VELOCITY,
     Judged,
     TracksAt,
-    as_trajectories,
+    figures_of_whole_tracks,
     track_errors,
     track_figures,
     tracks_at,
+    unreferenced_m,
 )
 
 # Of a run that is shorter than four burn-ins, tracks have a quarter to begin.
@@ -65,7 +65,8 @@ def targets_of(source: Source) -> Judged | None:
     burn_in_s = min(BURN_IN_S, BURN_IN_SHARE * (last_ns - source.epoch_ns) * 1e-9)
     first_ns = source.epoch_ns + round(burn_in_s * 1e9)
     at_ns = np.arange(first_ns, last_ns + 1, round(PERIOD_S * 1e9))
-    return Judged(at_ns, np.stack([_places(truth, at_ns) for truth in truths]))
+    places = np.stack([_places(truth, at_ns) for truth in truths])
+    return Judged(at_ns, places, unreferenced_m(truths))
 
 
 def _places(truth: Stream, at_ns: Integers) -> Floats:
@@ -128,13 +129,12 @@ class Followed:
     @property
     def figures(self) -> dict[str, float]:
         """Return what the tracks are worth, at the instants told of; {} without tracks or a target."""
-        from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
-
         begin = self.first or 0
         truths = self.targets.truths[:, begin : begin + len(self.sets)]
         if not self.sets or not np.isfinite(truths).any():
             return {}
-        errors = track_errors(self.sets, truths)
+        limit_m = self.targets.unreferenced_m
+        errors = track_errors(self.sets, truths, unreferenced_m=limit_m)
         found = {
             name: value
             for name, value in track_figures(errors).items()
@@ -142,26 +142,11 @@ class Followed:
         }
         followed = errors.track != NONE
         squared = errors.distance[followed] ** 2
-        near = _near(self.sets, truths)
         return found | {
             "followed_share": float(followed.sum() / errors.present.sum()),
             "followed_rmse_m": float(np.sqrt(squared.mean())) if len(squared) else np.nan,
-            "hota": float(hota(near, truths, CUTOFF_M).hota.mean()),
-            "idf1": idf1(near, truths, CUTOFF_M),
+            **figures_of_whole_tracks(self.sets, truths, limit_m),
         }
-
-
-def _near(sets: Sequence[TracksAt], truths: Floats) -> Floats:
-    """Return the tracks (tracks, k, 2) that are ever within the cutoff of a target."""
-    near: set[int] = set()
-    for at, true in zip(sets, truths.transpose(1, 0, 2), strict=True):
-        away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
-        near.update(at.number[(away < CUTOFF_M).any(axis=1)].tolist())
-    kept = []
-    for at in sets:
-        is_near = np.isin(at.number, list(near))
-        kept.append(TracksAt(at.number[is_near], at.place[is_near]))
-    return as_trajectories(kept)
 
 
 # What is kept of a run: its tracks while there may be more, then their figures alone.
@@ -189,8 +174,8 @@ def _finish(state: State) -> dict[str, float]:
     """Return the means over the runs of which they are known."""
     runs = [figures for figures in _figures(state).values() if figures]
     found = {}
-    for name in runs[0] if runs else ():
-        known = [figures[name] for figures in runs if np.isfinite(figures[name])]
+    for name in dict.fromkeys(name for figures in runs for name in figures):
+        known = [figures[name] for figures in runs if np.isfinite(figures.get(name, np.nan))]
         found[name] = float(np.mean(known)) if known else np.nan
     return found
 

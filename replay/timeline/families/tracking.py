@@ -24,7 +24,8 @@ from replay.engine.arrays import Integers
 from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
 from replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
 from replay.judging.errors.evaluation import Floats
-from replay.judging.tracks.errors import NONE, TrackErrors, instants_of, track_errors, tracks_at
+from replay.judging.tracks.clear_mot import NONE
+from replay.judging.tracks.errors import TrackErrors, instants_of, track_errors, tracks_at
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
 from replay.timeline.drawing.events import Happened, above_events, draw_events
 from replay.timeline.drawing.plane import (
@@ -230,7 +231,7 @@ def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
 
 def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happened]:
     """Yield when a target goes on with another track than before."""
-    for target, track in enumerate(errors.track, start=1):
+    for target, track in enumerate(errors.kept, start=1):
         followed = np.flatnonzero(track != NONE)
         for row in np.flatnonzero(np.diff(track[followed])):
             before, now = track[followed[row]], track[followed[row + 1]]
@@ -246,7 +247,11 @@ def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers,
         return np.empty(0, np.int64), {}
     sizes = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))
     return judged.time_ns, {
-        name: track_errors(tracks_at(sizes[name], tracks, judged.time_ns), judged.truths)
+        name: track_errors(
+            tracks_at(sizes[name], tracks, judged.time_ns),
+            judged.truths,
+            unreferenced_m=judged.unreferenced_m,
+        )
         for name, tracks in trackers
     }
 

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import fuselog as fl
 from recorders.errors import BadInput
+from recorders.log import RunMetadata
 from recorders.models.orientation import axis_angle_between
+from recorders.recording import Recording
+from replay.engine.streams.sources import memory_source
 from replay.estimators.orientation.inertial import (
     InertialModel,
     InertialSamples,
@@ -167,3 +171,47 @@ def test_bad_input_is_told():
         run_inertial_filter(InertialModel(block_s=0.0), start_inertial_filter(1), samples)
     with pytest.raises(BadInput, match="give for each a time"):
         run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(rate=samples.rate[:-1]))
+
+
+def nine_axes(turned_deg: np.ndarray, bias_radps: float = 0.08) -> tuple[fl.MemorySource, Rotation]:
+    """A unit that turns about the vertical by these angles, 100 a second, in its own noise and bias."""
+    rng, count = np.random.default_rng(5), len(turned_deg)
+    world = Rotation.from_euler("z", turned_deg[:, None], degrees=True)
+    rate = np.zeros((count, 3))
+    rate[:-1] = (world[:-1].inv() * world[1:]).as_rotvec() * RATE_HZ
+    noise = rng.standard_normal((3, count, 3))
+    samples = fl.make_stream(
+        "/body/inertial",
+        fl.schemas.INERTIAL_SAMPLE,
+        fl.simulation_stamps_ns(np.arange(count) / RATE_HZ),
+        specific_force_mps2=world.inv().apply(GRAVITY) + 0.02 * noise[0],
+        turn_rate_radps=rate + bias_radps + 0.002 * noise[1],
+        magnetic_field_ut=world.inv().apply(FIELD) + 0.3 * noise[2],
+    )
+    return memory_source(Recording([samples]), RunMetadata("own")), world
+
+
+@pytest.mark.parametrize("kind", ["gyro", "bingham-inertial"])
+def test_the_rest_is_found_and_said(kind: str) -> None:
+    """It rests for 5 s and then turns by 90 degrees, or turns slowly, or rests throughout."""
+    time_s = np.arange(0.0, 25.0, 1.0 / RATE_HZ)
+    turns = {5.0: [5.0, 8.0], 6.0: [6.0, 25.0], 20.0: [30.0, 31.0]}
+    for rest_s, way in turns.items():
+        source, world = nine_axes(np.interp(time_s, way, [0.0, 90.0]))
+        replay = fl.replay(source, {"of": kind})
+        [said] = [each for each in replay.losses if "rest" in each]
+        told_s = float(said.partition("first ")[2].split()[0])
+        assert rest_s - 0.6 < told_s <= rest_s
+        last = replay.estimates[0]["/estimates/of/body/state"]["mean"][-1]
+        error = world[-1].inv() * Rotation.from_quat(last, scalar_first=True)
+        assert np.degrees(error.magnitude()) < 2.0
+
+
+@pytest.mark.parametrize("kind", ["gyro", "bingham-inertial"])
+@pytest.mark.parametrize("rate_radps", [0.2, 3.0])
+def test_a_unit_that_never_rests_is_refused(kind: str, rate_radps: float) -> None:
+    """A steady turn looks like a bias, but the field turns with it; a stated rest is taken as it is."""
+    source, _ = nine_axes(np.degrees(rate_radps) * np.arange(0.0, 10.0, 1.0 / RATE_HZ))
+    with pytest.raises(BadInput, match=r"moves within 1 s of its first sample.*rest_s=SECONDS"):
+        fl.replay(source, {"of": kind})
+    assert len(fl.replay(source, {"of": {"kind": kind, "rest_s": 2.0}}).estimates) == 1

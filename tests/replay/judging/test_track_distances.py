@@ -1,11 +1,15 @@
 """Trajectory GOSPA, HOTA, IDF1: the sheet's case, and the linear programme against all assignments."""
 
+import json
+
 import numpy as np
 import pytest
 
 from recorders.errors import BadInput
 from replay.judging.sets.distances import gospa, gospa_pairs
 from replay.judging.tracks.distances import THRESHOLDS, hota, idf1, trajectory_gospa
+from replay.judging.tracks.errors import TracksAt, figures_of_whole_tracks, track_errors, track_figures
+from tests.replay.judging import track_peers
 
 NO = (np.nan, np.nan)
 TRUTHS = np.array(
@@ -79,6 +83,38 @@ def test_hota_of_the_sheet():
     assert means == pytest.approx(
         [0.4746199713780239, 0.7320574162679426, 0.3077137287663603], abs=1e-12
     )
+
+
+def test_figures_are_those_of_motmetrics_and_trackeval_on_random_scenes():
+    """IDF1, switches and breaks of motmetrics, HOTA and IDF1 of TrackEval; see `track_peers`."""
+    kept = json.loads(track_peers.KEPT.read_text())["scenes"]
+    assert len(kept) == track_peers.SCENES
+    for seed, theirs in enumerate(kept):
+        tracks, targets = track_peers.scene(seed)
+        told = [
+            TracksAt(np.flatnonzero(there), at[there])
+            for at in tracks.transpose(1, 0, 2)
+            for there in [np.isfinite(at[:, 0])]
+        ]
+        found = track_figures(track_errors(told, targets)) | figures_of_whole_tracks(told, targets)
+        ours = [found[name] for name in ("idf1", "switches", "breaks", "hota")]
+        assert ours == pytest.approx([*theirs.values()], abs=1e-9), seed
+
+
+def test_every_track_counts_unless_truths_cover_some_targets():
+    """Two targets that are followed, and ten tracks 300 m away: IDF1 is 2 * 20 / (20 + 20 + 100)."""
+    targets = np.stack([np.zeros((10, 2)), np.full((10, 2), 100.0)])
+    numbers = np.arange(12)
+    places = np.concatenate([targets[:, 0] + 1.0, [[40.0 * each, 400.0] for each in range(10)]])
+    told = [TracksAt(numbers, places)] * 10
+    errors = track_figures(track_errors(told, targets))
+    assert (errors["false_targets"], errors["missed_targets"]) == (10.0, 0.0)
+    assert "unreferenced_targets" not in errors
+    assert figures_of_whole_tracks(told, targets)["idf1"] == pytest.approx(40 / 140)
+    assert figures_of_whole_tracks(told, targets)["hota"] < 0.5
+    some = track_figures(track_errors(told, targets, unreferenced_m=50.0))
+    assert (some["false_targets"], some["unreferenced_targets"]) == (0.0, 10.0)
+    assert figures_of_whole_tracks(told, targets, 50.0)["referenced_idf1"] == 1.0
 
 
 def test_idf1_counts_the_one_track_of_each_thing():

@@ -13,6 +13,8 @@ from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.judging.judge import Judge
 from replay.judging.tracks.errors import (
+    SOME_ARE_KNOWN,
+    UNREFERENCED_M,
     TracksAt,
     as_trajectories,
     instants_of,
@@ -50,9 +52,11 @@ def last_scans(streams: Mapping[str, Stream], sensor: str, at_ns: np.ndarray) ->
 @pytest.mark.parametrize("scenario", SHEET)
 def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
     source = memory_source(*import_run("autoferry", autoferry / f"scenario{scenario}", {}))
-    at_ns, true = instants_of(source)
+    at_ns, true, limit_m = instants_of(source)
+    assert limit_m == UNREFERENCED_M
     radar, lidar = (
-        track_errors(last_scans(source.streams, sensor, at_ns), true) for sensor in ("radar", "lidar")
+        track_errors(last_scans(source.streams, sensor, at_ns), true, unreferenced_m=limit_m)
+        for sensor in ("radar", "lidar")
     )
     found = track_figures(radar)
     assert SHEET[scenario] == pytest.approx(
@@ -86,7 +90,8 @@ def test_switches_breaks_and_what_has_no_reference():
         TracksAt(np.array([8]), np.array([[0.0, 0.0]])),
         TracksAt(np.array([8, 7]), np.array([[100.0, 3.0], [0.0, 0.0]])),
     ]
-    errors = track_errors(tracks, np.concatenate([still, late]))
+    errors = track_errors(tracks, np.concatenate([still, late]), unreferenced_m=UNREFERENCED_M)
+    assert errors.unreferenced is not None
     assert errors.track.tolist() == [[7, -1, -1, 8, 7], [-1, -1, -1, -1, 8]]
     assert errors.unreferenced.tolist() == [1, 0, 0, 0, 0]
     assert errors.gospa_all[0] == pytest.approx(np.sqrt(25 + 200))
@@ -133,7 +138,8 @@ def test_what_is_told_later_is_predicted_for_longer():
     assert tracks_at(sizes, still, at_ns)[0].place.tolist() == [[9.0, 0.0]]
 
 
-def test_a_replay_is_judged_wherever_there_are_truths_and_tracks() -> None:
+@pytest.mark.parametrize("covers", [{}, {"covers": "some targets"}])
+def test_a_replay_is_judged_wherever_there_are_truths_and_tracks(covers: dict[str, str]) -> None:
     """In blocks as whole; of targets only while they are there, of tracks from the first set told on.
 
     The first target is there all the time, the second from 20 s on and 3 m beside its track; the number
@@ -146,7 +152,7 @@ def test_a_replay_is_judged_wherever_there_are_truths_and_tracks() -> None:
             f"/target{number}/truth",
             schemas.TRUTH_STATE,
             stamps[begin:],
-            metadata=state_metadata(names[:2]),
+            metadata=state_metadata(names[:2]) | covers,
             state=np.stack([stamps[begin:] * 1e-9, np.full(41 - begin, 100.0 * number)], axis=1),
         )
         for number, begin in ((1, 0), (2, 20))
@@ -176,15 +182,25 @@ def test_a_replay_is_judged_wherever_there_are_truths_and_tracks() -> None:
             now = sizes.take(slice(sets[0], sets[-1] + 1)), tracks.take(rows)
             judge.add({each.topic: gather([each]) for each in now})
         found[blocks] = judge.metrics
+        assert (SOME_ARE_KNOWN in judge.notes_of_coverage) == bool(covers)
     assert found[1] == found[4]
     figures = {key.removeprefix("t."): value for key, value in found[1].items()}
     # judged from 10 to 40 s, twice a second: 61 instants, of which 41 have both targets
     assert figures["missed_targets"] == figures["breaks"] == 0.0
-    assert figures["false_targets"] == 0.0
-    assert figures["unreferenced_targets"] == pytest.approx(20 / 61)
     assert figures["followed_share"] == 1.0
     assert figures["followed_rmse_m"] == pytest.approx(np.sqrt(9.0 * 41 / 102))
     assert figures["switches"] == 1.0
-    assert figures["idf1"] == pytest.approx(2 * (42 + 41) / (102 + 61 + 61))
-    assert figures["gospa_m"] == pytest.approx(3.0 * 41 / 61)
-    assert figures["gospa_all_m"] > figures["gospa_m"]
+    followed = 2 * (42 + 41) / (102 + 61 + 61)  # each track is near a target at some instant
+    if covers:
+        assert (figures["false_targets"], figures["unreferenced_targets"]) == (
+            0.0,
+            pytest.approx(20 / 61),
+        )
+        assert figures["referenced_idf1"] == pytest.approx(followed)
+        assert figures["gospa_m"] == pytest.approx(3.0 * 41 / 61)
+        assert figures["gospa_all_m"] > figures["gospa_m"]
+    else:
+        assert figures["false_targets"] == pytest.approx(20 / 61)
+        assert figures["idf1"] == pytest.approx(followed)
+        assert figures["gospa_m"] == pytest.approx((3.0 * 41 + np.sqrt(200) * 20) / 61)
+        assert not {"gospa_all_m", "unreferenced_targets", "referenced_idf1"} & set(figures)

@@ -55,8 +55,8 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     assert set(tracks["track_id"]) == {1}
     heard = seconds[seconds != 15]
     way = columns(tracks, "mean", *PLANE)
-    at_ns, truths = instants_of(source)
-    gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
+    at_ns, truths, limit_m = instants_of(source)
+    gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths, unreferenced_m=limit_m).gospa
     at = (pairs.publish_time_ns - SIMULATION_EPOCH_NS) // SECOND
     last = np.searchsorted(tracks.publish_time_ns, pairs.publish_time_ns, side="right") - 1
     by_radar = pairs["sensor_id"] == pairs.metadata["sensors"].split(",").index("radar")

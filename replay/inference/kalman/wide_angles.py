@@ -1,0 +1,137 @@
+"""Keeps samples within half a turn where an angle is hardly known, so that its variance is not lost.
+
+An angle a of standard deviation s has samples at a + r s. Beyond half a turn they come back from the
+other side, and what they are away from the mean is no longer r s: for s = 3 rad the three-dimensional
+unscented set, r = 3^1/2, gives 5.196 - 2 pi = -1.09 rad, and a prediction that measures nothing would
+turn 3 rad into 0.63 rad. Two rules prevent that:
+
+- **A smaller spread.** A function f is regressed at the samples m + c (x - m) of N(m, c^2 P), with the
+  largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for what f adds.
+  With y = f(m + c (x - m)) - f(m) the regression (Steinbring and Hanebeck 2014, (19)-(24)) gives
+
+      E[(x - m) y'] / c = P A',     E[(y - E y)(y - E y)'] / c^2 = A P A' + V / c^2,
+
+  where A is the slope of f within the quarter turn, and V the covariance of what the line leaves over.
+  So the values' differences are divided by c. For an affine f this is exact for every c: a prediction
+  keeps the variance of an angle that it only adds to. What is not affine is overstated, never
+  understated. This is the scaled unscented transformation (Julier, "The scaled unscented
+  transformation", ACC 2002) with a scale that the angles determine, except for the mean, which is that
+  of the narrowed samples: on a circle it is bounded, and the second-order term of the scaled
+  transformation is not.
+
+- **No wider than uniform.** An angle that may be anywhere has the standard deviation pi / 3^1/2 =
+  1.81 rad (Mardia and Jupp, Directional Statistics, 2000, section 3.5), and no belief about an angle is
+  wider. A motion samples a wider one as that, of each axis of a rotation too: it scales the rows of the
+  covariance's factor.
+
+A Gaussian says little about an angle beyond 1 rad: it has 0.2 % of its probability beyond half a turn
+there, and 8 % at 1.81 rad, where its mean means nothing. Samples are unchanged to the last bit while
+every angle's standard deviation is at most 1 rad and no sample is beyond half a turn.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.manifold import manifold_blocks
+
+WIDE_RAD = 1.0  # a standard deviation, up to which samples within half a turn are taken as they are
+UNIFORM_RAD = np.pi / np.sqrt(3.0)
+QUARTER_RAD = 0.5 * np.pi
+
+
+def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
+    """List the angles, axes and rotations of a state: first tangent component, size, turns.
+
+    An axis comes back after half a turn: its angle counts twice.
+    """
+    return tuple(
+        (tangent, width, 2.0 if kind == "axis" else 1.0)
+        for kind, _, tangent, width in manifold_blocks(kinds)
+        if kind != "linear"
+    )
+
+
+def unsuspected_rad(points: Floats) -> float:
+    """Return the standard deviation up to which no angle at points (..., L, N) needs a closer look."""
+    radius = np.sqrt(np.max(np.sum(points**2, axis=-1), initial=1.0))
+    return float(min(WIDE_RAD, np.pi / radius))
+
+
+@lru_cache(maxsize=64)
+def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Function:
+    """Make `narrow(factor, points, unsuspected)`: it returns c, and scales the factor (N, N) by it.
+
+    See the module. With `bounded`, angles that are wider than uniform become uniform first.
+
+    Args:
+        kinds: of the state's components.
+        size: of the factor, N.
+        bounded: whether it is a motion that is sampled.
+    """
+    turns = turning(kinds)
+
+    def squared_length(factor: Floats, first: int, width: int) -> float:
+        """Sum the variances of so many tangent components."""
+        squared = 0.0
+        for row in range(first, first + width):
+            for k in range(row + 1):
+                squared += factor[row, k] * factor[row, k]
+        return squared
+
+    def bound(factor: Floats, row: int, times: float) -> float:
+        """Return the standard deviation of one component, after it is bounded."""
+        wide = times * np.sqrt(squared_length(factor, row, 1))
+        if bounded and wide > UNIFORM_RAD:
+            for k in range(row + 1):
+                factor[row, k] *= UNIFORM_RAD / wide
+            return UNIFORM_RAD
+        return wide
+
+    def reach_of(factor: Floats, points: Floats, first: int, width: int) -> float:
+        """Return how far from the mean the farthest sample of some components is."""
+        most = 0.0
+        for index in range(len(points)):
+            squared = 0.0
+            for row in range(first, first + width):
+                away = 0.0
+                for k in range(row + 1):
+                    away += factor[row, k] * points[index, k]
+                squared += away * away
+            most = max(most, squared)
+        return np.sqrt(most)
+
+    def narrow(factor: Floats, points: Floats, unsuspected: float) -> float:
+        suspected = False
+        for first, width, times in turns:
+            if times * times * squared_length(factor, first, width) > unsuspected * unsuspected:
+                suspected = True
+        if not suspected:
+            return 1.0
+        widest, reach = 0.0, 0.0
+        for first, width, times in turns:
+            for row in range(first, first + width):
+                widest = max(widest, bound(factor, row, times))
+            reach = max(reach, times * reach_of(factor, points, first, width))
+        if reach <= QUARTER_RAD or (widest <= WIDE_RAD and reach <= np.pi):
+            return 1.0
+        share = QUARTER_RAD / reach
+        for row in range(size):
+            for k in range(row + 1):
+                factor[row, k] *= share
+        return share
+
+    return narrow
+
+
+def widen(share: float, memory: Any) -> None:
+    """Divide offsets and values of narrowed samples by c."""
+    for index in range(len(memory.offsets)):
+        for row in range(memory.offsets.shape[1]):
+            memory.offsets[index, row] /= share
+        for i in range(len(memory.shift)):
+            memory.values[index, i] /= share
+    for i in range(len(memory.shift)):
+        memory.shift[i] /= share
