@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from types import FrameType
 import click
 
 from pipeline.command_line.group import fuselog
-from recorders.errors import BadInput, printable
+from recorders.errors import BadInput, ignore_warnings_of_numbers, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if sys.stderr.isatty():  # somebody waits
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
-        with _stopped_by_signals():
+        with _stopped_by_signals(), warnings.catch_warnings():
+            ignore_warnings_of_numbers()
             code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)
             print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
