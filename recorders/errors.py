@@ -1,5 +1,6 @@
-"""Defines the one exception for what a user can mend, and how its sentences are worded and shown."""
+"""Defines the one exception for what a user can mend, and what reaches standard error."""
 
+import warnings
 from collections.abc import Collection
 from itertools import islice
 
@@ -46,6 +47,14 @@ def check_format(path: object, stated: object, read: int) -> None:
             f"{path}: {age} version of fuselog wrote it (format {stated}, this version reads {read}); "
             f"{mend}"
         )
+
+
+def ignore_warnings_of_numbers() -> None:
+    """Keep NumPy's warnings of single operations off standard error, unless warnings are asked for.
+
+    What overflows, or is not a number, is a finding, a doubt or an empty cell, each in its own words.
+    """
+    warnings.simplefilter("ignore", RuntimeWarning, append=True)
 
 
 def printable(text: str) -> str:

@@ -245,7 +245,7 @@ class AlteredLog(LogSource):
             None if at_ns is None else max(0, change.before(at_ns) + slack_ns)
             for at_ns, slack_ns in ((self.start_ns, -1), (self.end_ns, 1))  # it was rounded
         )
-        log = LogSource(self.log, start_ns, end_ns)
+        log = LogSource(self.log, start_ns, end_ns, rejections=self.rejections, is_raw=self.is_raw)
         for block in log.blocks([change.stored], "publish_time", block_messages):
             stream = change.altered(block[change.stored])
             is_in = np.ones(len(stream), bool)

@@ -33,7 +33,7 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     >>> fl.lint(run)
     []
     """
-    [source] = sources_of([log], set)
+    source = sources_of([log], set)[0].as_written()
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
     return lint_blocks(source.blocks(topics, "publish_time", BLOCK) if topics else ())
 

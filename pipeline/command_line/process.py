@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ import click
 
 from pipeline.command_line.group import fuselog
 from recorders import environment
-from recorders.errors import BadInput, printable
+from recorders.errors import BadInput, ignore_warnings_of_numbers, printable
 from recorders.processes import refuse_settings_here
 from replay.engine.compiling.trial import require_processor
 
@@ -35,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if sys.stderr.isatty():  # somebody waits
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
-        with _stopped_by_signals():
+        with _stopped_by_signals(), warnings.catch_warnings():
+            ignore_warnings_of_numbers()
             refuse_settings_here()
             environment.check()
             require_processor()

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from recorders.log import Clock, RunMetadata, Stream, Topic
-from replay.engine.streams.sources import Source
+from replay.engine.streams.sources import Rejections, Source
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,11 @@ class Renamed:
     def start_ns(self) -> int | None:
         """Return the begin of the span."""
         return self.estimates.start_ns
+
+    @property
+    def rejections(self) -> Rejections:
+        """Return what was left out of the estimates' log."""
+        return self.estimates.rejections
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:

@@ -50,6 +50,8 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
         if about.schema_name != schemas.TRUTH_STATE.full_name or topic.startswith("/estimates/"):
             continue
         truth = source.read([topic])[topic]
+        if not len(truth):
+            continue
         columns = [truth.components.index(name) for name in ("x_m", "y_m") if name in truth.components]
         for used in streamed if len(columns) == 2 else ():
             stream = source.read([used])[used]

@@ -102,7 +102,8 @@ def first_part(
             f"{MOST_MESSAGES} of {count} messages, and tried on the rest; for another part: fuselog cut"
         )
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    return Portion(MemorySource(streams, run, source.name), end_ns, note)
+    part = MemorySource(streams, run, source.name, rejections=source.rejections)
+    return Portion(part, end_ns, note)
 
 
 def on_the_rest(

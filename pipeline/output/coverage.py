@@ -212,8 +212,17 @@ def rows_of(
         Row(label, topic, doubt.messages, None, None, 0, doubt.why)
         for label in labels
         for topic, doubt in (doubts or {}).items()
+        if (label, topic) not in there
     ]
-    return [*rows, *doubtful]
+    return [*(_doubted(row, (doubts or {}).get(row.topic)) for row in rows), *doubtful]
+
+
+def _doubted(row: Row, doubt: Doubt | None) -> Row:
+    """Return the line of a topic with the messages that were left out before an estimator met them."""
+    if doubt is None:
+        return row
+    why = "; ".join(filter(None, (row.why, doubt.why)))
+    return row._replace(messages=row.messages + doubt.left_out, why=why)
 
 
 def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:

@@ -10,6 +10,7 @@ What `*` and `|` stand for gives numbers their names. The functions are `numbers
 """
 
 import ast
+import math
 import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -32,6 +33,7 @@ from pipeline.output.numbers import (
     negated,
     negative,
 )
+from pipeline.output.words import MISSING
 from recorders.errors import BadInput, choices
 
 
@@ -105,9 +107,9 @@ def _in_words(value: Value, form: str, *, named: bool) -> str:
         return ", ".join(_in_words(each, form, named=named) for each in value)
     if not isinstance(value, Number):
         return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
-    text = format(value.value, form)
+    text, low, high = (format(each, form) if math.isfinite(each) else MISSING for each in value[:3])
     if value.low != value.high and value.is_known:
-        text += f" ({format(value.low, form)} to {format(value.high, form)})"
+        text += f" ({low} to {high})"
     return f"{value.name} {text}" if named else text
 
 

@@ -28,6 +28,7 @@ from pipeline.output.results import (
     metric_tables,
     split_metric,
 )
+from pipeline.output.words import MISSING
 from recorders.errors import printable
 
 if TYPE_CHECKING:
@@ -149,17 +150,33 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
 
 
 def format_value(value: object) -> str:
-    """Write four significant digits of floats, nothing for None, the range of many numbers, or text."""
+    """Write four significant digits of floats, the range of many numbers, or text.
+
+    What is no value, as NaN and infinity, is empty; see `is_value`.
+    """
     if isinstance(value, list):
-        known = [each for each in value if each is not None]
+        known = [each for each in value if is_value(each)]
         if any(isinstance(each, dict) for each in known):
             return f"{len(value)} tables"
         if any(isinstance(each, list) for each in known):
             return ", ".join(map(format_value, value))
         if len(known) > 4 and all(isinstance(each, int | float) for each in known):
             return f"{format_value(min(known))} to {format_value(max(known))}"
-        return " ".join(map(format_value, value))
-    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+        return " ".join(format_value(each) or MISSING for each in value)
+    if not is_value(value):
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def is_value(value: object) -> bool:
+    """Tell whether a cell has a value: None, NaN, infinity and what pandas has for missing are none.
+
+    >>> [is_value(each) for each in (0.0, "", None, math.nan, math.inf)]
+    [True, True, False, False, False]
+    """
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is not None and type(value).__name__ not in ("NAType", "NaTType")
 
 
 def has_many_cases(metrics: Mapping[str, MetricValue]) -> bool:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, ignore_warnings_of_numbers
 from recorders.processes import safe_spawning
 from replay.engine.compiling.compile import use_cores
 
@@ -137,6 +137,7 @@ def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_cores(1)
     threadpool_limits(1)
+    ignore_warnings_of_numbers()
     parent = parent_process()
     assert parent is not None
 

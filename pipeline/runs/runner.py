@@ -196,7 +196,7 @@ def _in_memory(source: LogSource) -> MemorySource:
     """Read a log's streams, but for estimates and what is no columns."""
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
-    return MemorySource(source.read(topics), run, source.name)
+    return MemorySource(source.read(topics), run, source.name, rejections=source.rejections)
 
 
 def _write_log(source: MemorySource, path: Path) -> None:

@@ -10,15 +10,16 @@ from recorders.log import Stream, schemas
 from recorders.plausibility.finding import Finding
 
 TOLERANCE = 1e-6  # of the largest entry
+SINGULAR, SINGULAR_BELOW = "singular", 1e-12  # the least eigenvalue of its correlations
 # Of what has no such component, as a planar robot's height, zero may stand for it.
 _PARTIAL = {schemas.POSE.full_name, schemas.TWIST.full_name}
 
 
 def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find covariances that are -1, zero, negative, not symmetric, indefinite, or one number."""
+    """Find covariances that are -1, zero, negative, not symmetric, indefinite, singular, one number."""
     for entry in stream.schema:
-        column = stream.columns[entry.name]
-        if not entry.name.startswith("covariance") or column.ndim != 2 or not column.shape[1]:
+        column = stream.columns[entry.name].reshape(len(stream), -1)
+        if "variance" not in entry.name or not column.shape[1]:
             continue
         is_new = np.ones(len(column), bool)
         is_new[1:] = (column[1:] != column[:-1]).any(
@@ -26,7 +27,11 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         )  # of equal ones in a row the first tells all
         rows = np.flatnonzero(is_new & np.isfinite(column).all(axis=1))
         is_partial = stream.schema.full_name in _PARTIAL
-        for words, bad in _faults(column[rows], is_partial=is_partial, is_stated=len(stream) == 1):
+        is_prior = stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
+        faults = _faults(
+            column[rows], is_partial=is_partial or is_prior, is_exact=len(stream) == 1 and not is_prior
+        )
+        for words, bad in faults:
             if bad.any():
                 share = np.repeat(bad, np.diff(np.append(rows, len(column)))).sum()
                 first_s = 1e-9 * float(
@@ -45,18 +50,18 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                     if is_unknown
                     else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, a number "
                     f"for each axis",
-                    sure="fact",
+                    sure="hint" if words == SINGULAR else "fact",
                 )
                 break
 
 
 def _faults(
-    values: NDArray[np.float64], *, is_partial: bool, is_stated: bool
+    values: NDArray[np.float64], *, is_partial: bool, is_exact: bool
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield each fault with the rows (n,) that have it, the plainest first.
 
-    `is_partial` says that zero may stand for a component that there is none, `is_stated` that one
-    message is for all of the log.
+    `is_partial` says that zero may stand for a component that there is none, or that is known exactly,
+    `is_exact` that it may so for all.
     """
     width = values.shape[1]
     size = isqrt(width)
@@ -65,7 +70,7 @@ def _faults(
     yield "-1, which stands for unknown", np.equal(diagonal[:, 0], -1.0)
     yield "negative on its diagonal", np.less(diagonal.min(axis=1), 0.0)
     zero = np.equal(diagonal, 0.0)
-    if not is_stated:  # of a place that is stated once zero says that it is exact
+    if not is_exact:  # of a place that is stated once zero says that it is exact
         yield "zero", np.greater_equal(zero.sum(axis=1), zero.shape[1] if is_partial else 1)
     if not is_matrix:
         return
@@ -76,3 +81,7 @@ def _faults(
     apart = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     yield "not symmetric", apart > TOLERANCE * scale
     yield "indefinite", np.linalg.eigvalsh(matrices)[:, 0] < -TOLERANCE * scale
+    deviations = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    correlations = matrices / (deviations[:, :, None] * deviations[:, None, :])
+    correlations[:, range(size), range(size)] = 1.0  # what has no variance is singular for itself alone
+    yield SINGULAR, np.linalg.eigvalsh(correlations)[:, 0] < SINGULAR_BELOW

@@ -1,16 +1,33 @@
 """Asks the checks of a log in their table, portion by portion, so that memory is bounded."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from itertools import islice
 
 from recorders.errors import BadInput
-from recorders.linting import columns, covariances, forces, limits, magnetic, names, places, stamps
+from recorders.linting import (
+    columns,
+    covariances,
+    forces,
+    impossible,
+    limits,
+    magnetic,
+    names,
+    places,
+    stamps,
+)
 from recorders.log import Log, Stream, read_blocks, read_empty
+from recorders.log.impossible import main_span, possible
 from recorders.log.streams import concatenate
 from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
 from recorders.plausibility.finding import Finding
 
-CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] = (
+Check = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]
+# Of all messages; the other checks look at what is possible.
+OF_IMPOSSIBLE: tuple[Check, ...] = (impossible.beyond, impossible.integers)
+CHECKS: tuple[Check, ...] = (
+    impossible.apart,
+    impossible.restated,
     stamps.units,
     stamps.order,
     stamps.jitter,
@@ -54,9 +71,13 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
         The findings, the worst first; none of a log without a fault: thresholds are far from chance.
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
-    for index, streams in enumerate(islice(_portions(blocks), portions)):
+    for index, whole in enumerate(islice(_portions(blocks), portions)):
+        span_ns = main_span(stream.publish_time_ns for stream in whole.values())
+        cleared = {topic: possible(stream, span_ns)[0] for topic, stream in whole.items()}
+        streams = {topic: stream for topic, stream in cleared.items() if len(stream)}
         of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
-        for each in (*of_stamps, *_asked(CHECKS, streams)):
+        of_impossible = _asked((partial(impossible.years, span_ns), *OF_IMPOSSIBLE), whole)
+        for each in (*of_impossible, *of_stamps, *_asked(CHECKS, streams)):
             others = found.setdefault((each.cause, each.topic, each.field), [])
             if not others or (each in of_stamps and not index):
                 others.append(each)
@@ -71,10 +92,7 @@ def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
     return lint(blocks, portions=portions)
 
 
-def _asked(
-    checks: Iterable[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]],
-    streams: Mapping[str, Stream],
-) -> Iterator[Finding]:
+def _asked(checks: Iterable[Check], streams: Mapping[str, Stream]) -> Iterator[Finding]:
     for stream in streams.values():
         for check in checks:
             yield from check(stream, streams)

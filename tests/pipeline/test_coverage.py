@@ -78,7 +78,10 @@ def _another_truth(streams: Streams) -> None:
             _another_topic,
             "ekf: /robot1/front/range_bearing: {n} of {n} not used: the estimator does not",
         ),
-        (_infinite, f"ekf: {SIGHTINGS}: 1 are infinite"),
+        (
+            _infinite,
+            f"ekf: {SIGHTINGS}: 1 of {{n}} not used: 1 message is left out: range_m is infinite",
+        ),
         (_repeated, f"ekf: {SIGHTINGS}: 5 repeat the message before"),
         (_a_landmark_twice, f"ekf: {MAP}: landmark "),
         (

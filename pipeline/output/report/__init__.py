@@ -10,6 +10,7 @@ as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
 import base64
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -34,8 +35,8 @@ from pipeline.output.report.scene import lens, nis_chart, plan, tracked
 from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
 from pipeline.output.report.sweeps import RUNS_TABLE
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
-from pipeline.output.terminal import format_value
-from pipeline.output.words import QUANTITIES, TRACKING, label_of, quantity
+from pipeline.output.terminal import format_value, is_value
+from pipeline.output.words import QUANTITIES, TRACKING, count, label_of, quantity
 from recorders.atomic import whole_file
 from recorders.errors import BadInput, printable
 from recorders.parameters import Parameters, build
@@ -120,6 +121,7 @@ def write_report(
     )
     environment.filters |= {
         "value": format_value,
+        "empty": empty_cells,
         "drawn": _as_json,
         "hashes": _hashes,
         "named": _named,
@@ -156,6 +158,17 @@ def _visible(value: object) -> object:
         each if each in "\n\t" or category(each) == "Zs" else printable(each) for each in value
     )
     return Markup(shown) if isinstance(value, Markup) else shown
+
+
+def empty_cells(table: pd.DataFrame) -> list[str]:
+    """Say why cells of a table are empty: nothing to compute them from, or an infinite value."""
+    cells = [value for row in table.itertuples(index=False) for value in row if not is_value(value)]
+    infinite = sum(isinstance(value, float) and math.isinf(value) for value in cells)
+    counts = {
+        "have nothing to be computed from": len(cells) - infinite,
+        "would be larger than any number": infinite,
+    }
+    return [f"{count(of, 'cell')} without a value: they {why}." for why, of in counts.items() if of]
 
 
 def _asset(name: str) -> str:

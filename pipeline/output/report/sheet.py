@@ -59,6 +59,12 @@ class Sheet:
     groups: dict[str, list[Row]]
     more: list[Row] = field(default_factory=list)
 
+    @property
+    def has_missing(self) -> bool:
+        """Tell whether a cell has no value."""
+        rows = [row for of in (*self.groups.values(), self.more) for row in of]
+        return any(cell.text == MISSING for row in rows for cell in row.cells)
+
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
     """Return the table of a result, and of several cases one each; None without numbers."""

@@ -107,7 +107,7 @@ class Usage:
         """Report landmarks that are at two places."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
-        apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)
+        apart_m = np.where(np.diff(number) == 0, np.linalg.norm(np.diff(place, axis=0), axis=1), 0.0)
         if apart_m.any():
             worst = int(np.argmax(apart_m))
             self.doubtful[topic] = (
@@ -135,7 +135,6 @@ class Usage:
             if self.begins_ns is not None:
                 begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
                 facts[EARLY] += int((stream.times(order) < begins_ns).sum())
-            facts["are infinite"] += int(_infinite(stream).sum())
             facts["repeat the message before"] += int(_repeated(stream).sum())
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
@@ -209,14 +208,6 @@ class Usage:
 def _topic_in(why: str, topics: Iterable[str]) -> bool:
     """Tell whether a reason is of one of these topics, which such reasons begin with."""
     return any(why.startswith(f"topic {topic}:") for topic in topics)
-
-
-def _infinite(stream: Stream) -> np.ndarray:
-    found = np.zeros(len(stream), bool)
-    for column in stream.columns.values() if len(stream) else ():
-        if column.dtype.kind == "f":
-            found |= np.isinf(column).reshape(len(column), -1).any(axis=1)
-    return found
 
 
 def _repeated(stream: Stream) -> np.ndarray:

@@ -1,10 +1,11 @@
 """Reads the runs of a replay: from log files, or from recordings in memory; one run or many."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import zip_longest
-from typing import Protocol, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from recorders.log import (
     read_span,
     read_streams,
 )
+from recorders.log.impossible import YEAR_NS, main_span, possible
 from recorders.recording import Recording
 from replay.engine.streams.blocks import Block, Findings, Ragged, gather, is_in_order, merge_events
 
@@ -61,6 +63,10 @@ class Source(Protocol):
     def whole(self) -> "Source":
         """Return the run without a span."""
 
+    @property
+    def rejections(self) -> "Rejections":
+        """Return what was left out of all that was read, being impossible."""
+
 
 def is_sensed(source: Source, topic: str) -> bool:
     """Tell whether `topic` of the run `source` is its own, and columns: no estimates, no images."""
@@ -73,13 +79,42 @@ def is_sensed(source: Source, topic: str) -> bool:
     return True
 
 
+class Rejections(dict[str, Counter[str]]):
+    """Counts messages that are left out, being impossible: by topic, and by what is wrong."""
+
+    def note(self, topic: str, found: Counter[str]) -> None:
+        """Note what a read of a topic, whole or in part, left out; it may be read again."""
+        self[topic] = self.get(topic, Counter()) | found
+
+    def sentence(self, topic: str) -> str:
+        """Say what is left out of a topic."""
+        return "; ".join(
+            f"{count} {'message is' if count == 1 else 'messages are'} left out: {why}"
+            for why, count in self[topic].items()
+        )
+
+
+@dataclass(frozen=True, repr=False)
 class _Readable(Mapping[str, Stream]):
-    """Maps topics to whole streams, as a person reads a source; raises `UnknownName` for others."""
+    """Maps topics to whole streams, as a person reads a source; raises `UnknownName` for others.
+
+    Attributes:
+        rejections: what was left out of all that was read, being impossible.
+        is_raw: whether nothing is left out.
+    """
+
+    rejections: Rejections = field(default_factory=Rejections, kw_only=True, compare=False)
+    is_raw: bool = field(default=False, kw_only=True)
+
+    def as_written(self) -> Self:
+        """Return the source with all of its messages, impossible ones as well."""
+        return replace(self, is_raw=True)
 
     def __getitem__(self: Source, topic: str) -> Stream:
         if topic not in self.topics:
             raise UnknownName(f"{self.name}: no topic {topic}; {choices(topic, self.topics)}")
-        return self.read([topic])[topic]
+        assert isinstance(self, _Readable)
+        return self.as_written().read([topic])[topic]
 
     def __contains__(self: Source, topic: object) -> bool:
         return topic in self.topics
@@ -144,7 +179,7 @@ class LogSource(_Readable):
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
         """Return all of `topics` in publish-time order, whatever the source's span."""
-        return read_streams(self.log, topics)
+        return self._possible(read_streams(self.log, topics), Rejections())
 
     def empty(self, topic: str) -> Stream:
         """Return `topic` without its messages."""
@@ -154,18 +189,43 @@ class LogSource(_Readable):
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Yield the span of `topics` by the clock `order`, up to `block_messages` in a block."""
-        return read_blocks(
+        before = Rejections()
+        for block in read_blocks(
             self.log,
             topics,
             order=order,
             start_ns=self.start_ns,
             end_ns=self.end_ns,
             block_messages=block_messages,
-        )
+        ):
+            kept = self._possible(block, before)
+            yield {topic: stream for topic, stream in kept.items() if len(stream)}
+
+    def _possible(self, streams: Mapping[str, Stream], before: Rejections) -> dict[str, Stream]:
+        """Leave out impossible messages, and note them with those `before` these; not of estimates."""
+        kept = dict(streams)
+        for topic, stream in streams.items() if not self.is_raw else ():
+            if topic.startswith("/estimates/"):
+                continue
+            kept[topic], found = possible(stream, self.main_span)
+            if found:
+                before[topic] = before.get(topic, Counter()) + found
+                self.rejections.note(topic, before[topic])
+        return kept
+
+    @cached_property
+    def main_span(self) -> tuple[int, int] | None:
+        """Find the first and last stamp of most messages if others are years from them."""
+        first_ns, last_ns = self.extent("publish_time")
+        topics = [topic for topic in self.topics if is_sensed(self, topic)]
+        if last_ns - first_ns < YEAR_NS or not topics:
+            return None
+        blocks = read_blocks(self.log, topics)
+        return main_span(each.publish_time_ns for block in blocks for each in block.values())
 
     def whole(self) -> "LogSource":
         """Return the whole log."""
-        return LogSource(self.log)
+        return replace(self, start_ns=None, end_ns=None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -254,10 +314,23 @@ class MemorySource(_Readable):
         return stream.take(np.lexsort((stream.position, stream.times(order))))
 
     def stream_of(self, topic: str) -> Stream:
-        """Return `topic` as it was recorded; raises BadInput where it is not there."""
+        """Return `topic` as it was recorded; raises BadInput where it is not there.
+
+        Impossible messages are left out.
+        """
         if topic not in self.streams:
             raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
-        return self.streams[topic]
+        if self.is_raw:
+            return self.streams[topic]
+        stream, found = possible(self.streams[topic], self.main_span)
+        if found:
+            self.rejections.note(topic, found)
+        return stream
+
+    @cached_property
+    def main_span(self) -> tuple[int, int] | None:
+        """Find the first and last stamp of most messages if others are years from them."""
+        return main_span(each.publish_time_ns for each in self.streams.values())
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:

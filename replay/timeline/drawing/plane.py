@@ -341,9 +341,10 @@ def plane_view(
 
 
 def bounds_of(places: Floats) -> tuple[Floats, Floats]:
-    """Return the lower left and the upper right corner (2,) of a view of places (n, 2)."""
-    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
-    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent_of(places))
+    """Return the lower left and the upper right corner (2,) of a view of places (n, 2), NaN left out."""
+    known = places[np.isfinite(places).all(axis=1)]
+    low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else (np.zeros(2), np.zeros(2))
+    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent_of(known))
     return low - margin, high + margin
 
 
@@ -381,8 +382,9 @@ def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
 
 
 def extent_of(places: Floats) -> float:
-    """Return the larger side of the box around places (n, 2); one where they have no extent."""
-    return float(np.ptp(places, axis=0).max()) or 1.0 if len(places) else 1.0
+    """Return the larger side of the box around places (n, 2), NaN left out; one if it has no extent."""
+    known = places[np.isfinite(places).all(axis=1)]
+    return float(np.ptp(known, axis=0).max()) or 1.0 if len(known) else 1.0
 
 
 def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: float) -> None:

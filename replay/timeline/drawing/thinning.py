@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
 from replay.engine.streams.failures import join_streams
-from replay.engine.streams.sources import Source, is_sensed
+from replay.engine.streams.sources import Rejections, Source, is_sensed
 from replay.judging.errors.evaluation import PER_ROW, Errors, Floats, errors_at
 from replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 
@@ -221,6 +221,11 @@ class Held:
     def start_ns(self) -> int | None:
         """Return the source's."""
         return self.of.start_ns
+
+    @property
+    def rejections(self) -> Rejections:
+        """Return the source's."""
+        return self.of.rejections
 
     @property
     def topics(self) -> Mapping[str, Topic]:

@@ -253,6 +253,8 @@ def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
 def _draw_dots(
     canvas: Canvas, entity: str, time_ns: Times, headings: Floats, colour: Colour, radius_px: float
 ) -> None:
+    if not len(headings):
+        return
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=_on_map(headings)))
     radii = rr.Radius.ui_points(radius_px)
     canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii, draw_order=40.0))

@@ -34,7 +34,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _seen(scene: Scene) -> list[Stream]:
-    return [scene.read(topic) for topic in topics_of(scene.source.topics, schemas.POSITION_FIX)]
+    found = map(scene.read, topics_of(scene.source.topics, schemas.POSITION_FIX))
+    return [stream for stream in found if len(stream)]
 
 
 def _is_target(stream: Stream) -> bool:

@@ -72,9 +72,9 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def landmarks_of(scene: Scene) -> pd.DataFrame:
     """Return places (n, 2) by number; none where the log has no map, as that of estimates."""
-    if "/landmarks" not in scene.source.topics:
+    stream = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
+    if stream is None or not len(stream):
         return pd.DataFrame(np.empty((0, 2)), index=np.empty(0, np.int64))
-    stream = scene.read("/landmarks")
     places = stream["position_m"].reshape(len(stream), -1)[:, :2]
     numbered = pd.DataFrame(places, index=stream["landmark_id"].astype(np.int64))
     return numbered[~numbered.index.duplicated()]

@@ -79,6 +79,8 @@ def _sensors(scene: Scene) -> Iterator[Sensor]:
         if not set(mounting) <= set(scene.source.topics):
             continue
         position, attitude = map(scene.read, mounting)
+        if not len(position) or not np.linalg.norm(attitude["quaternion"][:1]) > 0.0:
+            continue
         turned = Rotation.from_quat(attitude["quaternion"][0], scalar_first=True).inv()
         yield Sensor(
             int(number[1]), position["position_m"][0], turned.as_euler("ZYX"), scene.read(topic)

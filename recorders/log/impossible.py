@@ -1,0 +1,140 @@
+"""Finds values that no sensor can give: infinite ones, and ones beyond what their unit can be."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log.schemas import BODY_POINT, LANDMARK
+from recorders.log.streams import Stream
+
+# By the unit that ends a name: far beyond what is measured, wrongly scaled integers included.
+LIMITS = {
+    "m": 1e12,
+    "mps": 1e10,
+    "mps2": 1e12,
+    "rad": 1e6,
+    "radps": 1e6,
+    "deg": 1e12,
+    "s": 1e12,
+    "ut": 1e12,
+}
+# Of all others, as covariances and scores: squares of it are still numbers.
+LIMIT = 1e50
+LEAST = min(LIMITS.values())
+# A gap between stamps that no log has inside.
+YEAR_NS = 31_556_952 * 10**9
+# What is said once, at whatever stamp.
+TIMELESS = {LANDMARK.full_name, BODY_POINT.full_name}
+
+
+class Impossible(NamedTuple):
+    """Describes impossible values of one component of a field.
+
+    Attributes:
+        field, name: the field, and its component in words.
+        rows: (n,) where they are.
+        value: the largest.
+        limit: the largest that would be possible.
+    """
+
+    field: str
+    name: str
+    rows: NDArray[np.bool_]
+    value: float
+    limit: float
+
+    @property
+    def words(self) -> str:
+        """Say what is wrong with the component."""
+        if np.isinf(self.value):
+            return f"{self.name} is infinite"
+        return f"{self.name} is {self.value:.3g}, and can be {self.limit:.0e} at most"
+
+
+def impossible(stream: Stream) -> Iterator[Impossible]:
+    """Yield the components of a stream's fields that have impossible values."""
+    for entry in stream.schema:
+        column = stream.columns.get(entry.name)
+        if column is None or column.dtype.kind != "f" or not column.size:
+            continue
+        flat = column.reshape(-1)
+        squares = float(flat @ flat)  # one quick pass for most columns
+        if squares <= LEAST**2:
+            continue
+        names = _components(stream, entry.name)
+        limits = [limit_of(name) for name in names]
+        if squares <= min(limits) ** 2:
+            continue
+        by_component = column.reshape(len(column), -1).T
+        for component, limit, values in zip(names, limits, by_component, strict=True):
+            rows = np.abs(values) > limit
+            if rows.any():
+                value = values[np.argmax(np.where(rows, np.abs(values), 0.0))]
+                name = " ".join(dict.fromkeys([entry.name, component]))
+                yield Impossible(entry.name, name, rows, float(value), limit)
+
+
+def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, Counter[str]]:
+    """Leave out impossible messages, and count them by what is wrong, each once.
+
+    Args:
+        stream: the messages.
+        span_ns: outside of which a stamp is impossible, see `main_span`; None where there is none.
+    """
+    found: Counter[str] = Counter()
+    wrong = [(each.words, each.rows) for each in impossible(stream)]
+    if span_ns is not None and stream.schema.full_name not in TIMELESS:
+        outside = (stream.publish_time_ns < span_ns[0]) | (stream.publish_time_ns > span_ns[1])
+        wrong.append(("its stamp is years from those of most messages", outside))
+    kept = np.ones(len(stream) if wrong else 0, bool)
+    for words, rows in wrong:
+        found[words] = int(np.count_nonzero(rows & kept))
+        kept &= ~rows
+    found = +found
+    return (stream.take(kept), found) if found else (stream, found)
+
+
+def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
+    """Find the first and last stamp of most messages; None where no others are years from them.
+
+    Args:
+        stamps_ns: (n,) in any order, several times.
+    """
+    parts = [each for each in stamps_ns if len(each)]
+    ends_ns = [int(end) for each in parts for end in (each.min(), each.max())]
+    if not parts or max(ends_ns) - min(ends_ns) <= YEAR_NS:
+        return None
+    together = np.sort(np.concatenate(parts))
+    jumps = np.flatnonzero(np.diff(together) > YEAR_NS) + 1
+    if not len(jumps):
+        return None
+    edges = np.concatenate([[0], jumps, [len(together)]])
+    most = int(np.argmax(np.diff(edges)))
+    if 2 * (edges[most + 1] - edges[most]) <= len(together):  # the stamps have another unit
+        return None
+    return int(together[edges[most]]), int(together[edges[most + 1] - 1])
+
+
+@lru_cache(maxsize=1024)
+def limit_of(name: str) -> float:
+    """Return the largest number that a field or component can be, by the unit in its name.
+
+    >>> limit_of("range_m"), limit_of("covariance_m2"), limit_of("quaternion")
+    (1000000000000.0, 1e+50, 1e+50)
+    """
+    return LIMITS.get(name.rpartition("_")[2], LIMIT)
+
+
+def _components(stream: Stream, field: str) -> list[str]:
+    """Name the components of a field: by the channel, else by axis or number."""
+    column = stream.columns[field]
+    if column.ndim == 1:
+        return [field]
+    width = column.shape[1]
+    if field in ("state", "mean", "value") and len(stream.components) == width:
+        return stream.components
+    return [field] * width
