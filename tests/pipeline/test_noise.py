@@ -19,7 +19,14 @@ from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
 from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from pipeline.sensing.likelihood import Samples, likelihood
 from pipeline.sensing.noise import _drifts
-from pipeline.sensing.preparing import Drift, find_drift, find_vibration, samples_of, white_block
+from pipeline.sensing.preparing import (
+    Drift,
+    check_at_rest,
+    find_drift,
+    find_vibration,
+    samples_of,
+    white_block,
+)
 from pipeline.sensing.terms import Terms
 from pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
@@ -290,6 +297,15 @@ def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: P
     found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
     assert any("yours 1.28 (" in note for note in found.notes)
     assert len(found.densities.doubts) == 1
+
+
+def test_noise_is_no_motion_and_a_slow_turn_is() -> None:
+    """Whether a unit moves is told by means over a second."""
+    noise = np.random.default_rng(1).normal(0.0, 0.6, 5000)  # m/s^2, twice what means may vary by
+    check_at_rest("/imu", "specific_force_mps2", noise, STEP_S)
+    turning = 0.6 * np.sin(0.3 * STEP_S * np.arange(5000))
+    with pytest.raises(fl.BadInput, match="the unit moves"):
+        check_at_rest("/imu", "specific_force_mps2", 0.1 * noise + turning, STEP_S)
 
 
 def test_bad_input_is_a_sentence() -> None:

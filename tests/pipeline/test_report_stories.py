@@ -167,6 +167,11 @@ def test_a_tie_is_broken_by_the_time_where_that_was_measured_and_differs(
     assert told.verdict[0].endswith(take)
 
 
+def test_one_run_is_not_counted() -> None:
+    told = _told({"a": {"position_rmse_m": [1.0]}, "b": {"position_rmse_m": [0.5]}})
+    assert told.cards[0].notes == []
+
+
 def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure() -> None:
     error = 1.0 + NOISE[0]
     runs = {
