@@ -20,7 +20,8 @@ from pipeline.tuning.outcome import TUNED, Tuning
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas, topics_of
 from replay.engine.replaying.estimator import bind
-from replay.engine.streams.sources import Ensemble, Source
+from replay.engine.streams.ensembles import Ensemble
+from replay.engine.streams.sources import Source
 
 Floats = NDArray[np.float64]
 DURATION_S = 20.0

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from recorders.log import Clock, RunMetadata, Stream, Topic
-from replay.engine.streams.sources import Rejections, Source
+from recorders.log.impossible import Rejections
+from replay.engine.streams.sources import Source
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import Ensemble, MemorySource
+from replay.engine.streams.ensembles import Ensemble
+from replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 MOST_MESSAGES = 300_000  # of the runs that are replayed together

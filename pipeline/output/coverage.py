@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.output.results import read_table
 from recorders.errors import BadInput
 from recorders.log import Clock
+from recorders.log.impossible import Rejections
 from recorders.parsing import parse_json
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
@@ -117,7 +118,8 @@ def recounted(
     orders = {order for _, order in spans}
     if len(orders) == 1:
         rows += untaken([source for source, _ in spans], labels, bound, orders.pop())
-    return rows_of(usages, rows, doubts)
+    left_out = Rejections().plus(source.rejections for source, _ in spans)
+    return rows_of(usages, rows, doubts, left_out)
 
 
 def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock]:
@@ -201,28 +203,39 @@ def _places(bound: Iterable[Bound]) -> dict[str, str]:
 
 
 def rows_of(
-    usages: Mapping[str, Usage], others: Sequence[Row], doubts: Mapping[str, Doubt] | None = None
+    usages: Mapping[str, Usage],
+    others: Sequence[Row],
+    doubts: Mapping[str, Doubt],
+    left_out: Rejections,
 ) -> list[Row]:
-    """Return all lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
-    rows = [row for usage in usages.values() for row in usage.rows()]
+    """Return all lines, by estimator and topic: what was counted, other topics, and doubtful truths.
+
+    What was left out, since it is impossible, counts among the messages.
+    """
+    rows = [_whole(row, left_out) for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
     rows += [row for row in others if (row.estimator, row.topic) not in there]
     labels = dict.fromkeys(name.partition("/")[0] for name in usages)
     doubtful = [
         Row(label, topic, doubt.messages, None, None, 0, doubt.why)
         for label in labels
-        for topic, doubt in (doubts or {}).items()
+        for topic, doubt in doubts.items()
+    ]
+    rejected = [
+        Row(label, topic, counts.total(), None, None, 0, left_out.sentence(topic))
+        for label in labels
+        for topic, counts in left_out.items()
         if (label, topic) not in there
     ]
-    return [*(_doubted(row, (doubts or {}).get(row.topic)) for row in rows), *doubtful]
+    return [*rows, *doubtful, *rejected]
 
 
-def _doubted(row: Row, doubt: Doubt | None) -> Row:
-    """Return the line of a topic with the messages that were left out before an estimator met them."""
-    if doubt is None:
+def _whole(row: Row, left_out: Rejections) -> Row:
+    """Return a line on a topic with the messages that were left out before an estimator met them."""
+    if row.topic not in left_out:
         return row
-    why = "; ".join(filter(None, (row.why, doubt.why)))
-    return row._replace(messages=row.messages + doubt.left_out, why=why)
+    why = "; ".join(filter(None, (row.why, left_out.sentence(row.topic))))
+    return row._replace(messages=row.messages + left_out[row.topic].total(), why=why)
 
 
 def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:

@@ -177,11 +177,17 @@ class MetricTable:
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """Return a table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
+    """Return a table of a result's folder; raises BadInput if it is damaged.
+
+    Arrow itself opens no name beyond the locale's characters.
+    """
     import pandas as pd
 
-    with path.open("rb") as file:
-        return pd.read_parquet(file)
+    try:
+        with path.open("rb") as file:
+            return pd.read_parquet(file)
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: the table is damaged ({error}); run the experiment again") from error
 
 
 def metric_tables(

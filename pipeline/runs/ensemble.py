@@ -20,12 +20,14 @@ from pipeline.runs.initial_states import Origin, start_from
 from pipeline.runs.settings import meanings_of
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
+from recorders.log.impossible import Rejections
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.replaying.usage import Row, Usage
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source, ensemble_of
+from replay.engine.streams.ensembles import ensemble_of
+from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import Errors, errors_at
 from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import Metric, find_metrics, plus
@@ -94,6 +96,7 @@ class Pass:
         stated: those that are not given, as the first log's channels state them; see `stated_of`.
         usages: what became of the measurements, by bound estimator.
         untaken: topics that estimators do not take.
+        left_out: impossible messages.
         seconds: that each estimator took, by label.
         refused: by estimator, why none of the runs can be replayed.
         input_sha256: a hash of the data that went in, where it was asked for.
@@ -108,12 +111,13 @@ class Pass:
     stated: dict[str, dict[str, str]] = field(default_factory=dict)
     usages: dict[str, Usage] = field(default_factory=dict)
     untaken: list[Row] = field(default_factory=list)
+    left_out: Rejections = field(default_factory=Rejections)
     meanings: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @property
     def coverage(self) -> list[Row]:
         """Return what became of every topic."""
-        return rows_of(self.usages, self.untaken, self.judge.doubts)
+        return rows_of(self.usages, self.untaken, self.judge.doubts, self.left_out)
 
     @property
     def timings(self) -> dict[str, dict[str, float]]:
@@ -131,11 +135,9 @@ class Pass:
         self.judge.merge(other.judge)
         self.seconds = plus(self.seconds, other.seconds)
         for name, usage in other.usages.items():
-            if name in self.usages:
-                self.usages[name].merge(usage)
-            else:
-                self.usages[name] = usage
+            self.usages.setdefault(name, Usage(name)).merge(usage)
         self.untaken = added(self.untaken, other.untaken)
+        self.left_out = self.left_out.plus([other.left_out])
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
@@ -238,6 +240,7 @@ def replay_parts(
         done.meanings = meanings_of(bound)
         done.usages = report.usages
         done.untaken = untaken(part.sources, estimators, bound, order)
+        done.left_out = Rejections().plus(source.rejections for source in part.sources)
         if passes:
             passes[0].merge(done)
         else:

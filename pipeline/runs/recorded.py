@@ -16,7 +16,8 @@ from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import Report, collect
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Ensemble, MemorySource, Source, memory_source
+from replay.engine.streams.ensembles import Ensemble
+from replay.engine.streams.sources import MemorySource, Source, memory_source
 from replay.judging.errors.evaluation import Errors, Innovations, split_topic
 from replay.judging.judge import TIME_BINS, Judge
 from replay.judging.metrics.measuring import Output, find_metrics, measure

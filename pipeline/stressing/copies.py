@@ -23,8 +23,9 @@ from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import Report, collect
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.ensembles import Ensemble
 from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import Ensemble, MemorySource
+from replay.engine.streams.sources import MemorySource
 from replay.judging.judge import Judge
 
 

@@ -31,8 +31,9 @@ from recorders.parameters import merge, nested
 from replay.engine.replaying.estimator import Bound, Initialized, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.ensembles import Ensemble
 from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, Source
+from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import Sums, plus

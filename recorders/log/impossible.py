@@ -61,8 +61,7 @@ def impossible(stream: Stream) -> Iterator[Impossible]:
         column = stream.columns.get(entry.name)
         if column is None or column.dtype.kind != "f" or not column.size:
             continue
-        flat = column.reshape(-1)
-        squares = float(flat @ flat)  # one quick pass for most columns
+        squares = _squares(column.reshape(-1))
         if squares <= LEAST**2:
             continue
         names = _components(stream, entry.name)
@@ -92,7 +91,7 @@ def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, C
         wrong.append(("its stamp is years from those of most messages", outside))
     kept = np.ones(len(stream) if wrong else 0, bool)
     for words, rows in wrong:
-        found[words] = int(np.count_nonzero(rows & kept))
+        found[words] += int(np.count_nonzero(rows & kept))
         kept &= ~rows
     found = +found
     return (stream.take(kept), found) if found else (stream, found)
@@ -119,6 +118,29 @@ def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
     return int(together[edges[most]]), int(together[edges[most + 1] - 1])
 
 
+class Rejections(dict[str, Counter[str]]):
+    """Counts messages that are left out, being impossible: by topic, and by what is wrong."""
+
+    def note(self, topic: str, found: Counter[str]) -> None:
+        """Note what a read of a topic, whole or in part, left out; it may be read again."""
+        self[topic] = self.get(topic, Counter()) | found
+
+    def sentence(self, topic: str) -> str:
+        """Say what is left out of a topic."""
+        return "; ".join(
+            f"{count} {'message is' if count == 1 else 'messages are'} left out: {why}"
+            for why, count in self[topic].items()
+        )
+
+    def plus(self, others: Iterable["Rejections"]) -> "Rejections":
+        """Add up what was left out of several runs."""
+        total = Rejections(self)
+        for other in others:
+            for topic, found in other.items():
+                total[topic] = total.get(topic, Counter()) + found
+        return total
+
+
 @lru_cache(maxsize=1024)
 def limit_of(name: str) -> float:
     """Return the largest number that a field or component can be, by the unit in its name.
@@ -127,6 +149,12 @@ def limit_of(name: str) -> float:
     (1000000000000.0, 1e+50, 1e+50)
     """
     return LIMITS.get(name.rpartition("_")[2], LIMIT)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _squares(values: NDArray[np.float64]) -> float:
+    """Add up squares, in one quick pass: no value is larger than their root."""
+    return float(values @ values)
 
 
 def _components(stream: Stream, field: str) -> list[str]:

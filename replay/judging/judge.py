@@ -263,16 +263,10 @@ class Judge:
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """Return by topic what is doubtful about a truth, or left out, in the first run that has it."""
+        """Return by topic what is doubtful about a truth, of the first run that has something."""
         found = dict(self._doubts)
-        for source, truths in zip(self._sources, self._truths, strict=True):
-            left_out = {
-                topic: Doubt(
-                    source.topics[topic].messages, source.rejections.sentence(topic), counts.total()
-                )
-                for topic, counts in source.rejections.items()
-            }
-            found = left_out | truths.doubts | found
+        for truths in self._truths:
+            found = truths.doubts | found
         return found
 
     @property

@@ -1,6 +1,6 @@
 """`make faults`: every part of the fault campaign beside this file that can run, and what held.
 
-python -m tests.faults [PART ...] [--seconds 600] [--seed 0]
+python -m tests.faults [PART ...] [--seconds 500] [--seed 0] [--most N]
 """
 
 import argparse
@@ -21,14 +21,19 @@ def main() -> int:
     """Run the parts for equal shares of the time; 0 where all that was tried held."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("parts", nargs="*", help=f"any of {', '.join(PARTS)} [default: all]")
-    parser.add_argument("--seconds", type=float, default=600, help="for all parts together")
+    parser.add_argument(
+        "--seconds", type=float, default=500, help="for all parts together, but for those that count"
+    )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--most", type=int, help="how often each part tries at most")
     asked = parser.parse_args()
     parts = asked.parts or PARTS
     rows, notes = [], []
     for part in parts:
         rng = np.random.default_rng([asked.seed, PARTS.index(part)])
-        tally = importlib.import_module(f"tests.faults.{part}").run(asked.seconds / len(parts), rng)
+        tally = importlib.import_module(f"tests.faults.{part}").run(
+            asked.seconds / len(PARTS), rng, asked.most
+        )
         rows.append((part, tally.tried, tally.held))
         notes += [f"{part}: {note}" for note in tally.notes]
     for note in notes:

@@ -213,9 +213,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         tables = {path.stem: read_table(path) for path in sorted(folder.glob("tables/*.parquet"))}
         figures = sorted(map(_figure, sorted(folder.glob("figures/*.svg"))), key=_rank)
     except (OSError, ValueError) as error:
-        raise BadInput(
-            f"{folder}: a table or figure is damaged ({error}); run the experiment again"
-        ) from error
+        raise BadInput(f"{folder}: a figure is damaged ({error}); run the experiment again") from error
     begun = opening(result, tables, _timings(folder, result))
     labels = [*(result.settings.get("estimators") or {}), *begun.found.labels, *begun.found.bounds]
     labels = list(dict.fromkeys(map(str, labels)))

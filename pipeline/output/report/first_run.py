@@ -12,7 +12,8 @@ from PIL import Image
 from recorders.atomic import scratch_folder
 from recorders.log import open_log, schemas, topics_of
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.streams.sources import LogSource, Source, ensemble_of
+from replay.engine.streams.ensembles import ensemble_of
+from replay.engine.streams.sources import LogSource, Source
 from replay.judging.errors.evaluation import Innovations, split_topic
 from replay.judging.judge import Judge
 

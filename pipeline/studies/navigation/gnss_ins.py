@@ -40,8 +40,9 @@ from recorders.importers.tables.mapping import adapted, read_mapping, recordings
 from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.ensembles import Ensemble
 from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import Ensemble, MemorySource, memory_source
+from replay.engine.streams.sources import MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # of three components
 RUNS_AT_ONCE = 2  # in memory, with their estimates

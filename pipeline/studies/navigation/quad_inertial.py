@@ -34,7 +34,8 @@ from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Ensemble, MemorySource, memory_source
+from replay.engine.streams.ensembles import Ensemble
+from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
 from replay.estimators.networks.covariance_intersection import fuse
 

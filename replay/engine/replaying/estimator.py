@@ -23,7 +23,8 @@ from replay.engine.compiling.kernel_source import DoesNotCompile
 from replay.engine.renamed import renamed
 from replay.engine.replaying.truth import refuse_truths, truths_among
 from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.sources import Ensemble, Source, ensemble_of
+from replay.engine.streams.ensembles import Ensemble, ensemble_of
+from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import Components
 
 

@@ -19,8 +19,9 @@ from replay.engine.replaying.late import Late, taking_late
 from replay.engine.replaying.monitor import RunMonitor
 from replay.engine.replaying.usage import Usage
 from replay.engine.streams.blocks import Block, Ragged, gather, join
+from replay.engine.streams.ensembles import Ensemble, ensemble_of
 from replay.engine.streams.priors import start_of_runs
-from replay.engine.streams.sources import Ensemble, Source, ensemble_of
+from replay.engine.streams.sources import Source
 
 BLOCK_MESSAGES = 1 << 16
 # Of a run, those that an initialization looks at.

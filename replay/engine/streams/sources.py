@@ -1,11 +1,10 @@
 """Reads the runs of a replay: from log files, or from recordings in memory; one run or many."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import zip_longest
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -21,9 +20,9 @@ from recorders.log import (
     read_span,
     read_streams,
 )
-from recorders.log.impossible import YEAR_NS, main_span, possible
+from recorders.log.impossible import YEAR_NS, Rejections, main_span, possible
 from recorders.recording import Recording
-from replay.engine.streams.blocks import Block, Findings, Ragged, gather, is_in_order, merge_events
+from replay.engine.streams.blocks import gather, is_in_order
 
 
 class Source(Protocol):
@@ -64,7 +63,7 @@ class Source(Protocol):
         """Return the run without a span."""
 
     @property
-    def rejections(self) -> "Rejections":
+    def rejections(self) -> Rejections:
         """Return what was left out of all that was read, being impossible."""
 
 
@@ -77,21 +76,6 @@ def is_sensed(source: Source, topic: str) -> bool:
     except BadInput:
         return False
     return True
-
-
-class Rejections(dict[str, Counter[str]]):
-    """Counts messages that are left out, being impossible: by topic, and by what is wrong."""
-
-    def note(self, topic: str, found: Counter[str]) -> None:
-        """Note what a read of a topic, whole or in part, left out; it may be read again."""
-        self[topic] = self.get(topic, Counter()) | found
-
-    def sentence(self, topic: str) -> str:
-        """Say what is left out of a topic."""
-        return "; ".join(
-            f"{count} {'message is' if count == 1 else 'messages are'} left out: {why}"
-            for why, count in self[topic].items()
-        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -352,121 +336,3 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     return MemorySource(
         {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
     )
-
-
-SourceType = TypeVar("SourceType", bound=Source)
-# Of a block of few messages it is kept what a few filters make of it: of more that takes much memory.
-FEW_MESSAGES, FEW_FILTERS = 1 << 13, 4
-
-
-class Ensemble(list[SourceType]):
-    """Represents runs that are replayed together: they hold the same topics.
-
-    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept,
-    with what was found of them (`findings`); no run may be added to it or taken from it.
-    """
-
-    def __init__(self, sources: Iterable[SourceType]) -> None:
-        super().__init__(sources)
-        self.findings = Findings()
-        self._kept: dict[tuple[str, Clock], Ragged] = {}
-        self._alike: set[str] = set()
-
-    def __reduce__(self) -> tuple[type["Ensemble[SourceType]"], tuple[list[SourceType]]]:
-        return type(self), (list(self),)
-
-    @cached_property
-    def starts_ns(self) -> dict[int, int]:
-        """Find where the replayed spans begin, by run; of those that do not begin with their run."""
-        starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
-        return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
-
-    def require_alike(self, topics: Iterable[str]) -> None:
-        """Raise BadInput where a run does not hold these topics as the first one does."""
-        first = self[0]
-        for topic in topics:
-            if topic in self._alike:
-                continue
-            here = first.topics[topic]
-            stated = here.schema_name, here.metadata
-            for source in self:
-                there = source.topics.get(topic)
-                if there is None or (there.schema_name, there.metadata) != stated:
-                    raise BadInput(
-                        f"{source.name}: topic {topic} differs from that of {first.name}; the runs of "
-                        "an ensemble have the same topics and types, so replay this one on its own"
-                    )
-            self._alike.add(topic)
-
-    def read(self, topics: Sequence[str]) -> dict[str, Ragged]:
-        """Return whole topics, in publish-time order."""
-        if self._recordings:
-            return self._laid_out(topics, "publish_time")
-        runs = [source.read(topics) for source in self]
-        return {topic: gather([run[topic] for run in runs]) for topic in topics}
-
-    def blocks(
-        self, topics: Sequence[str], order: Clock, block_messages: int
-    ) -> Iterator[dict[str, Ragged]]:
-        """Return the next block of every run, until all runs are at their end.
-
-        The runs need not be at the same time: each has its own state. Recordings are one block.
-        """
-        if not topics:
-            return
-        if self._are_whole:
-            block = self._laid_out(topics, order)
-            if any(len(ragged) for ragged in block.values()):
-                yield block
-            return
-        empty = {topic: self[0].empty(topic) for topic in topics}
-        ended: dict[str, Stream] = {}
-        runs = [source.blocks(topics, order, block_messages) for source in self]
-        for blocks in zip_longest(*runs, fillvalue=ended):
-            yield {
-                topic: gather([block.get(topic, nothing) for block in blocks])
-                for topic, nothing in empty.items()
-            }
-
-    def block(self, streams: dict[str, Ragged], order: Clock) -> Block:
-        """Return messages with their order in time; of whole recordings as they were found before."""
-
-        def merged(findings: Findings | None = None) -> Block:
-            return Block(streams, merge_events(streams, order), findings=findings)
-
-        if any(self._kept.get((topic, order)) is not ragged for topic, ragged in streams.items()):
-            return merged()
-        if sum(map(len, streams.values())) > FEW_MESSAGES:
-            return merged()
-        return self.findings.once(("block", order, *streams), lambda: merged(Findings(FEW_FILTERS)))
-
-    @cached_property
-    def _recordings(self) -> list[MemorySource]:
-        """Return the runs, where all are in memory."""
-        found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
-        return found if len(found) == len(self) else []
-
-    @property
-    def is_in_memory(self) -> bool:
-        """Tell whether all runs are recordings."""
-        return bool(self._recordings)
-
-    @cached_property
-    def _are_whole(self) -> bool:
-        """Tell whether all runs are in memory, without spans."""
-        return bool(self._recordings) and all(run.is_whole for run in self._recordings)
-
-    def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
-        """Return topics of recordings, each run by one of the clocks."""
-        for topic in topics:
-            if (topic, order) not in self._kept:
-                together = gather([source.stream_of(topic) for source in self._recordings])
-                if not is_in_order(together, order):
-                    together = gather([source.in_order(topic, order) for source in self._recordings])
-                self._kept[topic, order] = together
-        return {topic: self._kept[topic, order] for topic in topics}
-
-
-def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:
-    """Return the ensemble of these runs, which may be one already."""
-    return sources if isinstance(sources, Ensemble) else Ensemble(sources)

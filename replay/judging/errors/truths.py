@@ -20,11 +20,10 @@ BLOCK_MESSAGES = 1 << 16
 
 
 class Doubt(NamedTuple):
-    """Holds what is doubtful about a topic of so many messages, of which some are left out."""
+    """Holds what is doubtful about a truth of so many messages."""
 
     messages: int
     why: str
-    left_out: int = 0
 
 
 class Truths:

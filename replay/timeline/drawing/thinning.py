@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
+from recorders.log.impossible import Rejections
 from replay.engine.streams.failures import join_streams
-from replay.engine.streams.sources import Rejections, Source, is_sensed
+from replay.engine.streams.sources import Source, is_sensed
 from replay.judging.errors.evaluation import PER_ROW, Errors, Floats, errors_at
 from replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 

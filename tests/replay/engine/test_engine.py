@@ -17,8 +17,9 @@ from recorders.recording import Recording, record_run
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.replaying.replaying import Report, collect, replay
 from replay.engine.streams.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
+from replay.engine.streams.ensembles import Ensemble
 from replay.engine.streams.results import state_stream
-from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, Source, memory_source
+from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 
