@@ -7,7 +7,7 @@ w, x, y, z, and more that is no part of the pose.
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -25,6 +25,10 @@ Format = Literal["tum", "kitti", "euroc"]
 TOLERANCE = 1e-3
 # Squares of positions that are farther away, and their sums, may be no numbers any more.
 FARTHEST_M = 1e100
+# Of a text's last line; a number that is cut off is still a number.
+NO_END = (
+    "the last line does not end with a newline, so it may be cut off within it; it was read as it is"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,7 @@ class Trajectory:
         rotation: (n, 3, 3) from the body's frame to that of the positions, to as many digits as the
             source states; None where there is none.
         time_ns: (n,); None where there are no stamps.
-        notes: sentences on what was mended.
+        notes: sentences on what was mended or is doubtful.
     """
 
     name: str
@@ -123,7 +127,8 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
 
     Raises BadInput that names the line where the file holds no trajectory.
     """
-    numbers, lines = zip(*_lines(Path(path)), strict=True)
+    text = _text(Path(path))
+    numbers, lines = zip(*_lines(path, text), strict=True)
     found = _recognised(path, numbers[0], lines[0]) if format is None else _known(format)
     layout = LAYOUTS[found]
     rows = list(map(_fields, lines))
@@ -152,27 +157,32 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         _refuse(bad, path, numbers, "has a quaternion that is not of unit length; scale it to 1")
         rotation = Rotation.from_quat(quaternion, scalar_first=found == "euroc").as_matrix()
     position_m = values[:, layout.position]
+    doubts = () if text.endswith("\n") else (f"{path}: {NO_END}",)
     if layout.time_ns is None:
-        return Trajectory(str(path), position_m, rotation)
+        return Trajectory(str(path), position_m, rotation, notes=doubts)
     stamps = [layout.time_ns(fields[0]) for fields in rows]
     beyond = [abs(stamp) >= 2**63 for stamp in stamps]
     _refuse(beyond, path, numbers, f"has a stamp beyond the year 2262; {_wanted(found)}")
-    return _in_order(str(path), position_m, rotation, np.array(stamps, np.int64))
+    poses = _in_order(str(path), position_m, rotation, np.array(stamps, np.int64))
+    return replace(poses, notes=(*poses.notes, *doubts))
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """List the lines that hold something, with their numbers."""
+def _text(path: Path) -> str:
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            lines = [
-                (number, line.strip())
-                for number, line in enumerate(file, 1)
-                if line.strip() and not line.lstrip().startswith("#")
-            ]
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror}; give a trajectory file") from None
     except UnicodeDecodeError:
         raise BadInput(f"{path}: is not a text file; give a trajectory as TUM, KITTI or EuRoC") from None
+
+
+def _lines(path: object, text: str) -> list[tuple[int, str]]:
+    """List the lines that hold something, with their numbers."""
+    lines = [
+        (number, line.strip())
+        for number, line in enumerate(text.split("\n"), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not lines:
         raise BadInput(f"{path}: has no poses; give a trajectory as TUM, KITTI or EuRoC")
     return lines

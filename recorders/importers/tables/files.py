@@ -27,7 +27,7 @@ from recorders.errors import BadInput, choices
 from recorders.importers.tables.blocks import BLOCK_BYTES, COMMENTS, Utf8, blocks_of, delimited, lines_of
 from recorders.importers.tables.npz import columns_of
 from recorders.parsing import DEEPEST
-from recorders.trajectories import read_trajectory
+from recorders.trajectories import NO_END, read_trajectory
 
 Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory"]
 Batch = dict[str, pa.Array]
@@ -48,13 +48,14 @@ DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowEx
 
 @dataclass
 class Table:
-    """Reads a file's table: holds its columns, what was left out of its rows, and what was mended."""
+    """Reads a file's table: its columns, what was left out of its rows, mended, and is doubtful."""
 
     path: Path
     columns: list[str]
     _read: Read
     left_out: Counter[str] = field(default_factory=Counter)
     mended: str = ""
+    doubts: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         _check_width(self.path, len(self.columns))
@@ -173,15 +174,16 @@ def _open_text(
     else:
         named = _cells(comments[-1], delimiter) if comments else []
         named = named if len(named) == width else []
-    columns, left_out = _unique(names or named, width, path), Counter[str]()
+    columns, left_out, doubts = _unique(names or named, width, path), Counter[str](), set[str]()
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         with open_decompressed(path) as file:
             for _ in range(skipped):
                 file.readline()
-            yield from _text_batches(file, columns, wanted, delimiter, decimal, left_out)
+            blocks = blocks_of(file, doubts)
+            yield from _text_batches(blocks, columns, wanted, delimiter, decimal, left_out)
 
-    return Table(path, columns, read, left_out)
+    return Table(path, columns, read, left_out, doubts=doubts)
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -206,7 +208,7 @@ def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
 
 
 def _text_batches(
-    file: BinaryIO,
+    blocks: Iterator[bytes],
     columns: list[str],
     wanted: Mapping[str, bool],
     delimiter: str,
@@ -219,7 +221,7 @@ def _text_batches(
 
     is_spaced = delimiter == " "
     batches = pyarrow.csv.open_csv(
-        Utf8(delimited(blocks_of(file)) if is_spaced else blocks_of(file)),
+        Utf8(delimited(blocks) if is_spaced else blocks),
         pyarrow.csv.ReadOptions(column_names=columns, block_size=BLOCK_BYTES),
         pyarrow.csv.ParseOptions(
             delimiter="," if is_spaced else delimiter, invalid_row_handler=leave_out
@@ -282,9 +284,11 @@ def _open_parquet(path: Path) -> Table:
 
 
 def _open_json(path: Path) -> Table:
+    doubts = set[str]()
+
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         with open_decompressed(path) as file:
-            for block in blocks_of(file):
+            for block in blocks_of(file, doubts):
                 _check_depth(block)
                 for batch in _flat_batches(pyarrow.json.read_json(pa.BufferReader(block))):
                     missing = pa.nulls(len(next(iter(batch.values()))))
@@ -293,7 +297,7 @@ def _open_json(path: Path) -> Table:
     first = next(read({}), None)
     if first is None:
         raise BadInput(f"{path}: has no rows; give one JSON object per line")
-    return Table(path, list(first), read)
+    return Table(path, list(first), read, doubts=doubts)
 
 
 def _check_depth(block: bytes) -> None:
@@ -324,9 +328,14 @@ def _open_trajectory(path: Path) -> Table:
         columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion.T, strict=True))
     whole: Batch = {} if found.time_ns is None else {"time_ns": pa.array(found.time_ns)}
     whole |= {name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()}
-    mended = "; ".join(note.removeprefix(f"{path}: ") for note in found.notes)
+    notes = [note.removeprefix(f"{path}: ") for note in found.notes]
+    doubts = {NO_END} & {*notes}
     return Table(
-        path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), mended=mended
+        path,
+        list(whole),
+        lambda wanted: iter([{name: whole[name] for name in wanted}]),
+        mended="; ".join(note for note in notes if note not in doubts),
+        doubts=doubts,
     )
 
 
