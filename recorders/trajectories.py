@@ -31,6 +31,10 @@ MOST_S, SLOWEST_S, FASTEST_NS = 9.2e9, 1e4, 1e6
 _NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
 # Squares of positions that are farther away, and their sums, may be no numbers any more.
 FARTHEST_M = 1e100
+# Of a text's last line; a number that is cut off is still a number.
+NO_END = (
+    "the last line does not end with a newline, so it may be cut off within it; it was read as it is"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,7 @@ class Trajectory:
         rotation: (n, 3, 3) from the body's frame to that of the positions, to as many digits as the
             source states; None where there is none.
         time_ns: (n,); None where there are no stamps.
-        notes: sentences on the format that was found, and on what was corrected.
+        notes: sentences on the format that was found, and on what was corrected or is doubtful.
     """
 
     name: str
@@ -130,7 +134,8 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
 
     Raises BadInput that names the line where the file holds no trajectory, or may be of two formats.
     """
-    comment, numbers, lines = _lines(Path(path))
+    text = _text(Path(path))
+    comment, numbers, lines = _lines(path, text)
     rows = list(map(_fields, lines))
     found = _recognised(path, numbers, lines, rows) if format is None else _known(format)
     layout = LAYOUTS[found]
@@ -167,32 +172,37 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         rotation = Rotation.from_quat(quaternion, scalar_first=found == "euroc").as_matrix()
     position_m = values[:, layout.position]
     note = f"{path}: read as {found.upper().replace('EUROC', 'EuRoC')} ({layout.columns})"
+    notes = (note,) if text.endswith("\n") else (note, f"{path}: {NO_END}")
     if layout.time_ns is None:
-        return Trajectory(str(path), position_m, rotation, notes=(note,))
+        return Trajectory(str(path), position_m, rotation, notes=notes)
     stamps: list[int | Decimal] = [layout.time_ns(fields[0]) for fields in rows]
     beyond = [not -(2**63) < stamp < 2**63 for stamp in stamps]
     _refuse(beyond, path, numbers, f"has a stamp beyond the year 2262; {_wanted(found)}")
     _refuse([stamp != int(stamp) for stamp in stamps], path, numbers, _NO_NS)
-    return _in_order(str(path), position_m, rotation, np.array(list(map(int, stamps)), np.int64), note)
+    time_ns = np.array(list(map(int, stamps)), np.int64)
+    return _in_order(str(path), position_m, rotation, time_ns, notes)
 
 
-def _lines(path: Path) -> tuple[str, list[int], list[str]]:
-    """Return the last comment before the poses, and the lines that hold something: numbers and texts."""
-    comment = ""
-    numbers: list[int] = []
-    lines: list[str] = []
+def _text(path: Path) -> str:
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            for number, line in enumerate(file, 1):
-                if line.lstrip().startswith("#"):
-                    comment = comment if lines else line
-                elif line.strip():
-                    numbers.append(number)
-                    lines.append(line.strip())
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror}; give a trajectory file") from None
     except UnicodeDecodeError:
         raise BadInput(f"{path}: is not a text file; give a trajectory as TUM, KITTI or EuRoC") from None
+
+
+def _lines(path: object, text: str) -> tuple[str, list[int], list[str]]:
+    """Return the last comment before the poses, and the lines that hold something: numbers and texts."""
+    comment = ""
+    numbers: list[int] = []
+    lines: list[str] = []
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.lstrip().startswith("#"):
+            comment = comment if lines else line
+        elif line.strip():
+            numbers.append(number)
+            lines.append(line.strip())
     if not lines:
         raise BadInput(f"{path}: has no poses; give a trajectory as TUM, KITTI or EuRoC")
     return comment, numbers, lines
@@ -296,13 +306,17 @@ def _refuse(bad: ArrayLike, path: object, numbers: Sequence[int], what: str) -> 
 
 
 def _in_order(
-    name: str, position_m: Floats, rotation: Floats, time_ns: NDArray[np.int64], note: str
+    name: str,
+    position_m: Floats,
+    rotation: Floats,
+    time_ns: NDArray[np.int64],
+    notes: tuple[str, ...],
 ) -> Trajectory:
     steps = np.diff(time_ns)
     if not len(steps) or steps.min() > 0:
-        return Trajectory(name, position_m, rotation, time_ns, (note,))
+        return Trajectory(name, position_m, rotation, time_ns, notes)
     back, again = int((steps < 0).sum()), len(time_ns) - len(np.unique(time_ns))
-    notes = (note, f"{name}: {back} stamps go back, {again} repeat; the poses were sorted")
+    notes = (*notes, f"{name}: {back} stamps go back, {again} repeat; the poses were sorted")
     order = np.argsort(time_ns, kind="stable")
     return Trajectory(name, position_m[order], rotation[order], time_ns[order], notes)
 

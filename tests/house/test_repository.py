@@ -192,3 +192,16 @@ def test_environment_variables_are_read_in_one_place() -> None:
         "replay/engine/compiling/kernels/native.py",
         "replay/timeline/viewer.py",
     }
+
+
+def test_every_promise_of_security_names_tests_that_there_are() -> None:
+    text = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (.*) \| (.*) \|$", text, re.MULTILINE)[1:]
+    assert len(rows) >= 10
+    for promise, kept in rows:
+        named = re.findall(r"((?:`test_\w+`(?:, | and )?)+) in `(tests/\S+\.py)`", kept)
+        assert named, promise
+        for tests, path in named:
+            there = (ROOT / path).read_text(encoding="utf-8")
+            for test in re.findall(r"test_\w+", tests):
+                assert f"def {test}(" in there, (path, test)

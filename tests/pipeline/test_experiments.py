@@ -114,10 +114,10 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     values = json.loads(text)
     assert list(values) == [
         *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"],
-        *["bounds", "intervals", "alarms", "causes"],
+        *["bounds", "intervals", "alarms", "causes", "kind"],
     ]
     assert set(values["files"]) == {*_contents(result), "timeline.rrd", TIMINGS}
-    assert values["experiment"] == "landmarks"
+    assert (values["experiment"], values["kind"]) == ("landmarks", "run")
     assert values["settings"]["seed"] == 5
     assert values["settings"]["record"]["parameters"] == {"duration_s": 2}
     assert re.fullmatch("[0-9a-f]{64}", values["input_sha256"])

@@ -17,7 +17,7 @@ VALUES = "[[tables.streams]]\ntopic = '/v'\nbecomes = 'VectorMeasurement'\nfield
 def guessed(folder: Path, text: str) -> fl.MemorySource:
     """The log of a table by what is guessed of it."""
     table, mapping = folder / "own.csv", folder / "own.toml"
-    table.write_text(text, encoding="utf-8")
+    table.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
     mapping.write_text(guess([table]), encoding="utf-8")
     return fl.import_("table", table, mapping=str(mapping))
 
@@ -25,7 +25,7 @@ def guessed(folder: Path, text: str) -> fl.MemorySource:
 def read(folder: Path, head: str, cells: list[str]) -> list[str]:
     """The stamps of a table with these times, by a mapping with this head."""
     table, mapping = folder / "own.csv", folder / "own.toml"
-    table.write_text("\n".join(["t;v", *(f"{cell};1,5" for cell in cells)]), encoding="utf-8")
+    table.write_text("\n".join(["t;v", *(f"{cell};1,5" for cell in cells), ""]), encoding="utf-8")
     mapping.write_text(f"[[tables]]\ndecimal = ','\n{head}\ncomponents = 'v'\n", encoding="utf-8")
     stream = fl.import_("table", table, mapping=str(mapping))["/v"]
     assert stream["value"][0] == 1.5
@@ -60,7 +60,7 @@ def test_dates_are_read_as_they_are_written(tmp_path: Path, cell: str, stamp: st
 def test_no_rate_stands_for_times_that_cannot_be_read(tmp_path: Path) -> None:
     table = tmp_path / "own.csv"
     rows = [f"{row};14:03 and {row} s;{row}.5;0.1" for row in range(20)]
-    table.write_text("\n".join(["number;when;speed;yaw_rate", *rows]))
+    table.write_text("\n".join(["number;when;speed;yaw_rate", *rows, ""]))
     with pytest.raises(BadInput, match="column when holds times such as '14:03 and 0 s', whose format"):
         guess([table])
 

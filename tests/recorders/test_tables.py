@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.importers.tables import blocks, files
+from recorders.importers.tables.blocks import NO_END
 from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
@@ -120,7 +121,7 @@ def test_one_table_in_many_formats(form: str, imported: Callable[..., Any], tmp_
             {"time": t, "imu": {"ax": ax, "ay": ay, "az": az}, "rate": [gx, gy, gz]}
             for t, ax, ay, az, gx, gy, gz in frame.itertuples(index=False)
         ]
-        path.write_text("\n".join(map(json.dumps, lines)))
+        path.write_text("\n".join([*map(json.dumps, lines), ""]))
         for name in ("ax", "ay", "az"):
             mapping = mapping.replace(f'"{name}"', f'"imu.{name}"')
         for index, name in enumerate(("gx", "gy", "gz")):
@@ -539,6 +540,23 @@ def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any],
     assert read["state"][1, 2] == pytest.approx(10, abs=1e-3)  # 111 m away the ellipsoid is 1 mm lower
 
 
+@pytest.mark.parametrize("form", ["csv", "jsonl", "tum", "kitti"])
+def test_a_last_line_without_an_end_is_told(form: str, tmp_path: Path) -> None:
+    """A number that is cut off is a number all the same: 12.5 of 12.5678."""
+    whole = {
+        "csv": "t,x\n0,1.5\n1,12.5678\n",
+        "jsonl": '{"t": 0, "x": 1.5}\n{"t": 1, "x": 12.5678}\n',
+        "tum": "0 0 0 0 0 0 0 1\n1 12 0 0 0 0 0 1\n",
+        "kitti": "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 12\n",
+    }[form]
+    path = tmp_path / f"rows.{form}"
+    for text, is_told in ((whole, False), (whole[:-1], True)):
+        path.write_text(text)
+        table = files.open_table(path, "trajectory" if form in ("tum", "kitti") else None)
+        assert sum(len(next(iter(batch.values()))) for batch in table.batches(table.columns)) == 2
+        assert table.doubts == ({NO_END} if is_told else set())
+
+
 def test_blocks_make_no_difference(
     imported: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -547,7 +565,7 @@ def test_blocks_make_no_difference(
         f"{1000 + row - 5 * (row == 70)},{50 + row / 1e4 if row > 40 else ''},8,100"
         for row in range(100)
     ]
-    text = "t,lat,lon,h\n" + "\n".join(rows)
+    text = "\n".join(["t,lat,lon,h", *rows, ""])
     whole, notes = imported(text, FIX)
     for module in (blocks, files):
         monkeypatch.setattr(module, "BLOCK_BYTES", 100)

@@ -6,14 +6,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
+from recorders.trajectories import NO_END
+
 BLOCK_BYTES = 1 << 23
 COMMENTS = (b"%", b"#")
 
 
-def blocks_of(file: BinaryIO) -> Iterator[bytes]:
+def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
     """Yield whole lines, as many as a block takes; raises ValueError where a line is longer.
 
-    Of the last line, which may have no end, there is no block by itself.
+    Of the last line, which may have no end, there is no block by itself; that is added to `doubts`.
     """
     lines = rest = b""
     while block := file.read(BLOCK_BYTES):
@@ -25,6 +27,8 @@ def blocks_of(file: BinaryIO) -> Iterator[bytes]:
             lines = whole + newline
         if len(rest) > BLOCK_BYTES:
             raise ValueError(f"it has a line of more than {BLOCK_BYTES >> 20} MB")
+    if rest.strip():
+        doubts.add(NO_END)
     if lines or rest:
         yield lines + rest
 

@@ -41,7 +41,7 @@ from recorders.importers.tables.blocks import (
 from recorders.importers.tables.layout import Layout, layout_of
 from recorders.importers.tables.npz import columns_of
 from recorders.parsing import DEEPEST
-from recorders.trajectories import read_trajectory
+from recorders.trajectories import NO_END, read_trajectory
 
 Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc"]
 Batch = dict[str, pa.Array]
@@ -70,6 +70,7 @@ class Table:
         left_out: why how many rows were left out.
         mended: what was mended.
         units: what a row of units says, by column.
+        doubts: what is doubtful about its rows.
     """
 
     path: Path
@@ -78,6 +79,7 @@ class Table:
     left_out: Counter[str] = field(default_factory=Counter)
     mended: str = ""
     units: dict[str, str] = field(default_factory=dict)
+    doubts: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         _check_width(self.path, len(self.columns))
@@ -252,6 +254,7 @@ def _open_text(path: Path, more: Sequence[Path], options: TextOptions) -> Table:
         raise BadInput(f"{path}: has a header line but no rows; give a table with rows")
     _check_width(path, found.width)
     columns, left_out = _unique(options.names or found.names, found.width, path), Counter[str]()
+    doubts: set[str] = set()
     if found.above:
         left_out["that are above the names of the columns"] = found.above
     if found.units:
@@ -261,10 +264,11 @@ def _open_text(path: Path, more: Sequence[Path], options: TextOptions) -> Table:
         with _open_joined(paths) as file:
             for _ in range(found.skipped):
                 file.readline()
-            yield from _text_batches(file, columns, wanted, found, options.decimal, left_out)
+            blocks = blocks_of(file, doubts)
+            yield from _text_batches(blocks, columns, wanted, found, options.decimal, left_out)
 
     units = {name: unit for name, unit in zip(columns, found.units, strict=False) if unit}
-    return Table(path, columns, read, left_out, units=units)
+    return Table(path, columns, read, left_out, units=units, doubts=doubts)
 
 
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
@@ -279,7 +283,7 @@ def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
 
 
 def _text_batches(
-    file: BinaryIO,
+    blocks: Iterator[bytes],
     columns: list[str],
     wanted: Mapping[str, bool],
     layout: Layout,
@@ -291,7 +295,7 @@ def _text_batches(
         return "skip"
 
     is_spaced = layout.delimiter == " "
-    rows = without(blocks_of(file), layout.heads, left_out)
+    rows = without(blocks, layout.heads, left_out)
     batches = pyarrow.csv.open_csv(
         Chunks(utf8(delimited(rows) if is_spaced else rows)),
         pyarrow.csv.ReadOptions(column_names=columns, block_size=BLOCK_BYTES),
@@ -364,9 +368,11 @@ def _root(name: str, columns: Sequence[str]) -> str:
 
 
 def _open_json(path: Path) -> Table:
+    doubts = set[str]()
+
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         with open_decompressed(path) as file:
-            for block in blocks_of(file):
+            for block in blocks_of(file, doubts):
                 _check_depth(block)
                 for batch in _flat_batches(pyarrow.json.read_json(pa.BufferReader(block))):
                     missing = pa.nulls(len(next(iter(batch.values()))))
@@ -375,7 +381,7 @@ def _open_json(path: Path) -> Table:
     first = next(read({}), None)
     if first is None:
         raise BadInput(f"{path}: has no rows; give one JSON object per line")
-    return Table(path, list(first), read)
+    return Table(path, list(first), read, doubts=doubts)
 
 
 def _check_depth(block: bytes) -> None:
@@ -406,9 +412,14 @@ def _open_trajectory(path: Path, format: str | None) -> Table:  # noqa: A002
         columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion.T, strict=True))
     whole: Batch = {} if found.time_ns is None else {"time_ns": pa.array(found.time_ns)}
     whole |= {name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()}
-    mended = "; ".join(note.removeprefix(f"{path}: ") for note in found.notes)
+    notes = [note.removeprefix(f"{path}: ") for note in found.notes]
+    doubts = {NO_END} & {*notes}
     return Table(
-        path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), mended=mended
+        path,
+        list(whole),
+        lambda wanted: iter([{name: whole[name] for name in wanted}]),
+        mended="; ".join(note for note in notes if note not in doubts),
+        doubts=doubts,
     )
 
 

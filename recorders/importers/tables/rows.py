@@ -556,6 +556,8 @@ class Rows:
             notes[f"{name}: columns not taken"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, trajectory"] = self.table.mended
+        for doubt in sorted(self.table.doubts):
+            notes[name] += f"; {doubt}"
         for reason, count in self.table.left_out.items():
             notes[f"{name}: rows left out, {reason}"] = str(count)
         return notes
