@@ -45,6 +45,8 @@ QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
 
 ReadCounts = Counter[tuple[str, str]]
 _MOST_VEHICLES = 1000
+# Rows by which it is told whether the newest one is first.
+_LOOKED_AT = 1000
 # The column of the stamps that have a file of their own.
 _STAMP = "\0stamp"
 
@@ -267,6 +269,7 @@ class Rows:
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
         clock = self._time.model_copy(update={"zone": None, "rollover": None})
+        batch = {name: cells[:_LOOKED_AT] for name, cells in batch.items()}
         rows = np.arange(_size(batch))
         return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])
 
@@ -374,7 +377,9 @@ class Rows:
             name: self._read_ns(batch, clock, rows, readings[name])
             for name, clock in self._others.items()
         }
-        timed = np.all([each != NOT_A_TIME for each in (stamps, *others.values())], axis=0)
+        timed = stamps != NOT_A_TIME
+        for each in others.values():
+            timed &= each != NOT_A_TIME
         self._tell(self.path.name, "rows without a time are left out", int((~timed).sum()))
         order.follow(stamps[timed], rows[timed])
         if self._is_reversed:
