@@ -87,6 +87,7 @@ class Rows:
         self._vehicle = None if own.vehicle is None else self.table.column(own.vehicle)
         self._clocks: dict[str, tuple[Order, dict[str, Reading]]] = {}  # by vehicle
         self._reached: dict[str, int] = {}
+        self._vehicles: dict[str, str] = {}  # their names, by what they are in topics
         self._texts, self._numbers = self._wanted()
         self._batches = self._timed(self.table.batches(self._numbers, self._texts))
         self._next = next(self._batches, None)
@@ -254,7 +255,13 @@ class Rows:
             if not name:
                 continue
             which = np.flatnonzero(pc.fill_null(pc.equal(names, name), False).to_numpy(False))
-            self._names["vehicle"] = re.sub(r"\W+", "_", name).strip("_") or "_"
+            plain = re.sub(r"\W+", "_", name).strip("_") or "_"
+            if (other := self._vehicles.setdefault(plain, name)) != name:
+                raise BadInput(
+                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which are both "
+                    f"{plain} in topics; give them names of letters and digits"
+                )
+            self._names["vehicle"] = plain
             self._numbers_of.clear()
             yield {column: cells.take(pa.array(which)) for column, cells in batch.items()}, rows[which]
 
