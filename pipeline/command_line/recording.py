@@ -188,8 +188,8 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = Fals
     text = guess(paths)
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
-    for assumed in assumptions(text):
-        click.echo(printable(f"assumed: {assumed}"))
+    for sentence in assumptions(text):
+        click.echo(printable(sentence))
     if is_used:
         click.echo(printable(f"{mapping}: what was guessed and is imported by; read it"))
         return

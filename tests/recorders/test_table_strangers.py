@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from recorders.errors import BadInput
+from recorders.importers.tables import blocks, files
 from recorders.importers.tables.guessing import assumptions, guess
 from recorders.importers.tables.importer import TableParameters, read
 from recorders.log import Stream
@@ -433,3 +434,34 @@ def test_files_of_one_row_are_one_table(tmp_path: Path) -> None:
     (folder / "data" / f"{40:010d}.txt").write_text("49 8.4 115 0")
     with pytest.raises(BadInput, match=r"timestamps.txt: has 40 times, and there are more rows"):
         Got(folder, got.text)
+
+
+LOCAL = pd.date_range("2025-11-02T04:30Z", periods=40, freq="5min").tz_convert("America/New_York")
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("time,speed,yaw_rate", lambda k: f"2025-06-01 12:00:{59 - k:02d},{k},0"),
+        ("time_us,speed,yaw_rate", lambda k: f"{(2**32 - 95_000 + 10_000 * k) % 2**32},{k},0"),
+        ("t,vehicle,lat,lon", lambda k: f"{EPOCH + k // 2},{'AB'[k % 2]},{48 + 1e-5 * k:.6f},11"),
+        ("t,lat,NS,lon,EW", lambda k: f"{EPOCH + k},3352.{k:02d},S,07036.12,W"),
+        ("time [America/New_York],speed,yaw_rate", lambda k: f"{LOCAL[k]:%Y-%m-%d %H:%M:%S},{k},0"),
+        ("t,GPS", lambda k: f"{EPOCH + k},47.{50 + k} 8.7" + "\nt,GPS" * (k == 9)),
+    ],
+)
+def test_blocks_make_no_difference_to_what_is_decided_by_order(
+    head: str, row: Callable[[int], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = text_of(tmp_path, head, row)
+    whole = Got(path)
+    for module in (blocks, files):
+        monkeypatch.setattr(module, "BLOCK_BYTES", 120)
+    parts = Got(path, whole.text)
+    assert parts.notes == whole.notes
+    for topic, stream in whole.streams.items():
+        times = parts.streams[topic].publish_time_ns
+        assert sorted(times.tolist()) == stream.publish_time_ns.tolist()
+        order = np.argsort(times, kind="stable")
+        for name, column in stream.columns.items():
+            assert np.array_equal(parts.streams[topic].columns[name][order], column, equal_nan=True)

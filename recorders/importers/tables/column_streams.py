@@ -25,7 +25,7 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
-from recorders.importers.tables.guessed_places import altitude_of, places_of, speed_unit_of
+from recorders.importers.tables.guessed_places import altitude_of, is_ais, places_of, speed_unit_of
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -377,7 +377,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
     """Write headings beside fixes; a course alone is none, as it has no direction at rest."""
     if not table.places or not (found := take(table.columns, _HEADING_ALONE)):
         return
-    direction = direction_of(found[0], table.places)
+    is_compass = is_ais(table) or bool(re.search("compass|course|heading|hdg", found[0].plain))
+    direction = direction_of(found[0], table.places, usual=is_compass)
     angle = "heading" if direction.is_compass else "yaw"
     what = "clockwise from north" if direction.is_compass else "anticlockwise from east"
     begin = "# " if direction.is_sure else ASSUMED

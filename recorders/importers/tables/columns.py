@@ -204,6 +204,10 @@ def underlined(name: str) -> str:
     return "_".join(_WORDS.get(word, word) for word in plain.split("_"))
 
 
+# By how much of the path one direction has to be more like the course than another.
+_CLEAR = 0.4
+
+
 class Direction(NamedTuple):
     """States what a heading is in, whether it is clockwise from north, and why."""
 
@@ -213,10 +217,13 @@ class Direction(NamedTuple):
     is_sure: bool = False
 
 
-def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Direction:
+def direction_of(
+    heading: GuessedColumn, places: Sequence[GuessedColumn], *, usual: bool | None = None
+) -> Direction:
     """Find a heading's unit and convention, by the course of places, else by its numbers.
 
-    A heading may be unwrapped, so that its largest value says little.
+    A heading may be unwrapped, so that its largest value says little. `usual` is whether such a heading
+    mostly is a compass's, which decides if the course does not tell clearly.
     """
     stated = stated_unit(heading, "rad")
     units = [stated] if stated else _angle_units(largest_of([heading]))
@@ -232,8 +239,14 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
                 for is_compass, turned in ((False, own_rad), (True, np.pi / 2 - own_rad)):
                     likeness[name, is_compass] = np.sum(length * np.cos(angle_rad - turned))
             best = max(likeness, key=lambda each: likeness[each])
-            if likeness[best] > 0.5 * np.sum(length):
-                return Direction(*best, "so it goes with the course", is_sure=True)
+            whole = np.sum(length)
+            alike = best[0], best[1] if usual is None else usual
+            if likeness[best] - likeness[alike] < _CLEAR * whole < likeness[alike]:
+                best = alike
+            if likeness[best] > 0.5 * whole:
+                other = likeness[best[0], not best[1]]
+                is_sure = usual is None or bool(likeness[best] - other > _CLEAR * whole)
+                return Direction(*best, "so it goes with the course", is_sure=is_sure)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
 

@@ -82,8 +82,12 @@ def without_codes(table: GuessedTable) -> GuessedTable:
             int(np.isin(column.values, values).sum()) for column in table.whole if column.name == name
         )
         listed = " and ".join(f"{value:g}" for value in values)
-        table.made.append(f"{ASSUMED}{name}: {listed} means not available, in {count} rows; missing")
+        table.made.append(f"{ASSUMED}{name}: {listed} means not available, in {_rows(count)}; missing")
     return table._replace(columns=cleaned(table.columns), whole=cleaned(table.whole))
+
+
+def _rows(count: int) -> str:
+    return "1 row" if count == 1 else f"{count} rows"
 
 
 def _is_code(values: NDArray, code: float, largest: float) -> bool:
@@ -132,7 +136,7 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         for column in place:
             missing[column.name] = [*missing.get(column.name, []), 0.0]
         lines.append(
-            f"{ASSUMED}{names}: 0, 0 means that there was no fix, in {zero.sum()} rows; missing"
+            f"{ASSUMED}{names}: 0, 0 means that there was no fix, in {_rows(int(zero.sum()))}; missing"
         )
         degrees = [np.where(zero, np.nan, values) for values in degrees]
     return Places(chosen, lines, *degrees)

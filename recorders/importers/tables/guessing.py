@@ -42,6 +42,8 @@ _FEWEST = 10
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
 # The column of times that have a file of their own.
 _STAMP = "timestamp"
+# How the line of a file begins that is left out.
+_NOT_TAKEN = "# not taken: "
 # Reasons of a guess that are none of a doubt.
 _SURE = ("as its name says", "so places move as fast")
 
@@ -73,21 +75,23 @@ def guess(paths: Sequence[Path]) -> str:
     head = [
         "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
-        *(f"# not taken: {note}" for note in notes),
+        *(f"{_NOT_TAKEN}{note}" for note in notes),
         *_warnings("\n".join(tables)),
     ]
     return "\n".join(head) + "\n\n" + "\n".join(tables)
 
 
 def assumptions(text: str) -> list[str]:
-    """Return what a guessed mapping assumes that changes numbers: its lines that say so."""
+    """Return what a guessed mapping assumes that changes numbers, and which files it leaves out."""
     found = []
     for line in text.splitlines():
         setting, _, why = line.partition("   # ")
         if line.startswith(ASSUMED):
-            found.append(line.removeprefix(ASSUMED))
+            found.append(f"assumed: {line.removeprefix(ASSUMED)}")
+        elif line.startswith(_NOT_TAKEN):
+            found.append(line.removeprefix("# "))
         elif why and why not in _SURE:
-            found.append(f"{setting} ({why})")
+            found.append(f"assumed: {setting} ({why})")
     return list(dict.fromkeys(found))
 
 
@@ -171,7 +175,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
         [],
         {},
     )
-    every = without_codes(_in_order(every, batch, time.vehicle))
+    every = _in_order(without_codes(every), batch, time.vehicle)
     of_truth = true_columns(every.columns, is_reference=is_reference)
     true = every._replace(columns=of_truth, has_truth=True, places=[], made=[])
     rest = every._replace(has_truth=bool(of_truth))

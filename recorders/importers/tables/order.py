@@ -47,12 +47,12 @@ class Order:
             self._usual_ns = float(np.median(steps[steps > 0]))
         if self._reached_ns == NOT_A_TIME:
             self._first_ns = self._reached_ns = int(stamps[0])
+        if stamps[0] >= self._reached_ns and (not len(steps) or steps.min() >= 0):
+            self._reached_ns, self._behind = int(stamps[-1]), 0
+            return
         highest = np.maximum.accumulate(np.append(self._reached_ns, stamps))
         behind = stamps < highest[:-1]
         self._reached_ns = int(highest[-1])
-        if not behind.any():
-            self._behind = 0
-            return
         edges = np.flatnonzero(np.diff(np.concatenate([[0], behind.astype(np.int8), [0]])))
         for begin, end in edges.reshape(-1, 2):
             if begin > 0 or not self._behind:

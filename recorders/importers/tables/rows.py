@@ -38,6 +38,8 @@ QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
 
 ReadCounts = Counter[tuple[str, str]]
 _MOST_VEHICLES = 1000
+# Rows by which it is told whether the newest one is first.
+_LOOKED_AT = 1000
 # The column of the stamps that have a file of their own.
 _STAMP = "\0stamp"
 
@@ -78,6 +80,7 @@ class Rows:
         self._vehicle = None if own.vehicle is None else self.table.column(own.vehicle)
         self._clocks: dict[str, tuple[Order, dict[str, Reading]]] = {}  # by vehicle
         self._reached: dict[str, int] = {}
+        self._vehicles: dict[str, str] = {}  # their names, by what they are in topics
         self._texts, self._numbers = self._wanted()
         self._batches = self._timed(self.table.batches(self._numbers, self._texts))
         self._next = next(self._batches, None)
@@ -245,7 +248,13 @@ class Rows:
             if not name:
                 continue
             which = np.flatnonzero(pc.fill_null(pc.equal(names, name), False).to_numpy(False))
-            self._names["vehicle"] = re.sub(r"\W+", "_", name).strip("_") or "_"
+            plain = re.sub(r"\W+", "_", name).strip("_") or "_"
+            if (other := self._vehicles.setdefault(plain, name)) != name:
+                raise BadInput(
+                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which are both "
+                    f"{plain} in topics; give them names of letters and digits"
+                )
+            self._names["vehicle"] = plain
             self._numbers_of.clear()
             yield {column: cells.take(pa.array(which)) for column, cells in batch.items()}, rows[which]
 
@@ -260,6 +269,7 @@ class Rows:
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
         clock = self._time.model_copy(update={"zone": None, "rollover": None})
+        batch = {name: cells[:_LOOKED_AT] for name, cells in batch.items()}
         rows = np.arange(_size(batch))
         return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])
 
@@ -367,7 +377,9 @@ class Rows:
             name: self._read_ns(batch, clock, rows, readings[name])
             for name, clock in self._others.items()
         }
-        timed = np.all([each != NOT_A_TIME for each in (stamps, *others.values())], axis=0)
+        timed = stamps != NOT_A_TIME
+        for each in others.values():
+            timed &= each != NOT_A_TIME
         self._tell(self.path.name, "rows without a time are left out", int((~timed).sum()))
         order.follow(stamps[timed], rows[timed])
         if self._is_reversed:

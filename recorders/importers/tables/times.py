@@ -38,6 +38,7 @@ ZONED = r"\s+([A-Z]{2,5}|[A-Z]\w+/\w+)$"
 # The offset from UTC at the end of a cell with a time.
 OWN_OFFSET = r":\d\d.*?(?:[Zz]|(?P<sign>[-+])(?P<h>[01]\d)(?::?(?P<m>\d\d))?)$"
 _OFFSET = re.compile(r"(?<=\d)( ?)([Zz]|[-+][01]\d:?\d\d)$")
+_SPACED = r"(:[\d.]+) ([-+]\d\d:?\d\d)$"
 _WRITTEN = re.compile(
     r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?(?:([ T,]*)"
     r"(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
@@ -275,17 +276,20 @@ def _dates_ns(
         return to_ns(found, 1, -leap_ns, where=label, mend=MEND)
     texts = [_padded(texts_of(each, is_part=len(cells) > 1), mapping.format) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
-    if mapping.format == ISO:  # pandas knows no fractions after a comma
-        joined = pc.replace_substring_regex(joined, r"(:\d\d),(\d)", r"\1.\2")
-        joined = pc.replace_substring_regex(joined, r"(:[\d.]+) ([-+]\d\d:?\d\d)$", r"\1\2")
+    if mapping.format == ISO:  # pandas knows no fractions after a comma, and no space before an offset
+        for mark, written in ((",", r"(:\d\d),(\d)"), (" -", _SPACED), (" +", _SPACED)):
+            if pc.any(pc.match_substring(joined, mark)).as_py():
+                plain = r"\1.\2" if mark == "," else r"\1\2"
+                joined = pc.replace_substring_regex(joined, written, plain)
     zones = np.zeros(len(joined), dtype=object)
     names: dict[str, float | ZoneInfo] = {}
     if "%p" not in mapping.format and pc.any(pc.match_substring_regex(joined, ZONED)).as_py():
         zones = joined.to_pandas().str.extract(ZONED, expand=False).fillna(0).to_numpy()
         joined = pc.replace_substring_regex(joined, ZONED, "")
-    own = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False).to_numpy(
-        zero_copy_only=False
-    )
+    own = np.zeros(len(joined), bool)
+    if zone:
+        found = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False)
+        own = found.to_numpy(zero_copy_only=False)
     try:
         names = {str(name): offset_of(str(name)) for name in set(zones.tolist()) - {0}}
         dates = pd.to_datetime(joined.to_pandas(), format=mapping.format, utc=True)
@@ -301,11 +305,12 @@ def _dates_ns(
     for name, own_zone in names.items():
         which = zones == name
         since_ns[which] = _from_zone(since_ns[which], own_zone, rows[which], label, reading)
-    local = ~own & (zones == 0)
-    if zone and own.any():
+    if own.any():
         _check_offsets(since_ns[own], joined.filter(pa.array(own)), zone, rows[own], label)
-    since_ns[local] = _from_zone(since_ns[local], zone, rows[local], label, reading)
-    return to_ns(since_ns, 1, -leap_ns, where=label, mend=MEND)
+    if zone:
+        local = ~own & (zones == 0)
+        since_ns[local] = _from_zone(since_ns[local], zone, rows[local], label, reading)
+    return to_ns(since_ns, 1, -leap_ns, where=label, mend=MEND) if leap_ns else since_ns
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
