@@ -33,11 +33,9 @@ _CLOCKED = {
     schemas.MAGNETIC_FIELD.full_name,
     schemas.ODOMETRY.full_name,
 }
-# What drives filters, each message until the next one.
-_DRIVING = {
-    schemas.INERTIAL_SAMPLE.full_name,
-    schemas.ODOMETRY.full_name,
-    schemas.TWIST.full_name,
+_USES = {
+    schemas.INERTIAL_SAMPLE.full_name: "a model that they drive takes the mean of both",
+    schemas.ODOMETRY.full_name: "the first of both holds for no time, and has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
@@ -99,11 +97,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         )
         return
     things = _things(stream, streams)[rows]
-    use = (
-        "a model that they drive takes the mean of both"
-        if stream.schema.full_name in _DRIVING
-        else "both are used, in the file's order"
-    )
+    use = _USES.get(stream.schema.full_name, "both are used, in the file's order")
     same = (np.diff(stamps_ns) == 0) & (np.diff(things) == 0)
     if same.any() and stream.schema.full_name in REGULARS:
         first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))

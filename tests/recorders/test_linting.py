@@ -342,6 +342,17 @@ def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
     [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
     assert "have the stamp of the one before" in found.words
     assert "a model that they drive takes the mean" in found.words
+    unit = clean(1)[IMU]
+    stamps_ns = unit.publish_time_ns // 10**8 * 10**8
+    wheels = make_stream(
+        "/odometry",
+        schemas.ODOMETRY,
+        stamps_ns,
+        forward_mps=unit["turn_rate_radps"][:, 0],
+        turn_radps=unit["turn_rate_radps"][:, 1],
+    )
+    [found] = lint([{"/odometry": wheels}])
+    assert "the first of both holds for no time, and has no effect" in found.words
 
 
 def test_what_is_missing_is_not_frozen() -> None:

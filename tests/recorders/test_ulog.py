@@ -536,6 +536,18 @@ def test_a_height_above_the_ellipsoid_that_is_none_is_that_above_the_sea(
     assert all(text.endswith(", 47 m higher" if separation_m else "instead") for text in told)
 
 
+def test_a_height_of_zero_above_the_sea_is_one_too(tmp_path: Path):
+    """The filter's origin has it as well: both are on one level, whatever the ellipsoid says."""
+    rows = [("vehicle_gps_position", 0, "iiiiB", (474000000, 85000000, 0, 535000, 3))] * 3
+    rows.insert(1, ("vehicle_local_position", 0, "QddfB", (1_000_000, 47.4, 8.5, 0.0, 1)))
+    path = tmp_path / "sea.ulg"
+    path.write_bytes(several({"vehicle_gps_position": FIX, "vehicle_local_position": PLACE}, rows))
+    streams = ULOG.read(path, UlogParameters()).together().streams
+    fix = next(each for each in streams if each.topic == "/vehicle/fix")
+    assert fix["altitude_m"].tolist() == [0.0] * 3
+    assert float(fix.metadata["origin_altitude_m"]) == 0.0
+
+
 def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
     """Noise by the sheet, section 1: PX4's defaults are .0015 and .035 for a step of 10 ms."""
     parameters = {

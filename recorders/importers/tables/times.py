@@ -293,12 +293,12 @@ def _dates_ns(
     try:
         names = {str(name): offset_of(str(name)) for name in set(zones.tolist()) - {0}}
         dates = pd.to_datetime(joined.to_pandas(), format=mapping.format, utc=True)
+        since_ns = _since_ns(dates.dt.tz_localize(None))
     except ValueError as error:
         why = str(error).splitlines()[0]
         raise BadInput(
             f"{label} has cells that are not dates ({why}); give their `format`, or the unit of numbers"
         ) from None
-    since_ns = _since_ns(dates.dt.tz_localize(None))
     if mapping.format != ISO and not re.search("%[YyGcxs]", mapping.format):
         of_day_ns = to_ns(since_ns, 1, -_date_ns("1900-01-01"), where=label, mend=MEND)
         since_ns = to_ns(of_day_ns, 1, _date_ns(mapping.zero), where=label, mend=MEND)

@@ -113,6 +113,7 @@ def filter_events(
     merged, control = block.events, stage.model.control
     width, start = data_columns(stage)
     uses: list[tuple[str, Table]] = []
+    sampled: list[int] = []  # the columns of what is a sample, and does not hold until the next
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
         replaced = {name for each, _ in found.fallbacks for name in each.components}
@@ -121,6 +122,9 @@ def filter_events(
         uses.append((name, _control_table(control, block.streams[name], width, own)))
         for each, topic in found.fallbacks:
             uses.append((topic.name, _control_table(each, block.streams[topic.name], width, columns)))
+        for each in (*(drive for drive, _ in found.fallbacks), control):
+            if each.schema is schemas.INERTIAL_SAMPLE:
+                sampled += [columns[component] for component in each.components]
     for number, (_, topic) in enumerate(found.sensors):
         ragged = block.streams[topic.name]
         uses.append((topic.name, sensor_table(stage, number, ragged, context, settings)))
@@ -141,8 +145,8 @@ def filter_events(
         events = _inserted(events, again)
     if without_covariance.any() or again:
         events = events._replace(wants_estimate=last_of_stamps(events))
-    if control is not None and not events.arrival.shape[1]:
-        events = share_stamps(events, range(start, start + len(control.components)))
+    if sampled and not events.arrival.shape[1]:
+        events = share_stamps(events, sampled)
     return events._replace(wants_estimate=where_wanted(stage, events)), without_covariance
 
 

@@ -132,13 +132,13 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Give the control's messages of one stamp their mean, so that each of them counts.
+    """Give the control's samples of one stamp their mean, so that each of them counts.
 
     A recorder may stamp two samples at once: of each two, one would drive for no time at all.
 
     Args:
         events: in the order of their stamps.
-        columns: those of the control.
+        columns: those of the control that are samples.
     """
     at = np.flatnonzero(events.source == CONTROL)
     run = run_of_rows(events.offsets)[at]

@@ -390,6 +390,31 @@ def test_of_two_samples_of_one_stamp_both_count():
     assert 2.0 * np.arctan2(z, w) == pytest.approx(1.0, abs=0.02)
 
 
+def test_halves_of_samples_make_no_start():
+    """Of a unit whose accelerometer and gyro send their samples by turns, each without the other's."""
+    stamps_ns, is_force = 10**9 + 10**7 * np.arange(400), np.arange(400)[:, None] % 2 == 0
+    unit = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps_ns,
+        specific_force_mps2=np.where(is_force, [0.0, 0.0, 9.8], np.nan),
+        turn_rate_radps=np.where(is_force, np.nan, [0.0, 0.0, 0.1]),
+        magnetic_field_ut=np.full((400, 3), np.nan),
+    )
+    fix = make_stream(
+        "/fix",
+        schemas.POSITION_FIX,
+        stamps_ns[::100],
+        position_m=np.zeros((4, 3)),
+        covariance_m2=np.ones((4, 3)),
+    )
+    source = memory_source(Recording([unit, fix]), RunMetadata("halves", epoch_ns=10**9))
+    with pytest.raises(
+        BadInput, match="/inertial: has no sample with both specific force and turn rate"
+    ):
+        outputs(INERTIAL, "ekf", [source])
+
+
 def test_a_heading_may_state_its_covariance():
     """As headings of tables and of ROS do; the robot's model takes it too."""
     stamps_ns = 10**9 + 10**7 * np.arange(500)
