@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from recorders.log import schemas
+from recorders.log import Stream, schemas
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
+from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.tangent import tangent_components
 from replay.judging.errors.evaluation import split_topic
 from replay.judging.metrics.measuring import Output, Sums, plus
 from replay.judging.metrics.metrics import covered, estimated_share
@@ -21,6 +23,8 @@ STARTED, COVERAGE = schemas.STARTED.full_name, schemas.COVERAGE.full_name
 LEAVES = ("failure", "skipped", "started", "coverage")
 # Less than this share of a span is said; a run's first measurements may well be before the prior.
 LEAST_SHARE = 0.995
+# A standard deviation of an angle beyond which a Gaussian says little: 0.2 % is beyond half a turn.
+WIDE_RAD = 1.0
 
 
 @dataclass
@@ -32,6 +36,8 @@ class StreamDiagnostics:
     skipped: Counter[str] = field(default_factory=Counter)
     started: Counter[str] = field(default_factory=Counter)
     covered: Sums = field(default_factory=dict)
+    estimates: int = 0
+    wide: Counter[str] = field(default_factory=Counter)
 
     def merge(self, other: "StreamDiagnostics") -> None:
         """Add those of other runs."""
@@ -41,6 +47,8 @@ class StreamDiagnostics:
         if other.with_estimates is not None:
             self.with_estimates = other.with_estimates | (self.with_estimates or set())
         self.covered = plus(self.covered, other.covered)
+        self.estimates += other.estimates
+        self.wide.update(other.wide)
 
 
 class Diagnostics:
@@ -62,6 +70,8 @@ class Diagnostics:
         if schema == ESTIMATE:
             estimated = {self._first_run + run for run in runs}
             found.with_estimates = estimated | (found.with_estimates or set())
+            found.estimates += len(rows.stream)
+            found.wide.update(_wide_angles(rows.stream))
         elif schema == FAILURE:
             for run in runs:
                 failures = rows.of_run(run)
@@ -113,7 +123,30 @@ class Diagnostics:
                 notes.append(f"{name_of(topic)}: {percent}; its figures are of that")
             for reason, count in found.skipped.items():
                 notes.append(f"{name_of(topic)}: {count} not used: {reason}")
+            for angle, count in found.wide.items():
+                notes.append(
+                    f"{name_of(topic)}: {angle} has a standard deviation above {WIDE_RAD:g} rad in "
+                    f"{count} of {found.estimates} estimates: a Gaussian says little of such an angle, "
+                    "and positions, NEES and likelihood that follow from it may be wrong; bank and "
+                    "particles carry several at a time"
+                )
         return notes
+
+
+def _wide_angles(estimates: Stream) -> dict[str, int]:
+    """Count by angle the estimates in which its standard deviation is beyond `WIDE_RAD`."""
+    components = stated_components(estimates.metadata, {}, estimates.topic)
+    errors = tangent_components([*components], [*components.values()])
+    size = len(errors)
+    if not size or estimates["covariance"].shape[1] != size * size:
+        return {}
+    variances = estimates["covariance"][:, :: size + 1]
+    counts = {
+        name: int(np.count_nonzero(variances[:, place] > WIDE_RAD**2))
+        for place, (name, kind) in enumerate(errors)
+        if kind != "linear"
+    }
+    return {name: count for name, count in counts.items() if count}
 
 
 def name_of(topic: str) -> str:

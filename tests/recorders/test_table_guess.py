@@ -39,6 +39,17 @@ def test_commas_stand_before_fractions(tmp_path: Path) -> None:
     assert log["/odometry"].publish_time_ns[0] == 1_700_000_000_250_000_000
 
 
+def test_a_magnetometer_beside_an_inertial_unit_is_of_its_samples_too(tmp_path: Path) -> None:
+    """In gauss, every third row: orientation filters read it of the unit, headings of its own topic."""
+    rows = [
+        f"{row / 100},0,0,9.81,0,0,0,{'0.1,0.2,-0.4' if row % 3 == 0 else ',,'}" for row in range(60)
+    ]
+    log = guessed(tmp_path, "\n".join(["time,ax,ay,az,gx,gy,gz,mag_x,mag_y,mag_z", *rows]))
+    for topic in ("/inertial", "/magnetic_field"):
+        field = log[topic]["magnetic_field_ut"]
+        assert_allclose(field[~np.isnan(field[:, 0])], np.tile([10.0, 20.0, -40.0], (20, 1)))
+
+
 @pytest.mark.parametrize(
     ("cell", "stamp"),
     [

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from recorders.importers.units import unit
 # What vectors are called.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
 _GYROSCOPES = ("gyr", "gyro", "gyroscope", "angular_velocity", "rate", "omega", "w", "g")
+_MAGNETOMETERS = ("mag", "magnetometer", "magnetic_field", "m")
 _QUATERNIONS = ("quaternion", "quat", "orientation", "rotation", "q")
 _POSITIONS = ("pos", "position", "pose", "p", "translation", "t", "")
 _FORWARD_SPEED = (
@@ -74,31 +75,44 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
     force_unit, why = unit_by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)})
     largest = largest_of(rate)
     rate_unit = stated_unit(rate[0], "rad/s") or ("deg/s" if largest > _LARGEST_RATE_RADPS else "rad/s")
+    # a magnetometer of the same table is one of a nine-axis unit, which orientation filters read
+    field = take_axes(list(columns), *_MAGNETOMETERS)
     yield from stream_lines(
         f"{table.prefix}/inertial",
         "InertialSample",
         "the names are those of an accelerometer and of a gyroscope",
         f"fields.specific_force_mps2 = {names_of(force)}",
         f"fields.turn_rate_radps = {names_of(rate)}",
+        *_field_lines(field)[:1],
         f"units.specific_force_mps2 = {json.dumps(force_unit)}   # {why}",
         f"units.turn_rate_radps = {json.dumps(rate_unit)}   # the largest is {largest:.4g}",
+        *_field_lines(field)[1:],
         "# The axes of the body are forward, left, up; to turn those of the sensor (roll, pitch, yaw):",
         "# mounting_deg = [0, 0, 0]",
     )
 
 
 def _magnetic(table: GuessedTable) -> Iterator[str]:
-    field = take_axes(table.columns, "mag", "magnetometer", "magnetic_field", "m")
+    field = take_axes(table.columns, *_MAGNETOMETERS)
     if field:
-        sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
-        given, why = unit_by_size(field, sizes)
         yield from stream_lines(
             f"{table.prefix}/magnetic_field",
             "MagneticField",
             "the names are those of a magnetometer",
-            f"fields.magnetic_field_ut = {names_of(field)}",
-            f"units.magnetic_field_ut = {json.dumps(given)}   # {why}",
+            *_field_lines(field),
         )
+
+
+def _field_lines(field: Sequence[GuessedColumn]) -> list[str]:
+    """Write the field and unit of a magnetometer's columns; none without any."""
+    if not field:
+        return []
+    sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
+    given, why = unit_by_size(field, sizes)
+    return [
+        f"fields.magnetic_field_ut = {names_of(field)}",
+        f"units.magnetic_field_ut = {json.dumps(given)}   # {why}",
+    ]
 
 
 def _fix(table: GuessedTable) -> Iterator[str]:

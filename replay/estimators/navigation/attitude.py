@@ -141,8 +141,17 @@ def read_velocity(stream: Stream) -> Floats:
 
 
 def read_field(stream: Stream) -> Floats:
-    """Return the field (n, 3), once a period."""
-    return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
+    """Return the field (n, 3), once a period: its first sample there, of a slower magnetometer too."""
+    field = stream["magnetic_field_ut"]
+    known = np.flatnonzero(np.isfinite(field).all(axis=1))
+    if len(known) in (0, len(field)):
+        return np.where(first_of_periods(stream)[:, None], field, np.nan)
+    own = stream.take(known)
+    metadata = {key: value for key, value in own.metadata.items() if key != "rate_hz"}
+    found = np.full(field.shape, np.nan)
+    first = known[first_of_periods(replace(own, metadata=metadata))] if len(known) > 1 else known
+    found[first] = field[first]
+    return found
 
 
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:

@@ -21,6 +21,7 @@ from replay.engine.api.inputs import Given, Messages, OneRun
 from replay.engine.api.outputs import Estimates, Results
 from replay.engine.arrays import Floats, Integers
 from replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
+from replay.estimators.orientation.resting import of_nine_axes
 from replay.estimators.orientation.triad import triad, unit
 
 HALF = np.sqrt(0.5)
@@ -110,6 +111,8 @@ def follow_madgwick(
     """Take a step of the gyro, and one down the gradient of what force and field contradict."""
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])
+        if not can_follow(run, force, rate, field, state):
+            continue
         q = began(run, messages, row, state)
         duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
         # the author's north is x, see (46)
@@ -152,6 +155,8 @@ def follow_mahony(
     bias = state.bias[run]
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])
+        if not can_follow(run, force, rate, field, state):
+            continue
         q = began(run, messages, row, state)
         duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
         up = into_body(q, (0.0, 0.0, 1.0))
@@ -176,8 +181,24 @@ def follow_mahony(
 
 
 def unit_vectors(value: Floats) -> Any:
-    """Return the directions of force and field, and the turn rate between them."""
-    return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
+    """Return the directions of force and field, and the turn rate between them.
+
+    A field that is not finite is none, as between two samples of a slower magnetometer: zero, which
+    turns nothing.
+    """
+    rate = value[3], value[4], value[5]
+    if not np.isfinite(value[6] + value[7] + value[8]):
+        return unit(value[:3]), rate, (0.0, 0.0, 0.0)
+    return unit(value[:3]), rate, unit(value[6:])
+
+
+def can_follow(run: int, force: Any, rate: Any, field: Any, state: ComplementaryState) -> bool:
+    """Tell whether a sample says anything: force and turn rate, and the first one the field too."""
+    if not np.isfinite(force[0] + force[1] + force[2] + rate[0] + rate[1] + rate[2]):
+        return False
+    q = state.orientation[run]
+    is_blank = q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0
+    return not (is_blank and field[0] == 0.0 and field[1] == 0.0 and field[2] == 0.0)
 
 
 def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
@@ -225,14 +246,18 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     return Estimates(time_ns, mean, np.tile(parameters.covariance, (len(mean), 1, 1)))
 
 
-MADGWICK = of_inertial_samples(
-    "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+MADGWICK = of_nine_axes(
+    of_inertial_samples(
+        "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+    )
 )
-MAHONY = of_inertial_samples(
-    "Mahony's complementary filter of orientation and bias",
-    MahonyParameters,
-    start,
-    follow=follow_mahony,
+MAHONY = of_nine_axes(
+    of_inertial_samples(
+        "Mahony's complementary filter of orientation and bias",
+        MahonyParameters,
+        start,
+        follow=follow_mahony,
+    )
 )
 VQF = batch(
     "VQF of Laidig and Seel, by the package vqf",

@@ -258,10 +258,10 @@ def _reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Take in one sample; one that is not finite is passed over."""
+    """Take in one sample; one that is not finite is passed over, or only its field."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
-    if not all_finite(rate, force, field):
+    if not all_finite(rate, force, force):
         return
     orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
     if times[0] < 0:
@@ -275,7 +275,8 @@ def _reckon(
         for i in range(3):
             sums[0, i] += rate[i]
             sums[1, i] += force[i]
-            sums[2, i] += field[i]
+            if all_finite(field, field, field):
+                sums[2, i] += field[i]
         state.rest_samples[run] += 1
         return
     is_blank = True
@@ -316,10 +317,11 @@ def _accumulate(
     """Add one sample to the rest and to the block, in place.
 
     Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
+    A field that is not finite is none, as between two samples of a slower magnetometer.
     """
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
-    if not all_finite(rate, force, field):
+    if not all_finite(rate, force, force):
         return math.nan
     times = state.time_ns[run]
     duration_s = (time_ns - times[1]) * _NS
@@ -347,7 +349,8 @@ def _accumulate(
         turn_back(step, state.field[run])
     for i in range(3):
         state.force[run, i] += force[i]
-        state.field[run, i] += field[i]
+        if all_finite(field, field, field):
+            state.field[run, i] += field[i]
     return (time_ns - times[2]) * _NS
 
 

@@ -26,7 +26,7 @@ from replay.estimators.orientation.inertial import (
     start_inertial_filter,
     start_reckoning,
 )
-from replay.estimators.orientation.resting import LONGEST_S, finding_rest, rests_of
+from replay.estimators.orientation.resting import LONGEST_S, of_nine_axes, rests_of
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
@@ -130,7 +130,7 @@ def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel,
     return (given.parameters.model, advance), start_reckoning(given.runs)
 
 
-BINGHAM_INERTIAL = finding_rest(
+BINGHAM_INERTIAL = of_nine_axes(
     of_inertial_samples(
         "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
         InertialParameters,
@@ -138,7 +138,7 @@ BINGHAM_INERTIAL = finding_rest(
         follow_all=_follow_all,
     )
 )
-GYRO = finding_rest(
+GYRO = of_nine_axes(
     of_inertial_samples(
         "the gyro alone, from the attitude of the rest at the start on",
         GyroParameters,

@@ -74,31 +74,45 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
     return np.asarray(found)
 
 
-def finding_rest(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator, which finds how long its unit rests where `rest_s` is not set.
+def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
+    """Return the estimator, which refuses a unit without a magnetometer, and finds how long it rests.
 
-    Its `start` is given the samples of the rest as `REST`.
+    That is found if it has a parameter `rest_s` that is not set. Its `start` is given the samples of the
+    rest as `REST`.
     """
 
     def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
-        return [
-            replace(each, initialization=Initialization(each.streams, partial(_find, each.name)))
-            if isinstance(each, Recursive) and values.rest_s is None
-            else each
-            for each in estimator.bind(name, topics, values)
-        ]
+        seeks_rest = getattr(values, "rest_s", 0.0) is None
+        found = list[Bound]()
+        for each in estimator.bind(name, topics, values):
+            assert isinstance(each, Recursive)
+            find = partial(_find, each.name, seeks_rest)
+            found.append(replace(each, initialization=Initialization(each.streams, find)))
+        return found
 
     return replace(estimator, bind=bind)
 
 
 def _find(
     name: str,
+    seeks_rest: bool,
     first: Mapping[str, Ragged],
     static: Mapping[str, Ragged],
     clock: Clock,
 ) -> Initialized:
-    """Find the rest of every run; raises BadInput if a unit moves within `LEAST_S` of its start."""
+    """Find the rest of every run.
+
+    Raises BadInput if no run has a magnetic field, or a unit moves within `LEAST_S` of its start.
+    """
     [(topic, samples)] = first.items()
+    field = samples.stream.columns.get("magnetic_field_ut")
+    if len(samples.stream) and (field is None or not np.isfinite(field).all(axis=1).any()):
+        raise BadInput(
+            f"topic {topic}: has no magnetic field, by which the heading is found; import it into the "
+            "same message, fields.magnetic_field_ut = [...] in the mapping"
+        )
+    if not seeks_rest:
+        return Initialized({}, [])
     counts, rests_s, facts = [], [], list[Fact]()
     for run in range(samples.runs):
         own = samples.of_run(run)

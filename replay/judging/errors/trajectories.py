@@ -33,6 +33,8 @@ MOST_MOVES = 50
 STILL_RAD, TURNS_RAD = 1e-6, np.radians(20.0)
 # An alignment whose rotation is known less well is reported.
 LOOSE_DEG = 1.0
+# Beyond it an interval by the slope at the best rotation means nothing.
+UNKNOWN_DEG = 60.0
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ def _doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) 
     known_deg = np.degrees(rotation_error_rad(estimate.position_m, truth.position_m, align))
     if known_deg <= LOOSE_DEG:
         return []
-    within = f"within {known_deg:.2g} deg (95 %)" if known_deg < 180.0 else "not at all"
+    within = f"within {known_deg:.2g} deg (95 %)" if known_deg < UNKNOWN_DEG else "not at all"
     has_figures = estimate.rotation is not None
     figures = "; absolute rotation errors (APE) are known no better" if has_figures else ""
     return [

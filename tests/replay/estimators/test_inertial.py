@@ -1,5 +1,7 @@
 """The inertial filter on a simulated body: bias, motion, gaps, and the contract."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -215,3 +217,34 @@ def test_a_unit_that_never_rests_is_refused(kind: str, rate_radps: float) -> Non
     with pytest.raises(BadInput, match=r"moves within 1 s of its first sample.*rest_s=SECONDS"):
         fl.replay(source, {"of": kind})
     assert len(fl.replay(source, {"of": {"kind": kind, "rest_s": 2.0}}).estimates) == 1
+
+
+METHODS = ({"kind": "gyro"}, {"kind": "bingham-inertial"}, {"kind": "madgwick"}, {"kind": "mahony"})
+
+
+@pytest.mark.parametrize("settings", [*METHODS, {"kind": "ekf", "model": "orientation"}])
+@pytest.mark.parametrize("every", [3, 10])
+def test_a_slower_magnetometer_is_one_of_its_own_rate(settings: dict[str, str], every: int) -> None:
+    """Between its samples there are NaN: no sample, and no reading; the turn of 90 degrees is found."""
+    source, world = nine_axes(
+        np.interp(np.arange(0.0, 20.0, 1.0 / RATE_HZ), [6.0, 9.0], [0.0, 90.0]), 0.0
+    )
+    samples = source.streams["/body/inertial"]
+    field = samples["magnetic_field_ut"].copy()
+    field[np.arange(len(field)) % every != 1] = np.nan
+    slower = replace(samples, columns={**samples.columns, "magnetic_field_ut": field})
+    replay = fl.replay(replace(source, streams={samples.topic: slower}), {"of": settings})
+    assert not replay.failures
+    last = replay.estimates[0]["/estimates/of/body/state"]["mean"][-1, :4]
+    error = world[-1].inv() * Rotation.from_quat(last, scalar_first=True)
+    assert np.degrees(error.magnitude()) < 3.0
+
+
+@pytest.mark.parametrize("settings", METHODS)
+def test_a_unit_without_a_magnetometer_is_refused(settings: dict[str, str]) -> None:
+    source, _ = nine_axes(np.zeros(1000))
+    samples = source.streams["/body/inertial"]
+    field = np.full_like(samples["magnetic_field_ut"], np.nan)
+    blind = replace(samples, columns={**samples.columns, "magnetic_field_ut": field})
+    with pytest.raises(BadInput, match="has no magnetic field, by which the heading is found"):
+        fl.replay(replace(source, streams={samples.topic: blind}), {"of": settings})
