@@ -18,10 +18,7 @@ Key = TypeVar("Key")
 
 
 def in_children(jobs: Iterable[tuple[Key, Callable[[], object]]]) -> Iterator[tuple[Key, int]]:
-    """Run each job in a child of its own; yield its key and wait status, in the order in which they end.
-
-    A job that is not drawn in time may be left undrawn by its iterable.
-    """
+    """Run each job in a child of its own; yield its key and wait status as it ends."""
     waiting = iter(jobs)
     working: dict[int, tuple[Key, float]] = {}
     while True:
@@ -38,8 +35,8 @@ def in_children(jobs: Iterable[tuple[Key, Callable[[], object]]]) -> Iterator[tu
 
 
 def in_child(job: Callable[[], object]) -> int:
-    """Run one job in a child; return its wait status."""
-    return next(in_children([("", job)]))[1]
+    """Run one job in a child, which may take what memory it likes; return its wait status."""
+    return _next_end({_begin(job, is_limited=False): ("", time.monotonic())})[1]
 
 
 def how(status: int) -> str:
@@ -49,7 +46,7 @@ def how(status: int) -> str:
     return "ended with a traceback" if status else ""
 
 
-def _begin(job: Callable[[], object]) -> int:
+def _begin(job: Callable[[], object], *, is_limited: bool = True) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     pid = os.fork()
@@ -59,7 +56,8 @@ def _begin(job: Callable[[], object]) -> int:
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         memory = pages * resource.getpagesize() + LIMIT_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+        if is_limited:
+            resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_CPU_S, LIMIT_CPU_S + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         job()

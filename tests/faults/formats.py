@@ -53,14 +53,16 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
     end = time.monotonic() + 10 * seconds
     seed = int(rng.integers(1 << 32))
     tried, notes = 0, []
+    whole: dict[str, Format] = {}
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder:
         for name, each in FORMATS.items():
             wrong = _sample(Path(folder, name), each)
             notes += [f"{name}, whole: {wrong}"] if wrong else []
+            whole |= {} if wrong else {name: each}
 
         def jobs() -> Iterator[tuple[Mutant, Callable[[], object]]]:
             for number in range(MUTANTS if most is None else most):
-                for name, each in FORMATS.items():
+                for name, each in whole.items():
                     if time.monotonic() > end:
                         return
                     place = Path(folder, f"{name}-{number}")
@@ -76,6 +78,7 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
                 notes.append(f"{mutant.done}: {wrong}")
                 _keep(mutant.place, f"{mutant.place.name}-{seed}", notes[-1])
             shutil.rmtree(mutant.place)
+    tried += len(FORMATS) - len(whole)
     return Tally(tried, tried - len(notes), notes)
 
 

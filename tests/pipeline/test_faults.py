@@ -1,4 +1,7 @@
-"""A slice of `make faults`: outputs at random places, troubled files and cells, killed commands."""
+"""A slice of `make faults`: outputs, troubled files and cells, killed commands, mutants of formats."""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,3 +16,11 @@ def test_a_slice_of_the_faults_holds(part, most):
     tally = part.run(60.0, np.random.default_rng(1), most)
     assert tally.notes == []
     assert tally.held == tally.tried > 0
+
+
+def test_a_mutant_of_every_format_is_read_or_refused_in_a_sentence() -> None:
+    """In a process of its own, which has no threads when it forks."""
+    command = [sys.executable, "-m", "tests.faults", "formats", "--most", "1", "--seed", "1"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "seed 1" in ended.stdout

@@ -113,7 +113,8 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
             rows = rows_of(scan, seen)
             place = own[rows] + read_vectors(seen, "position_m", PLANE)
             order = np.argsort(rows, kind="stable")
-            columns = rr.Points2D.columns(positions=place[order]).partition(scan["detections"])
+            sizes = np.bincount(rows, minlength=len(scan))
+            columns = rr.Points2D.columns(positions=place[order]).partition(sizes)
             canvas.send(entity, scan.publish_time_ns, columns)
             canvas.fix(entity, rr.Points2D.from_fields(**Stroke(colour, 1.5).fields(widen=2.0)))
         elif f"{prefix}/bearing" in scene.source.topics:

@@ -5,6 +5,7 @@ vehicle's true place, side by side. Detections of the infrastructure sensor are 
 frame, and registered, where an estimator finds the pose.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -141,8 +142,12 @@ def _truths(scene: Scene) -> Vehicles:
     truths = [truth for case in cases for truth in scene.truths_of(case)]
     if not truths:
         return Vehicles(np.zeros(1, np.int64), np.zeros((1, 0, 2)))
-    places = np.stack([truth["state"][:, 0::2] for truth in truths], axis=1)
-    return Vehicles(truths[0].publish_time_ns, places)
+    stamps_ns = reduce(np.intersect1d, [truth.publish_time_ns for truth in truths])
+    if not len(stamps_ns):
+        return Vehicles(np.zeros(1, np.int64), np.zeros((1, 0, 2)))
+    rows = [np.searchsorted(truth.publish_time_ns, stamps_ns) for truth in truths]
+    states = [truth["state"][row, 0::2] for truth, row in zip(truths, rows, strict=True)]
+    return Vehicles(stamps_ns, np.stack(states, axis=1))
 
 
 def _tracks(scene: Scene, name: str, vehicles: Vehicles) -> Floats:
