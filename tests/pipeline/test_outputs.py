@@ -380,15 +380,20 @@ import os, sys
 with open(os.environ["SHADOWED"], "a") as told:
     print(__file__, *sys.argv, file=told)
 """
-# Runs commands one after another with the path that the console script has.
+# Starts workers as `--workers 2` and `--scheduler local:1` do, then runs commands one after another,
+# with the path that the console script has.
 DRIVER = """
 import json, sys
 from pipeline.command_line import main
+from pipeline.runs.executors import dask, processes
 if __name__ == "__main__":
+    for workers in (processes(2), dask("local:1")):
+        with workers() as pool:
+            assert pool.executor.submit(abs, -1).result() == 1
     print(json.dumps([main(words) for words in json.load(sys.stdin)]))
 """
-# Commands without an output, and further ones for each way in which a process is started: workers, those
-# of Dask, the viewer, filters of others and what ends them.
+# Commands without an output, and further ones that start processes: filters of others, what ends them,
+# and the viewer.
 OTHERS = """
 cache
 estimators
@@ -402,8 +407,6 @@ scenarios
 observability run.mcap
 stress run.mcap -e dead-reckoning
 calibrate nav.mcap -e ekf
-run dead.toml --runs 130 --workers 2 --out two
-run dead.toml --runs 130 --scheduler local:1 --out three
 replay run.mcap -e exec:/bin/true -o a.mcap
 replay run.mcap -e lib:./junk.so -o b.mcap
 report result --viewer --out viewer.html
