@@ -12,6 +12,7 @@ from pipeline.diagnosing.findings import FIRST, Finding
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.output.results import split_metric
 from recorders.log import Stream, schemas
+from recorders.log.impossible import Rejections
 from replay.engine.streams.failures import reason_stream
 from replay.judging.errors.evaluation import split_topic
 
@@ -123,6 +124,8 @@ def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cau
         f"than chance: {each.words}"
         for each in in_doubt
     ]
+    left_out = Rejections().plus(source.rejections for source in done.logs)
+    notes += [f"{topic}: {left_out.sentence(topic)}" for topic in left_out]
     notes += done.judge.components_without_truth
     if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
         notes.append(

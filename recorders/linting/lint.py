@@ -21,6 +21,7 @@ from recorders.log.impossible import main_span, possible
 from recorders.log.streams import concatenate
 from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
 from recorders.plausibility.finding import Finding
+from recorders.plausibility.stamps import losses
 
 Check = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]
 # Of all messages; the other checks look at what is possible.
@@ -76,6 +77,14 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
         cleared = {topic: possible(stream, span_ns)[0] for topic, stream in whole.items()}
         streams = {topic: stream for topic, stream in cleared.items() if len(stream)}
         of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
+        # what is left out for its values is not lost
+        of_stamps = [
+            each
+            for each in of_stamps
+            if each.cause != "lost messages"
+            or len(streams[each.topic]) == len(whole[each.topic])
+            or any(losses(whole[each.topic], whole))
+        ]
         of_impossible = _asked((partial(impossible.years, span_ns), *OF_IMPOSSIBLE), whole)
         for each in (*of_impossible, *of_stamps, *_asked(CHECKS, streams)):
             others = found.setdefault((each.cause, each.topic, each.field), [])

@@ -88,7 +88,7 @@ def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, C
     wrong = [(each.words, each.rows) for each in impossible(stream)]
     if span_ns is not None and stream.schema.full_name not in TIMELESS:
         outside = (stream.publish_time_ns < span_ns[0]) | (stream.publish_time_ns > span_ns[1])
-        wrong.append(("its stamp is years from those of most messages", outside))
+        wrong.append(("the stamp is years from those of most messages", outside))
     kept = np.ones(len(stream) if wrong else 0, bool)
     for words, rows in wrong:
         found[words] += int(np.count_nonzero(rows & kept))

@@ -213,7 +213,14 @@ def _start(
     except BadInput as error:
         return _Start(_REFUSED, dict.fromkeys(range(len(ensemble)), str(error)), error, streams)
     starts = len(unable) < len(ensemble)
-    why = None if starts else BadInput(f"{unable[0]}; the filter cannot start")
+    left_out = [
+        each.rejections.sentence(topic)
+        for each in ensemble[:1]
+        for topic in bound.priors
+        if topic in each.rejections
+    ]
+    reasons = [] if starts else [unable[0], *left_out, "the filter cannot start"]
+    why = None if starts else BadInput("; ".join(reasons))
     return _Start(state, unable, why, streams)
 
 
