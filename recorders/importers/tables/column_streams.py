@@ -24,7 +24,13 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
-from recorders.importers.tables.guessed_places import altitude_of, is_ais, places_of, speed_unit_of
+from recorders.importers.tables.guessed_places import (
+    ALTITUDE,
+    altitude_of,
+    is_ais,
+    places_of,
+    speed_unit_of,
+)
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -46,7 +52,6 @@ _YAW_RATE = (
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
-_ALTITUDE = r"(.*_)?(alt|altitude|height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
 _ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _TARGET = (
@@ -109,7 +114,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     table.places.extend(
         each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
     )
-    height = take(table.columns, _ALTITUDE)
+    height = take(table.columns, ALTITUDE)
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
         lines += altitude_of(table, height[0], found.unit)
