@@ -1,6 +1,7 @@
 """Inputs of the kinds that strangers reported: read right, or refused by a sentence that helps."""
 
 from collections.abc import Callable, Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def text_of(folder: Path, head: str, row: Callable[[int], str], rows: Sequence[i
 
 
 @pytest.mark.parametrize(
-    "kind", ["int64", "uint64", "Int64", "jsonl", "npz", "timestamp", "zoned", "duration"]
+    "kind", ["int64", "uint64", "Int64", "jsonl", "npz", "timestamp", "zoned", "duration", "decimal"]
 )
 def test_whole_numbers_of_ns_are_times(kind: str, tmp_path: Path) -> None:
     stamps = 1_700_000_000_123_456_789 + 100_000_000 * np.arange(40)
@@ -55,6 +56,9 @@ def test_whole_numbers_of_ns_are_times(kind: str, tmp_path: Path) -> None:
         frame.to_json(path, orient="records", lines=True)
     elif kind == "npz":
         np.savez(path, **{name: frame[name].to_numpy() for name in frame})
+    elif kind == "decimal":
+        frame["stamp"] = [Decimal(stamp) / 10**9 for stamp in stamps.tolist()]
+        frame.to_parquet(path)
     elif kind == "duration":
         frame.assign(stamp=pd.to_timedelta(frame["stamp"])).to_parquet(path)
     elif kind in ("timestamp", "zoned"):
@@ -245,6 +249,15 @@ def test_codes_of_ais_are_missing_values(tmp_path: Path) -> None:
     assert "lat: 91 means not available, in 2 rows" in got.said
 
 
+def test_an_altitude_of_minus_9999_is_missing(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},48.1,11.5,{-9999 if k == 3 else 500}"  # noqa: E731
+    got = Got(text_of(tmp_path, "t,lat,lon,alt", row))
+    altitude = got.streams["/fix"]["altitude_m"]
+    assert np.isnan(altitude[3])
+    assert np.nanmin(altitude) == 500
+    assert "alt: -9999 means not available, in 1 row" in got.said
+
+
 def test_a_column_of_codes_alone_gives_nothing(tmp_path: Path) -> None:
     row = lambda k: f"{EPOCH + k},219000001,55.5,{11 + 1e-4 * k:.4f},511"  # noqa: E731
     assert set(Got(text_of(tmp_path, "t,mmsi,lat,lon,heading", row)).streams) == {"/fix", "/values"}
@@ -304,6 +317,21 @@ def test_skipped_local_times_are_refused_and_doubled_ones_are_told_by_their_orde
     got = Got(path, zone)
     assert got.streams["/v"].publish_time_ns.tolist() == utc.as_unit("ns").asi8.tolist()
     assert any("the hour that comes twice in America/New_York" in note for note in got.notes)
+
+
+def test_rows_an_hour_apart_go_through_the_doubled_hour(tmp_path: Path) -> None:
+    utc = pd.date_range("2025-10-25T22:00Z", periods=8, freq="1h")
+    local = utc.tz_convert("Europe/Berlin")
+    path = text_of(tmp_path, "time,v", lambda k: f"{local[k]:%Y-%m-%d %H:%M:%S},{k}", range(8))
+    got = Got(path, by_zone(", zone = 'Europe/Berlin'"))
+    assert got.streams["/v"].publish_time_ns.tolist() == utc.as_unit("ns").asi8.tolist()
+
+
+def test_a_guess_says_that_local_times_are_skipped(tmp_path: Path) -> None:
+    head = "time [Europe/Berlin],speed,yaw_rate"
+    path = text_of(tmp_path, head, lambda k: f"2025-03-30 0{1 + k // 20}:{3 * k % 60:02d}:00,1,0")
+    with pytest.raises(BadInput, match="a time that the clocks of Europe/Berlin skip"):
+        Got(path)
 
 
 def test_continuity_tells_the_day_from_the_month(tmp_path: Path) -> None:
@@ -372,6 +400,7 @@ TEXTS = {
     "a newline in a name": ('t,"speed\nover ground",lat,lon', "{t},1.5,48.1,11.5"),
     "sep=": ("sep=;\nt;lat;lon", "{t};48.1;11.5"),
     "lines above": ("Logger 3\nFirmware 1.2\n\nt,lat,lon", "{t},48.1,11.5"),
+    "marks in a text": ("t|lat|lon|note", "{t}|48.1|11.5|a,b;c"),
     "quoted cells": ('"t","lat","lon"', '"{t}","48.1","11.5"'),
 }
 

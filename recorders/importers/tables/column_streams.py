@@ -25,7 +25,13 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
-from recorders.importers.tables.guessed_places import altitude_of, is_ais, places_of, speed_unit_of
+from recorders.importers.tables.guessed_places import (
+    ALTITUDE,
+    altitude_of,
+    is_ais,
+    places_of,
+    speed_unit_of,
+)
 from recorders.importers.units import unit
 
 # What vectors are called.
@@ -48,9 +54,6 @@ _YAW_RATE = (
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
-_ALTITUDE = (
-    r"(.*_)?(alt|altitude|(ellipsoidal_)?height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
-)
 _ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _GEODETIC = r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?"
@@ -127,7 +130,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     table.places.extend(
         each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
     )
-    height = take(table.columns, _ALTITUDE)
+    height = take(table.columns, ALTITUDE)
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
         lines += altitude_of(table, height[0], found.unit)
@@ -334,7 +337,7 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
             )
         table.made.extend(found.lines)
         names = dict(zip(("latitude", "longitude"), geodetic, strict=True))
-        names.update(zip(("altitude",), take(columns, _ALTITUDE), strict=False))
+        names.update(zip(("altitude",), take(columns, ALTITUDE), strict=False))
         parts = ", ".join(f"{key} = {name_of(each)}" for key, each in names.items())
         table.made.append(f"geodetic = {{ {parts} }}")
         axes = zip(("east_m", "north_m", "up_m"), names.values(), strict=False)

@@ -461,7 +461,7 @@ _PLAIN: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (
     (pa.types.is_string_view, pa.string()),
     (pa.types.is_time, pa.string()),
     (pa.types.is_date, pa.timestamp("ms")),
-    (pa.types.is_decimal, pa.float64()),
+    (pa.types.is_decimal, pa.string()),
     (pa.types.is_boolean, pa.int8()),
 )
 

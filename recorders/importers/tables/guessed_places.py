@@ -28,6 +28,10 @@ _AIS = {
     r"(.*_)?(cog|course(_over_ground)?)": (360.0, 3600.0),
 }
 _NOT_A_PLACE = (91.0, 181.0)
+_NO_ALTITUDE, _LOWEST_M = (-999.0, -9999.0, -32768.0), -450.0
+ALTITUDE = (
+    r"(.*_)?(alt|altitude|(ellipsoidal_)?height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
+)
 # What latitudes may be in, and the largest latitude so.
 _SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
 _MINUTES = "ddmm.mmmm"
@@ -60,6 +64,8 @@ def without_codes(table: GuessedTable) -> GuessedTable:
             known = tuple(code for code in _NOT_A_PLACE if _is_code(column.values, code, 90.0))
         elif re.fullmatch(r"(.*_)?(lon|lng|long)(gitude)?", column.plain):
             known = (181.0,) if _is_code(column.values, 181.0, 180.0) else ()
+        elif re.fullmatch(ALTITUDE, column.plain) and np.nanmedian(column.values) > _LOWEST_M:
+            known = _NO_ALTITUDE
         if found := [code for code in known if np.any(column.values == code)]:
             codes[column.name] = found
     if not codes:

@@ -316,10 +316,14 @@ def _dates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     named = sorted(
         table.texts, key=lambda name: not _NAMED.search(plain[name] + " date" * (name in days))
     )
+    dated: set[str] = set()
     for names in (*pairs, *([name] for name in named)):
         if found := _dated(table, names):
+            dated |= {*names}
             yield found
     for name in table.texts:
+        if name in dated:
+            continue
         cell = _first_cell(table.batch[name])
         if re.search(r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}", cell):
             raise BadInput(

@@ -127,13 +127,11 @@ def _joined(file: BinaryIO, skip: int) -> Iterator[_Line]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter by which most lines have one number of cells, the same as the second line."""
+    """Return the delimiter by which most lines have the same number of cells."""
     plain = [_QUOTED.sub("", line) for line in lines]
-    # the first line may be cut, as that of a logger whose file began in the middle of one
-    sample = plain[1:] or plain
     alike = {}
     for each in _DELIMITERS:
-        [(count, lines_with)] = Counter(line.count(each) for line in sample).most_common(1)
+        [(count, lines_with)] = Counter(line.count(each) for line in plain).most_common(1)
         if count:
             alike[each] = lines_with
     return max(alike, key=lambda each: alike[each]) if alike else " "

@@ -383,10 +383,14 @@ def _from_zone(
     if doubled.any():
         is_second = np.zeros(len(local), bool)
         times = local_ns[known]
+        steps = np.diff(times)
+        usual_ns = np.median(steps[steps > 0]) if (steps > 0).any() else 0
         for index in np.flatnonzero(doubled).tolist():
             before = times[index - 1] if index else reading.local_ns
             is_inside = bool(doubled[index - 1]) if index else reading.is_second
-            goes_back = before != NOT_A_TIME and times[index] < before
+            # of rows an hour apart, two of one local time are an hour apart as well
+            is_equal = times[index] == before and usual_ns >= second[index] - first[index]
+            goes_back = before != NOT_A_TIME and (times[index] < before or is_equal)
             reading.is_second = goes_back or (reading.is_second and is_inside)
             is_second[index] = reading.is_second
         first = np.where(is_second, second, first)
