@@ -1,7 +1,7 @@
 """Replays as a function: takes logs and estimators, and answers all that can be asked of the result.
 
-The estimates lie in a scratch folder for as long as the replay is referred to: memory holds the metrics'
-sums, and what is asked for.
+The estimates are in a scratch folder for as long as the replay or one of its estimates is referred to:
+memory holds the metrics' sums, and what is asked for.
 """
 
 import hashlib
@@ -9,7 +9,7 @@ import json
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,10 +106,21 @@ def replay(
         names = [f"run-{number:04d}.mcap" for number in range(len(sources))]
         places = [(folder / name, folder / "logs" / name) for name in names]
         done = plan.replay(places)
-        estimates = [LogSource(open_log(path)) for path, _ in places]
-        made = Replay(sources, estimates, plan.estimators, done, gap_limit_s, arrival_order, late)
-        weakref.finalize(made, stack.pop_all().close)
-    return made
+        scratch = _Scratch()
+        estimates = [_Estimated(open_log(path), scratch=scratch) for path, _ in places]
+        weakref.finalize(scratch, stack.pop_all().close)
+    return Replay(sources, estimates, plan.estimators, done, gap_limit_s, arrival_order, late)
+
+
+class _Scratch:
+    """Is referred to by all that is read of a scratch folder, which is removed with the last of it."""
+
+
+@dataclass(frozen=True, repr=False)
+class _Estimated(LogSource):
+    """Represents the estimates of a run, whose file lasts as long as this."""
+
+    scratch: _Scratch = field(default_factory=_Scratch)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

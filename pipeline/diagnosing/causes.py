@@ -8,11 +8,13 @@ import pandas as pd
 
 from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import (
+    NOISES,
     GainsOf,
     Hypothesis,
     Number,
     gains_over,
     inflation_over,
+    is_spike,
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
@@ -24,9 +26,6 @@ from replay.engine.streams.sources import MemorySource
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
-NOISES = ("measurement noise", "process noise")
-COMPONENTS = 3  # of a measurement, hardly more
-SPIKE = 10.0  # of log-likelihood that it falls within a standard error: 20 times what it may
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
 LEADING = 10  # of the likeliest faults: each is tried beside all others
 
@@ -174,7 +173,9 @@ def _likeliest(
     def is_sure(pair: tuple[Peak, Hypothesis]) -> bool:
         nonlocal inflation
         at, of = pair
-        if _is_at_end(gains_of, at, of) or _is_spike(likelihood, now, at, of):
+        if _is_at_end(gains_of, at, of) or (
+            not at.is_special and is_spike(likelihood, now, of, at.value, at.gain)
+        ):
             return False
         inflation = max(inflation, inflation_of(of, at.value, at.gain))
         if at.gain > least_gain(count, of.size) * inflation:
@@ -285,21 +286,6 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
         return False
     [last] = gains_of([(of, float(np.copysign(of.limit, at.value)))])
     return last > at.gain - DROP_95
-
-
-def _is_spike(likelihood: Likelihood, now: Trial, at: Peak, of: Hypothesis) -> bool:
-    """Tell whether the gain of a noise falls faster beside its peak than so many measurements allow.
-
-    Each of n measurements of m components tells at most 2 m of the information on the logarithm of a
-    standard deviation (Fisher's, of a Gaussian), so that the gain falls by about 1/2 within
-    (2 m n)^-1/2. A faster fall is that of a filter that diverges for most values: the likelihood is
-    jagged there, and its peak is none.
-    """
-    if of.kind not in NOISES or at.is_special:
-        return False
-    apart = (2.0 * COMPONENTS * sum(likelihood.count.values())) ** -0.5
-    beside = gains_over(likelihood, now)([(of, at.value - apart), (of, at.value + apart)])
-    return min(beside) < at.gain - SPIKE
 
 
 def _with_rival(

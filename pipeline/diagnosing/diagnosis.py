@@ -249,8 +249,7 @@ def diagnose(
         raise silent(source.name, label, bound)
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
-    notes = [*why]
-    sought, end_ns = Sought(), None
+    notes, sought, end_ns = [*why], Sought(), None
     opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
     if innovations.state("log_likelihood"):
         part, end_ns, note = first_part(source, bound, streamed)
@@ -261,22 +260,16 @@ def diagnose(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
-    is_own = isinstance(settings.get("kind"), Estimator)
-    trying = Trying(label, alterations_of(source), is_own, gate)
+    trying = Trying(label, alterations_of(source), isinstance(settings.get("kind"), Estimator), gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
     of_log = without_filter(source, streamed, undone_by(bound))
     sentences += ranked(sought.causes, of_log, trying, rest)
     no_judges = judged_by_itself(source, streamed)
     outliers = [each.value for each in sought.causes if each.hypothesis.kind == "outliers"]
+    gating = {"has_outliers": bool(outliers), "in_stretches": NEVER_S in outliers}
     findings: list[Finding] = [
-        *of_innovations(
-            innovations,
-            gate,
-            source.epoch_ns,
-            has_outliers=bool(outliers),
-            in_stretches=NEVER_S in outliers,
-        ),
+        *of_innovations(innovations, gate, source.epoch_ns, **gating),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(
             each

@@ -120,7 +120,8 @@ def of_aligned() -> Any:
     aligned = found.judge.metrics
     assert 0.0 < aligned["ekf.position_rmse_m.robot1"] < outcome["metrics"]["ekf.position_rmse_m.robot1"]
     assert len(found.compared.metrics) > 20
-    return outcome | {"metrics": aligned | found.compared.metrics, "written": []}
+    losses = [*outcome["losses"], *found.compared.notes]
+    return outcome | {"metrics": aligned | found.compared.metrics, "losses": losses, "written": []}
 
 
 def of_trajectories(found: Any) -> Any:

@@ -222,6 +222,8 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
         ("outliers", "gate_probability"),
         ("values", "/robot1/fix"),
     ]
+    assert not found[0].setting
+    assert "the gate that is set keeps these out" in found[0].words
 
 
 def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.diagnosing import causes as seeking
+from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
 from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
@@ -185,13 +186,17 @@ def late(at: float, *_: float) -> str:
 
 
 def test_a_gate_that_is_set_is_no_advice() -> None:
-    for probability, setting in ((1.0, "gate_probability=0.999"), (0.999, None)):
-        given = {"kind": "ekf", "gate_probability": probability}
-        base = Trial(car(2000), given)
-        tried = hypotheses(bind("ekf", [base.source], given), base, {}, {})
-        [outliers] = [each for each in tried if each.kind == "outliers"]
-        mend = outliers.mend(1.0)
-        assert (mend.setting if mend else None) == setting
+    """The gate is open while causes are sought, so that whoever gives advice knows what is set."""
+    base = Trial(car(2000), {"kind": "ekf", **OPEN})
+    tried = hypotheses(bind("ekf", [base.source], base.settings), base, {}, {})
+    [outliers] = [each for each in tried if each.kind == "outliers"]
+    mend = outliers.mend(1.0)
+    assert mend is not None
+    assert mend.setting == "gate_probability=0.999"
+    is_set = {
+        gate: Trying("ekf", {}, is_own=False, gate=gate).is_set(mend) for gate in (1.0, 0.999, 0.9)
+    }
+    assert is_set == {1.0: False, 0.999: True, 0.9: True}
 
 
 @pytest.mark.paper

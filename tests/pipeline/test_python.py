@@ -74,6 +74,18 @@ def test_the_page_works_as_written(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.search(r"/robot1/odometry +600 fuselog.Odometry", capsys.readouterr().out)
 
 
+def test_estimates_last_as_long_as_any_of_them_is_referred_to() -> None:
+    """Also in one line, where nothing refers to the replay; the folder goes with the last of them."""
+    log = fl.record("landmarks", seed=3, duration_s=2.0)
+    estimates = fl.replay(log, "ekf").estimates[0]
+    gc.collect()
+    assert len(estimates[POSE]) > 0
+    place = estimates.log.path  # type: ignore[union-attr]
+    del estimates
+    gc.collect()
+    assert not place.exists()
+
+
 def test_importing_is_quick_and_brings_nothing_heavy() -> None:
     done = python(
         "import time; begin = time.process_time(); import fuselog; took = time.process_time() - begin\n"

@@ -37,6 +37,9 @@ Kind = Literal[
     "unnamed",
 ]
 Number = Any  # a float; of a fault of several numbers a tuple of floats
+NOISES = ("measurement noise", "process noise")
+COMPONENTS = 3  # of a measurement, hardly more
+SPIKE = 10.0  # of log-likelihood that it falls within a standard error: 20 times what it may
 SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
 PARTS = 20  # of a log, whose slopes are compared
 FALL = 2.0  # of log-likelihood, about, from its greatest to where its slope is taken
@@ -180,6 +183,20 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
     return lambda asked: [
         found - before for found in likelihood([each.without(now, at) for each, at in asked])
     ]
+
+
+def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, gain: float) -> bool:
+    """Tell whether the gain of a noise falls faster beside its peak than so many measurements allow.
+
+    Each of n measurements of m components tells at most 2 m of the information on the logarithm of a
+    standard deviation (Fisher's, of a Gaussian), so that the gain falls by about 1/2 within
+    (2 m n)^-1/2. A faster fall is that of a filter that diverges for most values: the likelihood is
+    jagged there, and its peak is none.
+    """
+    if of.kind not in NOISES:
+        return False
+    apart = (2.0 * COMPONENTS * sum(likelihood.count.values())) ** -0.5
+    return min(gains_over(likelihood, now)([(of, value - apart), (of, value + apart)])) < gain - SPIKE
 
 
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:

@@ -113,38 +113,13 @@ class OrientationEstimates(NamedTuple):
     covariance: Floats
 
 
-class ReckoningState(NamedTuple):
-    """Holds what dead reckoning carries from sample to sample, first axis runs.
-
-    Attributes:
-        orientation: (runs, 4), zero until the rest is over, NaN after a gap.
-        time_ns: of the first sample and the last one, (runs, 2); -1 for none yet.
-        sums: of gyro, accelerometer and magnetometer over the rest, (runs, 3, 3).
-        rest_samples: how many samples they have (runs,).
-        rest_s: how long the body rests, if that is less than the model says, (runs,).
-    """
-
-    orientation: Floats
-    time_ns: Integers
-    sums: Floats
-    rest_samples: Integers
-    rest_s: Floats
-
-
-def start_reckoning(runs: int, rest_s: Floats | None = None) -> ReckoningState:
-    """Return the state before the first sample; rests (runs,) that are known end before the model's."""
-    none_yet = np.full((runs, 2), -1)
-    return ReckoningState(
-        np.zeros((runs, 4)),
-        none_yet,
-        np.zeros((runs, 3, 3)),
-        np.zeros(runs, np.int64),
-        np.full(runs, np.inf) if rest_s is None else rest_s,
-    )
-
-
 def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialState:
-    """Return the state before the first sample; rests (runs,) that are known end before the model's."""
+    """Return the state before the first sample.
+
+    Args:
+        runs: how many.
+        rest_s: (runs,), rests that end before the model's.
+    """
     return InertialState(
         np.full((runs, 3), -1),
         np.zeros((runs, 3)),
@@ -160,7 +135,8 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 
 
 @cache
-def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """Return the loop over runs of what takes one run through its samples, compiled."""
     return compile_over_runs(run_once, allocates=False)
 
 
@@ -175,28 +151,9 @@ def run_inertial_filter(
     These are filled into `estimates`, all NaN, where given. Raises BadInput where the columns have
     different lengths or the model's numbers are not positive.
     """
-    samples, estimates = _prepared(model, samples, estimates)
+    samples, estimates = prepared(model, samples, estimates)
     state = InertialState._make(part.copy() for part in state)
-    _over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
-    return state, estimates
-
-
-def run_dead_reckoning(
-    model: InertialModel,
-    state: ReckoningState,
-    samples: InertialSamples,
-    estimates: OrientationEstimates | None = None,
-    *,
-    unbiased: bool,
-) -> tuple[ReckoningState, OrientationEstimates]:
-    """Follow the gyro alone from the attitude of the rest on, less its mean there where `unbiased`.
-
-    There are no estimates before the rest is over, nor after a gap. Args and errors as
-    `run_inertial_filter`.
-    """
-    samples, estimates = _prepared(model, samples, estimates)
-    state = ReckoningState._make(part.copy() for part in state)
-    _over_runs(_reckoning_run)(len(samples.offsets) - 1, model, unbiased, state, samples, estimates)
+    over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
     return state, estimates
 
 
@@ -207,17 +164,23 @@ def attitudes(
 
     Args and errors as `run_inertial_filter`.
     """
-    samples, estimates = _prepared(model, samples, estimates)
+    samples, estimates = prepared(model, samples, estimates)
     rows = len(samples.force)
-    _over_runs(_attitude)(rows, samples.force, samples.field, estimates.orientation)
+    over_runs(_attitude)(rows, samples.force, samples.field, estimates.orientation)
     estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
     return estimates
 
 
-def _prepared(
+def prepared(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
 ) -> tuple[InertialSamples, OrientationEstimates]:
-    """Return checked samples, and estimates to fill."""
+    """Check samples, and return them with estimates to fill; see `run_inertial_filter`.
+
+    Args:
+        model: the filter's.
+        samples: of all runs.
+        estimates: to fill, all NaN; made where it is None.
+    """
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
         raise BadInput(
@@ -235,64 +198,6 @@ def _attitude(row: int, force: NDArray, field: NDArray, orientation: NDArray) ->
     found = triad(force[row], field[row])
     for part in range(4):
         orientation[row, part] = found[part]
-
-
-def _reckoning_run(
-    run: int,
-    model: InertialModel,
-    unbiased: bool,
-    state: ReckoningState,
-    samples: InertialSamples,
-    estimates: OrientationEstimates,
-) -> None:
-    for row in range(samples.offsets[run], samples.offsets[run + 1]):
-        _reckon(model, unbiased, state, run, samples, estimates, row)
-
-
-def _reckon(
-    model: InertialModel,
-    unbiased: bool,
-    state: ReckoningState,
-    run: int,
-    samples: InertialSamples,
-    estimates: OrientationEstimates,
-    row: int,
-) -> None:
-    """Take in one sample; one that is not finite is passed over, or only its field."""
-    time_ns, rate = samples.time_ns[row], samples.rate[row]
-    force, field = samples.force[row], samples.field[row]
-    if not all_finite(rate, force, force):
-        return
-    orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
-    if times[0] < 0:
-        times[:] = time_ns
-    duration_s, elapsed_s = (time_ns - times[1]) * _NS, (time_ns - times[0]) * _NS
-    times[1] = time_ns
-    if duration_s > model.gap_s:
-        orientation[:] = np.nan
-    rest_s = min(model.rest_s, state.rest_s[run])
-    if elapsed_s < rest_s:
-        for i in range(3):
-            sums[0, i] += rate[i]
-            sums[1, i] += force[i]
-            if all_finite(field, field, field):
-                sums[2, i] += field[i]
-        state.rest_samples[run] += 1
-        return
-    is_blank = True
-    for i in range(4):
-        is_blank = is_blank and orientation[i] == 0.0
-    if is_blank:
-        orientation[0], orientation[1], orientation[2], orientation[3] = triad(sums[1], sums[2])
-    turn, count = np.empty(3), max(state.rest_samples[run], 1)
-    for i in range(3):
-        turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
-    compose(orientation.copy(), turn_quaternion(turn[0], turn[1], turn[2]), orientation)
-    estimates.orientation[row] = orientation
-    variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - rest_s)
-    for i in range(3):
-        for j in range(3):
-            estimates.covariance[row, i, j] = variance if i == j else 0.0
 
 
 def _inertial_run(

@@ -21,11 +21,10 @@ from replay.estimators.orientation.inertial import (
     InertialSamples,
     OrientationEstimates,
     attitudes,
-    run_dead_reckoning,
     run_inertial_filter,
     start_inertial_filter,
-    start_reckoning,
 )
+from replay.estimators.orientation.reckoning import run_dead_reckoning, start_reckoning
 from replay.estimators.orientation.resting import LONGEST_S, of_nine_axes, rests_of
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}

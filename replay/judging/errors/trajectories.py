@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput, choices
 from recorders.trajectories import Trajectory
 from replay.engine.vectors.tangent import states_at
-from replay.judging.errors.alignment import Align, Alignment, aligned, alignment_of, rotation_error_rad
+from replay.judging.errors.alignment import Align, Alignment, aligned, alignment_of
+from replay.judging.errors.pose_doubts import UNTURNED, doubts_of_alignment, lacks_rotations
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -29,12 +30,6 @@ MOST_STEPS = 1 << 20
 GRID, STARTS = 65, 4
 # From the correlation's best place to the best offset it is a few steps.
 MOST_MOVES = 50
-# Orientations within it never turn; a path or an estimate that turns by more shows that they are none.
-STILL_RAD, TURNS_RAD = 1e-6, np.radians(20.0)
-# An alignment whose rotation is known less well is reported.
-LOOSE_DEG = 1.0
-# Beyond it an interval by the slope at the best rotation means nothing.
-UNKNOWN_DEG = 60.0
 
 
 @dataclass(frozen=True)
@@ -78,12 +73,6 @@ class Comparison:
         offset_s = self.time_offset_s
         if offset_s != "estimate" and not (isinstance(offset_s, int | float) and abs(offset_s) <= 1e9):
             raise BadInput(f"time_offset_s is {offset_s}; give seconds, or 'estimate'")
-
-
-UNTURNED = (
-    "its orientations never turn although its path or the estimate does: it is taken as positions "
-    "without orientations, and no rotation errors are given"
-)
 
 
 class Compared(NamedTuple):
@@ -136,13 +125,13 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
         _stamps(truth)  # without which the offset would go unnoticed
         estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
     matched, true = associate(estimate, truth, comparison)
-    doubts = [f"{true.name}: {UNTURNED}"] if _lacks_rotations(true, matched) else []
+    doubts = [f"{true.name}: {UNTURNED}"] if lacks_rotations(true, matched) else []
     if matched.rotation is None or true.rotation is None or doubts:
         matched, true = replace(matched, rotation=None), replace(true, rotation=None)
     alignment = alignment_of(matched.position_m, true.position_m, comparison.align, estimate.name)
     matched = aligned(matched, alignment)
     first, last = _pairs(matched, true, comparison)
-    doubts += _doubts_of_alignment(matched, true, comparison.align)
+    doubts += doubts_of_alignment(matched, true, comparison.align)
     return Compared(
         matched,
         true,
@@ -156,61 +145,6 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
         _angle_deg(_turn(matched, first, last), _turn(true, first, last)),
         tuple(doubts),
     )
-
-
-def _lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
-    """Tell whether a truth of positions alone was written with orientations that never turn.
-
-    They are one and the same although the path turns, or the estimate turns and the path does not lead
-    where they point.
-    """
-    if truth.rotation is None or estimate.rotation is None or len(truth) < 2:
-        return False
-    if _turned_rad(truth.rotation).max() > STILL_RAD:
-        return False
-    course = _courses(truth)
-    bends = _angle_rad(course, course[:1]) > TURNS_RAD
-    leads_away = _angle_rad(course, truth.rotation[0][None, :, 0]) > TURNS_RAD
-    return bends or (leads_away and bool(_turned_rad(estimate.rotation).max() > TURNS_RAD))
-
-
-def _turned_rad(rotation: Floats) -> Floats:
-    """Compute by what angles rotations (n, 3, 3) differ from the first."""
-    return np.asarray(Rotation.from_matrix(rotation[0].T @ rotation).magnitude())
-
-
-def _courses(trajectory: Trajectory) -> Floats:
-    """Return the directions (k, 3) of a path, each over a tenth of its extent; none of one that rests.
-
-    Over so much, errors of single positions do not count.
-    """
-    place = trajectory.position_m
-    step_m, ends = 0.1 * float(np.linalg.norm(place - place[0], axis=1).max()), [0]
-    for row in range(1, len(place)):
-        if np.linalg.norm(place[row] - place[ends[-1]]) > step_m:
-            ends.append(row)
-    way = np.diff(place[ends], axis=0)
-    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
-
-
-def _angle_rad(course: Floats, direction: Floats) -> float:
-    """Compute the greatest angle of directions (k, 3) with one (1, 3); zero without any."""
-    cosines = np.clip(np.sum(course * direction, axis=1), -1.0, 1.0)
-    return float(np.arccos(cosines).max(initial=0.0))
-
-
-def _doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) -> list[str]:
-    """Say how loosely positions determine the alignment's rotation."""
-    known_deg = np.degrees(rotation_error_rad(estimate.position_m, truth.position_m, align))
-    if known_deg <= LOOSE_DEG:
-        return []
-    within = f"within {known_deg:.2g} deg (95 %)" if known_deg < UNKNOWN_DEG else "not at all"
-    has_figures = estimate.rotation is not None
-    figures = "; absolute rotation errors (APE) are known no better" if has_figures else ""
-    return [
-        f"{estimate.name}: its path is nearly straight or short for its errors, so that positions "
-        f"determine the rotation of the {align} alignment {within}{figures}"
-    ]
 
 
 def associate(

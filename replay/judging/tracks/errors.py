@@ -232,10 +232,15 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 def figures_of_whole_tracks(
     tracks: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
 ) -> dict[str, float]:
-    """Return HOTA and IDF1 of the tracks at k instants by the truths (targets, k, 2), cutoff 20 m.
+    """Return HOTA and IDF1 with cutoff 20 m.
 
     Of all tracks; if truths cover some targets, of those that are ever within the cutoff of a target,
     under names of their own.
+
+    Args:
+        tracks: those at each of k instants.
+        truths: (targets, k, 2), in m, NaN where a target is not there.
+        unreferenced_m: see `Judged`.
     """
     from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
 
@@ -249,9 +254,14 @@ def figures_of_whole_tracks(
 
 
 def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int]:
-    """Return the tracks (tracks, k, 2) that are ever within the cutoff of a target.
+    """Find the tracks that are ever within the cutoff of a target.
 
-    And how many points all other tracks have.
+    Args:
+        tracks: those at each of k instants.
+        truths: (targets, k, 2), in m, NaN where a target is not there.
+
+    Returns:
+        These tracks (tracks, k, 2), NaN where one is absent, and how many points all others have.
     """
     near: set[int] = set()
     for at, true in zip(tracks, truths.transpose(1, 0, 2), strict=True):

@@ -1,0 +1,75 @@
+"""Tells what figures of trajectories do not mean: a truth without rotations, a loose alignment."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recorders.trajectories import Trajectory
+from replay.judging.errors.alignment import Align, rotation_error_rad
+
+Floats = NDArray[np.float64]
+# Orientations within it never turn; a path or an estimate that turns by more shows that they are none.
+STILL_RAD, TURNS_RAD = 1e-6, np.radians(20.0)
+# An alignment whose rotation is known less well is reported.
+LOOSE_DEG = 1.0
+# Beyond it an interval by the slope at the best rotation means nothing.
+UNKNOWN_DEG = 60.0
+UNTURNED = (
+    "its orientations never turn although its path or the estimate does: it is taken as positions "
+    "without orientations, and no rotation errors are given"
+)
+
+
+def lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
+    """Tell whether a truth of positions alone was written with orientations that never turn.
+
+    They are one and the same although the path turns, or the estimate turns and the path does not lead
+    where they point.
+    """
+    if truth.rotation is None or estimate.rotation is None or len(truth) < 2:
+        return False
+    if _turned_rad(truth.rotation).max() > STILL_RAD:
+        return False
+    course = _courses(truth)
+    bends = _angle_rad(course, course[:1]) > TURNS_RAD
+    leads_away = _angle_rad(course, truth.rotation[0][None, :, 0]) > TURNS_RAD
+    return bends or (leads_away and bool(_turned_rad(estimate.rotation).max() > TURNS_RAD))
+
+
+def _turned_rad(rotation: Floats) -> Floats:
+    """Compute by what angles rotations (n, 3, 3) differ from the first."""
+    return np.asarray(Rotation.from_matrix(rotation[0].T @ rotation).magnitude())
+
+
+def _courses(trajectory: Trajectory) -> Floats:
+    """Return the directions (k, 3) of a path, each over a tenth of its extent; none of one that rests.
+
+    Over so much, errors of single positions do not count.
+    """
+    place = trajectory.position_m
+    step_m, ends = 0.1 * float(np.linalg.norm(place - place[0], axis=1).max()), [0]
+    for row in range(1, len(place)):
+        if np.linalg.norm(place[row] - place[ends[-1]]) > step_m:
+            ends.append(row)
+    way = np.diff(place[ends], axis=0)
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+
+def _angle_rad(course: Floats, direction: Floats) -> float:
+    """Compute the greatest angle of directions (k, 3) with one (1, 3); zero without any."""
+    cosines = np.clip(np.sum(course * direction, axis=1), -1.0, 1.0)
+    return float(np.arccos(cosines).max(initial=0.0))
+
+
+def doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) -> list[str]:
+    """Say how loosely positions determine the alignment's rotation."""
+    known_deg = np.degrees(rotation_error_rad(estimate.position_m, truth.position_m, align))
+    if known_deg <= LOOSE_DEG:
+        return []
+    within = f"within {known_deg:.2g} deg (95 %)" if known_deg < UNKNOWN_DEG else "not at all"
+    has_figures = estimate.rotation is not None
+    figures = "; absolute rotation errors (APE) are known no better" if has_figures else ""
+    return [
+        f"{estimate.name}: its path is nearly straight or short for its errors, so that positions "
+        f"determine the rotation of the {align} alignment {within}{figures}"
+    ]
