@@ -149,8 +149,7 @@ def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                 stream,
                 as_is.value,
                 f"latitude and longitude are {what}: so fixes move {other.value:.4g} m for each metre "
-                "of "
-                f"the wheels, as they are {as_is.value:.4g} m",
+                f"of the wheels, as they are {as_is.value:.4g} m",
                 "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
                 is_fact=False,
             )

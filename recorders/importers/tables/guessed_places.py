@@ -156,8 +156,8 @@ def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> No
     largest = [float(np.nanmax(np.abs(column.values))) for column in place]
     raise BadInput(
         f"{table.path}: it is not certain what {place[0].name} and {place[1].name}, up to "
-        f"{largest[0]:.9g} and "
-        f"{largest[1]:.9g}, are in: {why}; write a mapping by hand with `units` of latitude_deg and "
+        f"{largest[0]:.9g} and {largest[1]:.9g}, are in: {why}; write a mapping by hand with `units` "
+        "of latitude_deg and "
         'longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` for '
         "ddmm.mmmm, or `missing` for codes of missing values"
     )

@@ -215,8 +215,7 @@ def _tried(
             refusals.append(
                 BadInput(
                     f"{label} could be the time, and is the same in all rows; write a mapping by hand "
-                    "with "
-                    "the `time` of the rows, as docs/your-log.md says"
+                    "with the `time` of the rows, as docs/your-log.md says"
                 )
             )
         return None
@@ -250,8 +249,7 @@ def _tried(
         comments = [
             *comments,
             f"{ASSUMED}{vehicle} says whose row it is: a namespace of topics for each of its "
-            f"{len(parts)} "
-            "values; vehicle",
+            f"{len(parts)} values; vehicle",
         ]
     seen = _seen([stamps[part] for part in parts])
     return GuessedTime(_toml(mapping), {*columns}, [*seen, *comments], stamps, vehicle)
@@ -377,8 +375,7 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     if others:
         comments.append(
             f"{ASSUMED}{' and '.join(names)} has {_first_part(pattern)} first, {pattern}, so that rows "
-            "follow "
-            f"one another; with {_first_part(others[0])} first they leap; format"
+            f"follow one another; with {_first_part(others[0])} first they leap; format"
         )
     return TimeMapping.model_validate({**given, "format": pattern}), comments
 

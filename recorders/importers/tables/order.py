@@ -84,8 +84,7 @@ class Order:
             f'in `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or in the '
             "table "
             '`vehicle = "COLUMN"` if a column says whose row it is; if the clock was restarted or set '
-            "back, "
-            "split the file there"
+            "back, split the file there"
         )
 
     def _rollover(self, high_ns: int, low_ns: int) -> int:

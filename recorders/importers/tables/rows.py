@@ -132,15 +132,13 @@ class Rows:
             if len(stamps) < _size(batch):
                 raise BadInput(
                     f"{self._stamps_path}: has {count} times, and there are more rows in {self.path} "
-                    "and "
-                    "the files after it; give a time for each row"
+                    "and the files after it; give a time for each row"
                 )
             yield {**batch, _STAMP: pa.array(stamps, pa.string())}
         if rest := sum(1 for _ in lines):
             raise BadInput(
                 f"{self._stamps_path}: has {count + rest} times, and there are {count} rows in "
-                f"{self.path} "
-                "and the files after it; give a row for each time"
+                f"{self.path} and the files after it; give a row for each time"
             )
 
     def _wanted(self) -> tuple[set[str], set[str]]:
@@ -212,8 +210,7 @@ class Rows:
                 row = int(np.argmax(minutes >= 60.0))
                 raise BadInput(
                     f"{self.path}: column {column} holds {found[row]:.9g}, which are no degrees and "
-                    "minutes "
-                    "(ddmm.mmmm); leave it out of degrees_minutes"
+                    "minutes (ddmm.mmmm); leave it out of degrees_minutes"
                 )
             found = np.copysign(np.floor(size / 100.0) + minutes / 60.0, found)
         if column in self._halves:
@@ -225,8 +222,7 @@ class Rows:
                 row = int(np.argmax(is_north & (found < 0.0)))
                 raise BadInput(
                     f"{self.path}: column {column} holds {found[row]:.9g} where {self._halves[column]} "
-                    "says "
-                    f"'{letters[row]}'; leave it out of hemispheres if it has signs already"
+                    f"says '{letters[row]}'; leave it out of hemispheres if it has signs already"
                 )
             unknown = ~(is_south | is_north) & np.isfinite(found)
             self._tell(
@@ -354,8 +350,7 @@ class Rows:
             if len(self._clocks) == _MOST_VEHICLES:
                 raise BadInput(
                     f"{self.path}: column {self._vehicle} has more than {_MOST_VEHICLES} values; name "
-                    "the "
-                    "column of the vehicle, or leave `vehicle` out"
+                    "the column of the vehicle, or leave `vehicle` out"
                 )
             label = f"{self.path}: column {' and '.join(self._time.columns)}"
             self._clocks[vehicle] = (

@@ -351,9 +351,8 @@ def _check_offsets(
         first = int(np.argmax(is_other))
         raise BadInput(
             f"{label}: row {rows[first] + 1} holds '{texts[first]}', which states another offset from "
-            "UTC "
-            f"than the mapping, {zone_h[first]:+g} h; leave `zone` and `utc_offset_h` out of `time`, as "
-            "the cells have their own"
+            f"UTC than the mapping, {zone_h[first]:+g} h; leave `zone` and `utc_offset_h` out of "
+            "`time`, as the cells have their own"
         )
 
 
