@@ -167,12 +167,6 @@ def test_nees_and_nis_have_the_bounds_of_what_is_independent(
     assert "dead-reckoning.nis_per_component.robot1" not in bounds
 
 
-def test_what_has_no_position_has_no_bounds_of_it() -> None:
-    source = memory_source(*record_run("batch-reactor", {}, 5))
-    judge = judged([source], [collect(replay([source], bind("ekf", [source], {})))])
-    assert {key.split(".")[1] for key in judge.intervals(0.95)} == {"nees", "nis_per_component"}
-
-
 def test_the_rmse_of_a_step_stands_beside_what_its_covariances_promise(
     sources: list[MemorySource], outputs: dict[str, Ragged]
 ) -> None:
