@@ -10,7 +10,7 @@ import pytest
 from pipeline.output.claims import decide
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import load_experiment
-from pipeline.studies.acoustic import recordings
+from pipeline.studies.acoustic import recordings, sequence
 from pipeline.studies.acoustic.recordings import (
     Options,
     Published,
@@ -44,6 +44,22 @@ def test_a_shot_is_where_it_was_fired_and_when_it_was_heard_last():
 
 def names(**columns: Any) -> Any:
     return SimpleNamespace(**columns)
+
+
+def test_a_shot_has_the_error_of_its_own_estimate(monkeypatch: pytest.MonkeyPatch):
+    source = memory_source(*record_run("shot-sequence", {"shots": 4}, 4))
+    _, last_ns = shots_of(source)
+    located = names(
+        run=np.zeros(3, int),
+        time_ns=last_ns[[0, 1, 3]],
+        error=np.array([[3.0, 4.0], [6.0, 8.0], [9.0, 12.0]]),
+        nees=np.array([3.0, 6.0, 9.0]),
+        components=["x_m", "y_m", "vx_mps"],
+    )
+    monkeypatch.setattr(sequence, "errors_named", lambda *_: located)
+    table = sequence.shot_errors(names(sources=[source]), ["ekf"])
+    np.testing.assert_array_equal(table["error_m"], [5.0, 10.0, np.nan, 15.0])
+    np.testing.assert_array_equal(table["nees"], [1.0, 2.0, np.nan, 3.0])
 
 
 def verdicts(metrics: dict, of: str) -> list[str]:

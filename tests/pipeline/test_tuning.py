@@ -20,7 +20,7 @@ import fuselog as fl
 from pipeline.output.results import read_result
 from pipeline.runs.executors import InlineExecutor
 from pipeline.tuning.objective import Best, Objective
-from pipeline.tuning.search import Coordinates, Cost, Free, curvature, least
+from pipeline.tuning.search import Coordinates, Cost, Free, _scanned, curvature, least
 from pipeline.tuning.tuning import ENOUGH
 from recorders.log import RunMetadata
 from recorders.recording import Recording
@@ -550,6 +550,17 @@ def test_what_need_not_be_positive_is_found_too() -> None:
     for row in found.parameters.to_dict("records"):
         assert row["low"] < true[row["parameter"]] < row["high"], row
         assert row["high"] - row["low"] < 0.2
+
+
+@pytest.mark.parametrize("lowest", [0.1, 10**-0.5, 10**-0.2, 10**0.2, 10**0.5, 10.0])
+def test_a_scan_finds_a_lower_minimum_up_to_ten_times_away(lowest: float) -> None:
+    coordinates = Coordinates([Free("sigma_m", 1.0, 1e-3, 1e3, is_positive=True)], np.ones(1))
+
+    def cost(values: np.ndarray) -> np.ndarray:
+        return np.where(np.abs(np.log(values[:, 0] / lowest)) < 0.05, 0.0, 1.0)
+
+    [found] = _scanned(cost, coordinates, np.zeros(1))
+    assert np.exp(found) == pytest.approx(lowest)
 
 
 @pytest.mark.paper

@@ -72,8 +72,12 @@ def test_a_magnetometer_and_tags_are_turned_with_the_body():
 
 
 def test_scales_are_taken_back_after_the_bias():
-    given = settings(force_scale_x=0.02, force_scale_z=-0.01)
-    true, scale, bias = np.array([1.0, 2.0, 9.8]), np.array([1.02, 1.0, 0.99]), np.array([0.1, 0.2, 0.3])
+    given = settings(force_scale_x=0.02, force_scale_y=0.03, force_scale_z=-0.01)
+    true, scale, bias = (
+        np.array([1.0, 2.0, 9.8]),
+        np.array([1.02, 1.03, 0.99]),
+        np.array([0.1, 0.2, 0.3]),
+    )
     measured = (*(scale * true + bias), 0.0, 0.0, 0.0)
     assert_allclose(specific_force(measured, bias, given), true)
 
