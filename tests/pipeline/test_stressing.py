@@ -17,6 +17,7 @@ from pipeline.stressing import copies, stressing
 from pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
+from pipeline.stressing.verdicts import ORDER
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream
 from replay.engine.streams.sources import memory_source
@@ -395,9 +396,14 @@ def test_a_lost_message_moves_a_filter_as_far_as_its_covariance_says() -> None:
     sure = {"kind": "ekf", "sigma_range_m": 0.005, "sigma_bearing_rad": 0.002, "gate_probability": 1.0}
     logs = [fl.record("landmarks", seed=seed, duration_s=10.0) for seed in range(3)]
     verdicts: dict[str, set[str]] = {"ekf": set(), "sure": set()}
-    for each in fl.stress(logs, {"ekf": {}, "sure": sure}).stressed:
+    found = fl.stress(logs, {"ekf": {}, "sure": sure})
+    for each in found.stressed:
         verdicts[each.estimator].add(each.verdict("dropped"))
     assert verdicts == {"ekf": {"sensitive"}, "sure": {"discontinuous or chaotic"}}
+    told = [each.partition(":")[0] for each in found.sentences]
+    worst_first = sorted((each.worst for each in found.stressed), key=ORDER.index, reverse=True)
+    assert [each for each in told if each in ORDER] == worst_first
+    assert len({*worst_first}) > 1
 
 
 def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> None:

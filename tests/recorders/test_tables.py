@@ -207,6 +207,17 @@ delay_s = 0.5
     since = found.publish_time_ns - 1767225600_000000000
     assert since.tolist() == [-500000000, -375000000, -250000000]
     assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 3
+    logged = mapping.replace("rate_hz = 8,", 'column = "x", unit = "s",').replace(
+        "[[tables.streams]]",
+        'arrival = { column = "tick", unit = "ms", zero = "2026-01-01" }\n[[tables.streams]]',
+    )
+    found = imported("x,tick\n1,5000\n2,5500\n3,7000\n", logged)[0]["/x"]
+    for clock_ns, times_s in (
+        (found.publish_time_ns, [0.5, 1.5, 2.5]),
+        (found["sensor_time_ns"], [1.0, 2.0, 3.0]),
+        (found.log_time_ns, [5.0, 5.5, 7.0]),
+    ):
+        assert ((clock_ns - 1767225600_000000000) / 1e9).tolist() == times_s
     head = b"TIMETAG RTKLIB demo5".ljust(64, b"\0") + struct.pack("<Id", 1756402240, 0.25)
     (tmp_path / "raw.csv.tag").write_bytes(head + struct.pack("<6I", 0, 0, 500, 10, 2002, 20))
     (tmp_path / "raw.csv").write_text("80\n1,5000\n2,5500\n3,7000\n4,70")  # both ends are cut

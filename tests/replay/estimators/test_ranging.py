@@ -233,6 +233,21 @@ def test_a_log_without_a_prior_begins_where_its_ranges_fit_best() -> None:
 POSE = {"kind": "ekf", "model": "ranging-pose"}
 
 
+def test_errors_that_last_are_as_large_and_last_as_long_as_stated() -> None:
+    """From seed to seed the deviation scatters by 1.4 %, the correlation over a second by .022."""
+    rate_hz, sigma_m = 4, 2.0
+    stated = {"error_sigma_m": sigma_m, "error_time_s": 1.0, "sigma_range_m": 1e-3}
+    log = fl.record(
+        "ranging", seed=5, duration_s=400.0, rate_hz=rate_hz, tags_m=[[0, 0, 0]], height_m=0.0, **stated
+    )
+    places = np.pad(log["/trolley/truth"]["state"][:, :2], ((0, 0), (0, 1)))
+    true = np.linalg.norm(places[:, None] - log["/anchors"]["position_m"], axis=2)
+    error = log["/trolley/ranges"]["range_m"].reshape(true.shape) - true
+    assert error.std() == pytest.approx(sigma_m, rel=0.08)
+    lasting = (error[rate_hz:] * error[:-rate_hz]).mean() / sigma_m**2
+    assert lasting == pytest.approx(np.exp(-1.0), abs=0.1)
+
+
 @pytest.mark.paper
 def test_nees_is_what_it_should_be_where_errors_that_last_are_modelled() -> None:
     """And above 30 where they are taken for white noise; blocked lines need a robust update."""

@@ -14,6 +14,7 @@ from replay.inference.association.births import ending
 from replay.inference.association.clusters import MOST_ENUMERATED
 from replay.inference.association.scans import Scans, in_time
 from replay.inference.association.shared_bias import pool_errors, pool_of
+from replay.inference.association.track_management import MANAGEMENTS
 from replay.inference.association.tracks import no_tracks
 
 PLACES = np.array([[0.0, 0.0], [4.0, 1.0], [9.0, -1.0]])
@@ -257,6 +258,30 @@ def test_a_second_track_of_a_target_ends(first_is_confirmed: bool, component: in
             tracks.mean[0, 1, 0, component] += sign * share * limits[component]
             end_tracks(0, tracks, p)
             assert tracks.used[0] == 1 + is_left
+
+
+@pytest.mark.parametrize("management", MANAGEMENTS)
+def test_a_silent_track_ends_after_the_time_of_its_kind(management: str):
+    """A confirmed one and a tentative one have times of their own, and are there to the end of them."""
+    model = SimpleNamespace(state=("x_m", "y_m"))
+    tracker = SimpleNamespace(stage=SimpleNamespace(model=model), management=management)
+    p = SimpleNamespace(
+        silence_s=10.0,
+        tentative_silence_s=6.0,
+        same_within_m=0.0,
+        ending_existence=0.1,
+        chances=6,
+        false_confirmation=0.01,
+        missed_confirmation=0.01,
+    )
+    end_tracks = ending(tracker)
+    for silent_s, left in ((5.9, [1, 2]), (6.1, [1]), (9.9, [1]), (10.1, [])):
+        tracks = no_tracks(1, 2, (1, 2, 2), 1, np.empty((0, 0)))
+        tracks.used[:], tracks.existence[:] = 2, 1.0
+        tracks.number[0], tracks.is_confirmed[0] = (1, 2), (True, False)
+        tracks.time_ns[:], tracks.seen_ns[:] = round(silent_s * 1e9), 0
+        end_tracks(0, tracks, p)
+        assert tracks.number[0, : tracks.used[0]].tolist() == left, silent_s
 
 
 def test_scans_of_two_sequences_are_merged_with_their_detections_and_keep_their_order_at_equal_stamps():
