@@ -20,7 +20,7 @@ from replay.regions.moving_sets import from_rings
         ("h5py", "papers", lambda: _datasets(Path("trial.hdf5"))),
         ("sklearn", "papers", lambda: fit_wrapped_mixture(np.zeros((40, 2)), 2)),
         ("shapely", "papers", lambda: from_rings([np.eye(3, 2)])),
-        ("pyproj", "maps", lambda: _onto_map("EPSG:25832")),
+        ("pyproj", "maps", lambda: _onto_map.__wrapped__("EPSG:25832")),
     ],
 )
 def test_what_is_missing_is_said(

@@ -36,6 +36,7 @@ SIZES = {
     "rad": 1.0,
     "mrad": 1e-3,
     "deg": np.pi / 180,
+    "semicircle": np.pi / 2**31,
     "T": 1.0,
     "mT": 1e-3,
     "uT": 1e-6,

@@ -81,7 +81,15 @@ def known_of(column: GuessedColumn) -> NDArray:
 
 
 def latitude_metres(latitude_deg: NDArray, longitude_deg: NDArray) -> tuple[NDArray, NDArray]:
-    """Return roughly how many m places (rows,) are north and east, on a sphere."""
+    """Return roughly how many m places are north and east, on a sphere.
+
+    Args:
+        latitude_deg: (rows,), NaN if there is none.
+        longitude_deg: (rows,), NaN if there is none.
+
+    Returns:
+        North and east of latitude and longitude 0 (rows,), scaled by the median latitude.
+    """
     metres = 111_195.0
     shrunk = metres * np.cos(np.radians(np.nanmedian(latitude_deg)))
     return metres * latitude_deg, shrunk * longitude_deg

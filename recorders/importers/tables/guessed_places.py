@@ -244,13 +244,27 @@ def is_ais(table: GuessedTable) -> bool:
 def path_ratio(
     table: GuessedTable, latitude_deg: NDArray, longitude_deg: NDArray, speed: NDArray
 ) -> float | None:
-    """Return how many m/s of the path one of a speed's unit is; None if places or speeds do not tell."""
+    """Return how many m/s of the path one of a speed's unit is; None if places or speeds do not tell.
+
+    Args:
+        table: has the times of the rows.
+        latitude_deg: (rows,), NaN if there is none.
+        longitude_deg: (rows,), NaN if there is none.
+        speed: (rows,), in the unknown unit.
+    """
     north, east = latitude_metres(latitude_deg, longitude_deg)
     return plane_ratio(table, east, north, speed)
 
 
 def plane_ratio(table: GuessedTable, east: NDArray, north: NDArray, speed: NDArray) -> float | None:
-    """Return what `path_ratio` does of places in a plane."""
+    """Return what `path_ratio` does, for places in a plane.
+
+    Args:
+        table: has the times of the rows.
+        east: (rows,), in m.
+        north: (rows,), in m.
+        speed: (rows,), in the unknown unit.
+    """
     if table.time_s is None:
         return None
     known = np.isfinite(east) & np.isfinite(north) & np.isfinite(table.time_s)

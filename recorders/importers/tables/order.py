@@ -95,9 +95,11 @@ class Order:
 
 
 def rollover_of(counts: NDArray, usual: float) -> int:
-    """Return at which number a counter (n,) begins again; 0 if its falls are no rollovers.
+    """Return at which number a counter begins again; 0 if its falls are no rollovers.
 
-    `usual` is its usual step: so far, or nearly, it goes on beyond the number where it falls.
+    Args:
+        counts: (n,), readings of the counter.
+        usual: its usual step: about so far it goes on beyond the number at which it falls.
     """
     steps = np.diff(counts)
     falls = np.flatnonzero(steps < 0)

@@ -229,9 +229,14 @@ def stamps_ns(
 ) -> Stamps:
     """Return the stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
 
-    `rows` are the numbers of the rows, from 0 on, and `reading` what is known from the rows before.
-    Raises BadInput, which begins with `where`, if a cell holds no time, or one beyond what a log can
-    hold.
+    Args:
+        mapping: says which columns have the time, and how.
+        columns: cells (n,) by name.
+        rows: (n,), the numbers of the rows, from 0 on.
+        where: begins the sentence on a cell that cannot be used.
+        reading: what is known from the rows before.
+
+    Raises BadInput if a cell holds no time, or one beyond what a log can hold.
     """
     reading = reading or Reading()
     if mapping.rate_hz is not None:
