@@ -55,29 +55,6 @@ def test_the_types_that_one_meets_are_where_it_says() -> None:
             assert re.search(rf"\b{name}\b", (ROOT / path).read_text(encoding="utf-8")), (name, path)
 
 
-@pytest.mark.parametrize("target", ["test", "test-fast"])
-def test_the_lanes_run_every_test_once(target: str) -> None:
-    """Those that `make test` starts side by side, and `make test-fast`."""
-    joined = MAKEFILE.replace("\\\n", "")
-    (started,) = re.findall(rf"^{target}: .*\n\t\$\(MAKE\) -j\d (.*)", joined, re.MULTILINE)
-    lanes = [
-        re.findall(rf"^{lane}: .*\n\t\$\(BIN\)/pytest (.*)", joined, re.MULTILINE)[0].split()
-        for lane in started.removesuffix(" lint").split()
-    ]
-
-    def runs(lane: list[str], path: Path) -> bool:
-        left_out = re.findall(r"--ignore(?:-glob)?='?([^\s']+)", " ".join(lane))
-        taken = [each for each in lane if not each.startswith("-")] or ["tests"]
-
-        def is_of(patterns: list[str]) -> bool:
-            return any(each.match(pattern) for each in (path, *path.parents) for pattern in patterns)
-
-        return is_of(taken) and not is_of(left_out)
-
-    for path in ROOT.glob("tests/**/test_*.py"):
-        assert sum(runs(lane, path.relative_to(ROOT)) for lane in lanes) == 1, path
-
-
 def test_ci_runs_the_two_commands_everywhere() -> None:
     workflow: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text("utf-8"))
     job = workflow["jobs"]["commands"]
