@@ -16,13 +16,13 @@ from hypothesis import settings
 from recorders.recording import import_run
 from replay.engine.streams.sources import MemorySource, memory_source
 
-# readline, which pytest imports, sets these for the processes of xdist, where text would be 80 wide
-for _name in ("COLUMNS", "LINES"):
-    os.environ.pop(_name, None)
-
 # The same examples in every run: a red test is red for everyone, and stays so until it is mended.
 settings.register_profile("fuselog", deadline=None, derandomize=True)
 settings.load_profile("fuselog")
+
+# readline, which pytest imports, sets these for the processes of xdist, where text would be 80 wide
+for _name in ("COLUMNS", "LINES"):
+    os.environ.pop(_name, None)
 
 
 def pytest_collection_finish() -> None:
