@@ -22,6 +22,10 @@ pytest_plugins = ["tests.goldens.keeping"]
 settings.register_profile("fuselog", deadline=None, derandomize=True)
 settings.load_profile("fuselog")
 
+# readline, which pytest imports, sets these for the processes of xdist, where text would be 80 wide
+for _name in ("COLUMNS", "LINES"):
+    os.environ.pop(_name, None)
+
 
 def pytest_collection_finish() -> None:
     """Leave what is imported by now out of every later collection: a twentieth of the suite's time."""

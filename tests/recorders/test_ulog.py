@@ -86,6 +86,15 @@ def test_inertial_samples_have_the_sheets_sums_in_our_axes(logs: Path, name: str
     assert inertial["specific_force_mps2"][:, 2].mean() > 9.5
 
 
+def test_rows_before_the_first_stamp_of_a_piece_are_spread_from_the_last_one() -> None:
+    """In equal steps where rows are of equal length, from what was known before the piece."""
+    piece = UlogFile.__new__(UlogFile)
+    piece._last_us = 5_000
+    at, stamps = 9 + 10 * np.arange(10), np.append(np.zeros(9, np.int64), 6_000)
+    found = piece._times(at, stamps, stamps > 0)
+    assert found.tolist() == [*range(5_100, 6_001, 100)]
+
+
 def test_the_filters_state_is_an_estimate_near_the_simulators_truth(logs: Path):
     """The sheet's comparison: the orientation errs by .23 deg on average, the position by 1 cm."""
     streams = streams_of(logs / f"{TAGGED}.ulg")
