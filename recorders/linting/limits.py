@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
@@ -147,20 +146,21 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     if EARLIEST_NS < first_ns < LATEST_NS:
         yield _stamps(
             stream,
-            f"its stamps begin on {pd.Timestamp(first_ns):%Y-%m-%d}, before there were such logs",
+            f"its stamps begin on {_day(first_ns)}, before there were such logs",
             "`unit` and `zero` of `time` in the mapping",
         )
-    days = pd.to_datetime(np.unique(stream.publish_time_ns // (86400 * 10**9)) * 86400 * 10**9)
+    days = np.unique(_day(stream.publish_time_ns))
+    of_month = (days - days.astype("datetime64[M]")).astype(int) + 1
     if (
         first_ns > LATEST_NS
         and len(days) >= 2
-        and len(set(days.day)) == 1
+        and len(set(of_month.tolist())) == 1
         and len(stream) >= 5 * len(days)
     ):
         yield _stamps(
             stream,
-            f"its stamps are of {len(days)} days, each the {days[0].day}. of a month, the first on "
-            f"{days[0]:%Y-%m-%d}: day and month are swapped",
+            f"its stamps are of {len(days)} days, each the {of_month[0]}. of a month, the first on "
+            f"{days[0]}: day and month are swapped",
             "`format` of `time` in the mapping",
         )
     for other in streams.values():
@@ -176,6 +176,11 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                 "`zone` or `utc_offset_h` of `time` in the mapping",
             )
             return
+
+
+def _day(time_ns: int | NDArray[np.int64]) -> NDArray[np.datetime64]:
+    """Return the days of stamps in UTC."""
+    return np.asarray(time_ns).astype("datetime64[ns]").astype("datetime64[D]")
 
 
 def _places(stream: Stream) -> Floats:

@@ -407,7 +407,7 @@ def changes(old: Runs, new: Runs) -> list[str]:
         elif run not in new:
             lines.append(f"{run}: removed")
         elif new[run] is not old[run]:
-            lines += capped(against(old, run, new[run]))
+            lines += capped(difference(run, old[run], new[run]))
     return lines
 
 

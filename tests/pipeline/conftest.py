@@ -45,6 +45,7 @@ ABOUT_OTHERS = (
     "campaigns",
     "checkpoints",
     "faults",
+    "impossible",
     "json",
     "known_answers",
     "outputs",

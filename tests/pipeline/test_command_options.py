@@ -230,7 +230,6 @@ UNMOVED = {
     "evaluate --truth-format": "it is found from the content, and another than that is refused",
     "explore --gap-limit": "no test moves it yet",
     "stress --gap-limit": "tests/pipeline/test_stressing.py: of which errors a change counts",
-    "report --viewer": "tests/pipeline/test_report.py asks for it in Python",
     "view --gap-limit": "no two timelines have the same bytes",
 }
 

@@ -403,8 +403,11 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
 
 @pytest.mark.paper
 @without_drawing()
-def test_nothing_is_refuted_by_estimates_that_are_missing(tmp_path: Path) -> None:
+def test_nothing_is_refuted_by_estimates_that_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
+    monkeypatch.setattr("recorders.log.impossible.limit_of", lambda _: 1e300)
     label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})
     result = run_experiment(label, experiment, tmp_path / "out", logs=1)
     assert {claim.verdict for claim in result.claims} == {"not reproducible"}

@@ -131,12 +131,16 @@ def test_the_page_goes_back_for_late_messages() -> None:
 
 
 def test_ours_are_made_as_those_of_others() -> None:
-    """By `recursive`, `batch`, or a model and a method; not so are libraries and programs."""
+    """By `recursive`, `batch`, or a model and a method; not so are libraries and programs.
+
+    Those of nine axes are made by `recursive`, and then find how long the unit rests.
+    """
     makers = set()
     for name in set(available("estimators")) - {"exec", "lib"}:
         bind = load("estimators", name, fl.Estimator).bind
         makers.add(getattr(bind, "func", bind).__module__)
-    assert makers == {"replay.engine.api.binding", "replay.inference.estimators"}
+    resting = "replay.estimators.orientation.resting"
+    assert makers == {"replay.engine.api.binding", "replay.inference.estimators", resting}
 
 
 def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:

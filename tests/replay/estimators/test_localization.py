@@ -424,14 +424,13 @@ def test_filters_that_are_told_wrong_noise_are_not(
 
 
 def absurd(source: MemorySource) -> MemorySource:
-    """The run with an odometry message, 5 s in, that no covariance survives."""
+    """The run with an odometry message, 5 s in, that is not left out, and no covariance survives it."""
     odometry = source.streams["/robot1/odometry"]
     forward = odometry["forward_mps"].copy()
     forward[100] = 1e200
     columns = {**odometry.columns, "forward_mps": forward}
-    return replace(
-        source, streams={**source.streams, "/robot1/odometry": replace(odometry, columns=columns)}
-    )
+    streams = {**source.streams, "/robot1/odometry": replace(odometry, columns=columns)}
+    return replace(source, streams=streams, is_raw=True)
 
 
 def onto_a_landmark(source: MemorySource) -> MemorySource:

@@ -614,7 +614,9 @@ def test_the_sheets_reference_trackers(autoferry: Path):
     assert len(rewound["rewound"]) == 5
     last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
     np.testing.assert_array_equal(rewound["track"]["mean"][-1], last)
-    late = track_figures(track_errors(tracks_at(rewound["set"], rewound["track"], at_ns), true))
+    late = track_figures(
+        track_errors(tracks_at(rewound["set"], rewound["track"], at_ns), true, unreferenced_m=limit_m)
+    )
     assert late["gospa_m"] == pytest.approx(figures[5]["gospa_m"], abs=0.05)
     one = replay_in_memory(sources[2:3], {label: {"sensors": ["radar", "lidar"]}})
     for leaf in ("set", "track", "association"):

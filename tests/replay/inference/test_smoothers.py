@@ -2,6 +2,7 @@
 
 import gc
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -439,7 +440,7 @@ def test_an_ensemble_is_its_runs_alone_and_one_that_fails_fails_alone(
     told[1] = told[1][:30]
     row = next(k for k, each in enumerate(told[2]) if each[0] >= 3 and each[1] == "rb")
     told[2][row] = (*told[2][row][:3], np.array([1e308, 1e308]))
-    sources = [vehicle_a.source(each) for each in told]
+    sources = [replace(vehicle_a.source(each), is_raw=True) for each in told]
     together = outputs(VEHICLE_A, "smoother", sources, forward=forward)
     assert np.diff(together["failure"].offsets).tolist() == [0, 0, 1]
     for run in (0, 1):

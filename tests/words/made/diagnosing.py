@@ -117,7 +117,7 @@ def order() -> Iterator[str]:
     for of_halves in ((-11.6, 250.0), (250.0, -1.93), (250.0, -1.91)):
         yield f"  {Cause(hypothesis, 1.0, (0.5, 1.5), 238.0, (), of_halves).words}"
     yield "in doubt:"
-    judge: Any = SimpleNamespace(judge=SimpleNamespace(components_without_truth=[], bounds={}))
+    judge: Any = SimpleNamespace(judge=SimpleNamespace(components_without_truth=[], bounds={}), logs=[])
     doubt = Cause(hypothesis, 1.0, (0.5, 1.5), 238.0, (), (-30.6, 268.6))
     yield from (f"  {each}" for each in notes_of(judge, [], [doubt]))
     yield "advised already:"
