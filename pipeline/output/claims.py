@@ -25,6 +25,7 @@ from pipeline.output.expressions import (
     truth,
 )
 from pipeline.output.numbers import Value, exactly
+from pipeline.output.words import MISSING
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 
@@ -78,7 +79,7 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 def known(claim: Claim) -> Claim:
     """Return the claim, neither confirmed nor refuted where a number of ours is missing."""
     has_none = claim.verdict in ("not reproducible", NO_VERDICT)
-    if has_none or not re.search(r"\bnan\b", claim.ours):
+    if has_none or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
         return claim
     why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
     return replace(claim, verdict="not reproducible", why=why)

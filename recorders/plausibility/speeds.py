@@ -8,7 +8,7 @@ import numpy as np
 from recorders.plausibility.body import Fixes, Floats, Series
 from recorders.plausibility.finding import Finding, digits
 from recorders.plausibility.motion import Motion
-from recorders.plausibility.windows import jumps, travelled
+from recorders.plausibility.windows import JUMP, jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
 UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}
@@ -28,7 +28,9 @@ def leaps(motion: Motion) -> Iterator[Finding]:
     """Find places that jump while a speed says that the body moves as usual."""
     sources = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
-        places = np.flatnonzero(jumps(fixes))
+        steps_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)
+        stated_m = np.sqrt(np.nan_to_num(fixes.variances_m2[1:] + fixes.variances_m2[:-1]))
+        places = np.flatnonzero(jumps(fixes) & (steps_m > JUMP * stated_m))
         source = next((each for each in sources if each.topic != fixes.topic), None)
         if source is None or not len(places):
             continue
@@ -37,7 +39,7 @@ def leaps(motion: Motion) -> Iterator[Finding]:
             is_jump = moved[places] <= LEAPED * np.nanquantile(moved, 0.95)
         if not is_jump.all():
             continue
-        lengths_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)[places]
+        lengths_m = steps_m[places]
         largest = int(np.argmax(lengths_m))
         at_s = fixes.times_s[1:][places]
         times = f"{len(places)} times, from {at_s[0]:.1f} s to {at_s[-1]:.1f} s, "

@@ -407,8 +407,10 @@ def test_estimates_are_kept_as_long_as_the_replay(
     del first
     gc.collect()
     assert [place.parent.exists() for place in places] == [False, True]
-    assert len(estimates[POSE])
     del second
+    gc.collect()
+    assert len(estimates[POSE])
+    del estimates
     gc.collect()
     assert not places[1].parent.parent.exists()
     assert caplog.records == []

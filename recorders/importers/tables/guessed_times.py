@@ -406,18 +406,15 @@ def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Sta
         if spans[each] <= 2.0 * spans[best] and not np.array_equal(stamps_by[each], stamps_by[best])
     ]
     if alike:
-        cell = _first_cells(table, names)
-        first, second = (pd.Timestamp(_first_known(stamps_by[each])) for each in (best, alike[0]))
+        row = int(np.argmax(stamps_by[best] != stamps_by[alike[0]]))
+        cell = " ".join(str(table.batch[name][row]) for name in names)
+        first, second = (pd.Timestamp(int(stamps_by[each][row])) for each in (best, alike[0]))
         raise BadInput(
             f"{table.path}: column {' and '.join(names)} holds dates such as '{cell}', which may be "
             f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping by hand with `format` in `time`, "
             f'"{best}" or "{alike[0]}"'
         )
     return best
-
-
-def _first_known(stamps: Stamps) -> int:
-    return int(stamps[stamps != NOT_A_TIME][0])
 
 
 def _zone(names: Sequence[str]) -> str:
