@@ -100,7 +100,9 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
         keeping.hold_outcome(name, settings, outcome, in_full=in_full)
-        return write_outcome(folder, name, settings, outcome)
+        result = write_outcome(folder, name, settings, outcome)
+        viewed(name, folder)
+        return result
 
     def held(
         command: str, settings: Mapping[str, Any], outcome: Outcome, *, in_full: bool = True
@@ -132,6 +134,21 @@ def told(name: str, settings: Mapping[str, Any], outcome: Outcome) -> None:
             result = write_outcome(folder, name, stated, outcome)
             run_sentences(result, folder)
             write_report([folder], folder / "report.html")
+
+
+_VIEWED: set[tuple[str, bool]] = set()
+
+
+def viewed(name: str, folder: Path) -> None:
+    """Save a timeline with `view`, once per experiment; without one, `view` says so in a line."""
+    has_timeline = (folder / "timeline.rrd").is_file()
+    if (name, has_timeline) not in _VIEWED:
+        _VIEWED.add((name, has_timeline))
+        with TemporaryDirectory() as place:
+            saved = Path(place, "saved.rrd")
+            said = run_here("view", folder, "--save", saved)
+            assert saved.is_file() == has_timeline, said.err
+            assert (said.code, said.err.count("\n")) == ((0, 0) if has_timeline else (2, 1)), said.err
 
 
 @pytest.fixture(scope="session")

@@ -165,10 +165,10 @@ def empty_cells(table: pd.DataFrame) -> list[str]:
     cells = [value for row in table.itertuples(index=False) for value in row if not is_value(value)]
     infinite = sum(isinstance(value, float) and math.isinf(value) for value in cells)
     counts = {
-        "have nothing to be computed from": len(cells) - infinite,
-        "would be larger than any number": infinite,
+        "they have nothing to be computed from": len(cells) - infinite,
+        "their value is infinite": infinite,
     }
-    return [f"{count(of, 'cell')} without a value: they {why}." for why, of in counts.items() if of]
+    return [f"{count(of, 'cell')} without a value: {why}." for why, of in counts.items() if of]
 
 
 def _asset(name: str) -> str:

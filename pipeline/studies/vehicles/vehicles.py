@@ -56,7 +56,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             for label, value in case.bytes_per_step.items()
         }
         outcome.figures[f"errors-{case.name}"] = _chart(case)
-    of_few = f"{cases[0].name}-first-{options.few_runs}-runs"
+    of_few = f"{cases[0].name}-first-{min(options.few_runs, len(cases[0].sources))}-runs"
     outcome.metrics |= _metrics(of_few, few, options.reference)
     outcome.input_sha256 = hash_streams(source for case in cases for source in case.sources)
     return outcome
