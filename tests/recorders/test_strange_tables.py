@@ -120,7 +120,12 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
         "day and month are swapped",
     ),
     "a unit of time": ({"t": STAMPS_S - 1_150_000_000}, TIME, [FIX], "begin on 1987"),
-    "whole seconds": ({"t": np.floor(STAMPS_S)}, TIME, [ODOMETRY], "the first one has no effect"),
+    "whole seconds": (
+        {"t": np.floor(STAMPS_S)},
+        TIME,
+        [ODOMETRY],
+        "the first of both holds for no time, and has no effect",
+    ),
 }
 
 
