@@ -600,3 +600,14 @@ def test_thousandths_of_degrees_a_second_are_known(tmp_path: Path) -> None:
     path = text_of(tmp_path, f"t,{','.join(names)}", lambda row: f"{EPOCH + row},0,0,1000,100,200,300")
     found = Got(path).streams["/inertial"].columns["turn_rate_radps"][0]
     assert np.degrees(found) == pytest.approx([0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(("name", "begin"), [("utc", 20), ("time", 50)])
+def test_few_seconds_of_hhmmss_are_no_counter(name: str, begin: int, tmp_path: Path) -> None:
+    def clock(row: int) -> str:
+        return f"2213{begin + row:02d}" if begin + row < 60 else f"2214{begin + row - 60:02d}"
+
+    path = text_of(
+        tmp_path, f"{name},speed,yaw_rate", lambda row: f"{clock(row)},1,0", range(30 - begin // 3)
+    )
+    assert Got(path).times("/odometry")[0] == f"2026-01-01 22:13:{begin}"

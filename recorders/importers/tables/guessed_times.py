@@ -472,7 +472,9 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             np.all(known < 240_000) and np.all(whole % 100 < 60) and np.all(whole // 100 % 100 < 60)
         )
         day = next((each for each in table.columns if re.fullmatch("(.*_)?date", each.plain)), None)
-        is_sure = np.ptp(known) >= 60 or cell.startswith("0") or day is not None
+        next_minute = np.any(np.diff(whole) == 41)  # from 59 to 100
+        is_sure = np.ptp(known) >= 60 or next_minute or cell.startswith("0") or day is not None
+        is_sure = is_sure or "utc" in column.plain.split("_")
         if not (is_of_day and is_sure):
             continue
         clock = "%H%M%S" + ".%f" * ("." in cell)
