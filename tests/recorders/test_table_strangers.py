@@ -494,3 +494,120 @@ def test_blocks_make_no_difference_to_what_is_decided_by_order(
         order = np.argsort(times, kind="stable")
         for name, column in stream.columns.items():
             assert np.array_equal(parts.streams[topic].columns[name][order], column, equal_nan=True)
+
+
+# Loggers of strangers.
+
+PLACE = "lat,lon"
+
+
+def _place(row: int, factor: float = 1.0) -> str:
+    digits = 7 if factor == 1.0 else 0
+    return f"{factor * (47.5 + row * 1e-5):.{digits}f},{factor * (8.5 + row * 2e-5):.{digits}f}"
+
+
+def test_velocities_are_read_in_the_unit_in_which_places_move(tmp_path: Path) -> None:
+    path = text_of(
+        tmp_path,
+        f"time_boot_ms,{PLACE},vx,vy,vz",
+        lambda row: f"{1000 * row},{_place(row, 1e7)},111,150,-3",
+    )
+    got = Got(path)
+    assert got.streams["/velocity"].columns["velocity_mps"][0] == pytest.approx([1.11, 1.5, -0.03])
+    assert "along east, north and up" in got.said
+
+
+def test_the_accuracy_of_positions_is_no_other_and_has_its_unit(tmp_path: Path) -> None:
+    whole = text_of(
+        tmp_path, f"t,{PLACE},hAcc", lambda row: f"{EPOCH + row},{_place(row, 1e7)},{1500 + row}"
+    )
+    assert Got(whole).streams["/fix"].columns["covariance_m2"][0][0] == pytest.approx(2.25)
+    phone = text_of(
+        tmp_path,
+        f"t,bearingAccuracy,horizontalAccuracy,{PLACE}",
+        lambda row: f"{EPOCH + row},2,4.5,{_place(row)}",
+    )
+    assert Got(phone).streams["/fix"].columns["covariance_m2"][0][0] == pytest.approx(20.25)
+    mavlink = text_of(tmp_path, f"t,{PLACE},eph", lambda row: f"{EPOCH + row},{_place(row, 1e7)},90")
+    with pytest.raises(BadInput, match="not certain what eph, up to 90"):
+        Got(mavlink)
+
+
+def test_axes_are_of_the_sensor_that_the_file_is_named_by(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "time,x,y,z", lambda row: f"{EPOCH + 0.01 * row:.2f},0.1,0.2,9.8")
+    for name in ("Accelerometer.csv", "Gyroscope.csv"):
+        assert set(Got(path.rename(tmp_path / name)).streams) == {"/values"}
+        path = tmp_path / name
+
+
+def test_true_places_keep_their_units(tmp_path: Path) -> None:
+    feet = text_of(
+        tmp_path,
+        f"t,{PLACE},gt_lat,gt_lon,gt_alt_ft",
+        lambda row: f"{EPOCH + row},{_place(row)},{_place(row)},1312.3",
+    )
+    with pytest.raises(BadInput, match="true altitudes, gt_alt_ft, are not in m"):
+        Got(feet)
+
+    def minutes(row: int) -> str:
+        return f"47{30 + row * 6e-4:08.5f},8{30 + row * 1.2e-3:08.5f}"
+
+    both = text_of(
+        tmp_path,
+        f"t,{PLACE},gt_lat,gt_lon",
+        lambda row: f"{EPOCH + row},{minutes(row)},{minutes(row)}",
+    )
+    got = Got(both)
+    assert got.streams["/fix"].columns["latitude_deg"][0] == pytest.approx(47.5)
+    assert np.abs(got.streams["/truth"].columns["state"][-1]).max() < 100
+    assert "as fast as the speed says" not in got.said
+
+
+def test_times_of_fit_count_from_1989(tmp_path: Path) -> None:
+    path = text_of(
+        tmp_path,
+        "timestamp,position_lat,position_long",
+        lambda row: f"{1069034400 + row},{566697074 + 100 * row},{101408950 + 200 * row}",
+    )
+    assert Got(path).times("/fix")[0] == "2023-11-16 02:00:00"
+
+
+def test_an_orientation_that_its_covariance_denies_is_none(tmp_path: Path) -> None:
+    names = ",".join(f"field.orientation.{axis}" for axis in "xyzw")
+    head = f"%time,{names},field.orientation_covariance0,speed"
+    path = text_of(tmp_path, head, lambda row: f"{(EPOCH + row) * 10**9},0,0,0,1,-1,{row}")
+    assert set(Got(path).streams) == {"/values"}
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "why"),
+    [(47.5, 351.5, "count from 0 to 360 deg"), (151.2, -33.8, "no unit fits")],
+)
+def test_degrees_beyond_their_range_are_no_degrees_and_minutes(
+    latitude: float, longitude: float, why: str, tmp_path: Path
+) -> None:
+    path = text_of(
+        tmp_path, f"t,{PLACE}", lambda row: f"{EPOCH + row},{latitude + row / 1e5:.5f},{longitude}"
+    )
+    with pytest.raises(BadInput, match=why):
+        Got(path)
+
+
+def test_thousandths_of_degrees_a_second_are_known(tmp_path: Path) -> None:
+    names = [
+        f"{name}_{axis} [{unit}]" for name, unit in (("acc", "mg"), ("gyro", "mdps")) for axis in "xyz"
+    ]
+    path = text_of(tmp_path, f"t,{','.join(names)}", lambda row: f"{EPOCH + row},0,0,1000,100,200,300")
+    found = Got(path).streams["/inertial"].columns["turn_rate_radps"][0]
+    assert np.degrees(found) == pytest.approx([0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(("name", "begin"), [("utc", 20), ("time", 50)])
+def test_few_seconds_of_hhmmss_are_no_counter(name: str, begin: int, tmp_path: Path) -> None:
+    def clock(row: int) -> str:
+        return f"2213{begin + row:02d}" if begin + row < 60 else f"2214{begin + row - 60:02d}"
+
+    path = text_of(
+        tmp_path, f"{name},speed,yaw_rate", lambda row: f"{clock(row)},1,0", range(30 - begin // 3)
+    )
+    assert Got(path).times("/odometry")[0] == f"2026-01-01 22:13:{begin}"

@@ -27,6 +27,7 @@ from recorders.importers.tables.columns import (
 )
 from recorders.importers.tables.guessed_places import (
     ALTITUDE,
+    accuracy_of,
     altitude_of,
     is_ais,
     places_of,
@@ -54,7 +55,7 @@ _YAW_RATE = (
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
-_ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
+_ACCURACY = r"(?!.*(bearing|head|course|yaw|speed|vel|vert|time|angle))(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _GEODETIC = r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?"
 _TARGET = (
@@ -144,9 +145,8 @@ def _fix(table: GuessedTable) -> Iterator[str]:
             "# The standard deviation of each axis, upwards twice that:",
             f"deviations.covariance_m2 = {names_of(3 * accuracy)}",
             "factors.covariance_m2 = [1, 1, 2]",
+            *accuracy_of(table, accuracy[0], found.unit),
         ]
-        if (length := stated_unit(accuracy[0], "m")) not in ("", "m"):
-            lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
     elif dilution := take(table.columns, r"(.*_)?hdop"):
         lines += [
             "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
@@ -337,7 +337,14 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
             )
         table.made.extend(found.lines)
         names = dict(zip(("latitude", "longitude"), geodetic, strict=True))
-        names.update(zip(("altitude",), take(columns, ALTITUDE), strict=False))
+        height = take(columns, ALTITUDE)
+        if height and (said := altitude_of(table, height[0], found.unit)):
+            if not all(line.startswith(ASSUMED) for line in said):
+                raise BadInput(
+                    f"{table.path}: its true altitudes, {height[0].name}, are not in m; convert them"
+                )
+            table.made.extend(said)
+        names.update(zip(("altitude",), height, strict=False))
         parts = ", ".join(f"{key} = {name_of(each)}" for key, each in names.items())
         table.made.append(f"geodetic = {{ {parts} }}")
         axes = zip(("east_m", "north_m", "up_m"), names.values(), strict=False)
@@ -415,11 +422,16 @@ def _heading(table: GuessedTable) -> Iterator[str]:
 def _velocity(table: GuessedTable) -> Iterator[str]:
     velocity = take_axes(table.columns, "vel", "velocity", "v") or take(table.columns, "ve", "vn", "vu")
     if velocity:
+        speed = np.linalg.norm([each.values for each in velocity[:2]], axis=0)
+        in_unit, why = speed_unit_of(table, velocity[0]._replace(values=speed))
         yield from stream_lines(
             f"{table.prefix}/velocity",
             "VelocityFix",
             "the names are a velocity along three axes",
             f"fields.velocity_mps = {names_of(velocity)}",
+            f"{ASSUMED}{', '.join(each.name for each in velocity)} are along east, north and up, or the "
+            "axes of the positions; the order of fields, factors",
+            f"units.velocity_mps = {json.dumps(in_unit)}   # {why}",
             "deviations.covariance_m2ps2 = [0.1, 0.1, 0.1]   # fill in the standard deviations",
         )
 

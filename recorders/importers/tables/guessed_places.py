@@ -115,12 +115,20 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     if stated and stated not in ("deg", "rad") and stated not in fitting:
         fitting = [stated] if _fits(stated, *pair) else []
     if not fitting:
-        _refuse(table, place, "no unit fits")
+        largest = [np.nanmax(np.abs(values)) for values in pair]
+        whole_turn = largest[0] <= 90.0 and largest[1] <= 360.0
+        _refuse(
+            table,
+            place,
+            "longitudes seem to count from 0 to 360 deg, so subtract 360 from those beyond 180"
+            if whole_turn
+            else "no unit fits",
+        )
     by_speed = _by_speed(table, pair, fitting)
     comment = ""
     if stated and stated in fitting and not (stated == "deg" and _MINUTES in fitting):
         chosen, why = stated, "as its name says"
-    elif len(by_speed) == 1:
+    elif len(by_speed) == 1 < len(fitting):
         chosen, why = by_speed[0], "by which places move as fast as the speed says"
     elif by_speed == [] and len(fitting) > 1 and "deg" not in fitting:
         _refuse(table, place, f"as {' or '.join(fitting)} they do not move as fast as the speed says")
@@ -133,7 +141,8 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     degrees = [_degrees(chosen, values) for values in pair]
     lines = [f"{comment}; {_how(chosen)}"] if comment else []
     if chosen == _MINUTES:
-        table.prepared["degrees_minutes"] = {"": [latitude.name, longitude.name]}
+        both = table.prepared.setdefault("degrees_minutes", {"": []})
+        both[""] += [latitude.name, longitude.name]
     elif chosen != "deg":
         lines += [f'units.{field} = "{chosen}"' for field in ("latitude_deg", "longitude_deg")]
     zero = (degrees[0] == 0) & (degrees[1] == 0)
@@ -188,7 +197,8 @@ def _fits(name: str, latitude: NDArray, longitude: NDArray) -> bool:
     if not (len(sizes[0]) and len(sizes[1])):
         return name == "deg"
     if name == _MINUTES:
-        is_beyond = sizes[0].max() > 90.0 or sizes[1].max() > 180.0
+        # longitudes may count to 360 deg, and stand where latitudes are named
+        is_beyond = max(sizes[0].max(), sizes[1].max()) > 360.0
         in_minutes = all(np.all(np.fmod(size, 100.0) < 60.0) for size in sizes)
         return bool(is_beyond and in_minutes and sizes[0].max() <= 9000.0 and sizes[1].max() <= 18000.0)
     factor = unit(name).size / unit("deg").size
@@ -339,6 +349,23 @@ def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) 
         "mapping by "
         'hand with units.altitude_m, such as "ft" or "mm"'
     )
+
+
+def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str) -> list[str]:
+    """Write the unit of a standard deviation of positions; raises BadInput if it is not certain."""
+    if length := stated_unit(accuracy, "m"):
+        return [f'units.covariance_m2 = "{length}"   # as its name says'] if length != "m" else []
+    known = known_of(accuracy)
+    if position_unit != "1e-7 deg" or np.any(known != np.rint(known)) or known.max() < 20:
+        return [f"{ASSUMED}{accuracy.name} is in m, as no unit is stated; units"]
+    if not re.search("acc", accuracy.plain):
+        raise BadInput(
+            f"{table.path}: it is not certain what {accuracy.name}, up to {known.max():.6g}, is "
+            "in: whole numbers may be m, mm, or a dilution times 100; write a mapping by hand with "
+            "`deviations` and `factors` of covariance_m2"
+        )
+    said = f"{ASSUMED}{accuracy.name} is in mm, as receivers with positions of 1e-7 deg have it; units"
+    return [said, 'units.covariance_m2 = "mm"']
 
 
 def speed_unit_of(table: GuessedTable, speed: GuessedColumn) -> tuple[str, str]:

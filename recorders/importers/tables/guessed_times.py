@@ -31,6 +31,8 @@ from recorders.importers.tables.times import (
 )
 
 UNKNOWN_ZERO = "2026-01-01"
+# What times of FIT files count from in s, and where numbers are more likely of 1970.
+_FIT_ZERO, _FIT_END = "1989-12-31", 1.3e9
 _SIZES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 # Unix time, in s, of 2000 and of 2100: what numbers that count from 1970 are between.
 _DATES_S = (946_684_800.0, 4_102_444_800.0)
@@ -467,7 +469,9 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             np.all(known < 240_000) and np.all(whole % 100 < 60) and np.all(whole // 100 % 100 < 60)
         )
         day = next((each for each in table.columns if re.fullmatch("(.*_)?date", each.plain)), None)
-        is_sure = np.ptp(known) >= 60 or cell.startswith("0") or day is not None
+        next_minute = np.any(np.diff(whole) == 41)  # from 59 to 100
+        is_sure = np.ptp(known) >= 60 or next_minute or cell.startswith("0") or day is not None
+        is_sure = is_sure or "utc" in column.plain.split("_")
         if not (is_of_day and is_sure):
             continue
         clock = "%H%M%S" + ".%f" * ("." in cell)
@@ -569,7 +573,9 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
     steps = steps[steps > 0]
     if not len(steps):
         if _NAMED.search(column.plain):
-            yield TimeMapping(column=column.name, zero=UNKNOWN_ZERO), []
+            unit = _epoch_unit(column)
+            given = {"unit": unit} if unit else {"zero": UNKNOWN_ZERO}
+            yield TimeMapping.model_validate({"column": column.name, **given}), []
         return
     step, largest = float(np.median(steps)), float(np.abs(known).max())
     unit, comments, zero = _epoch_unit(column), [], {}
@@ -589,8 +595,15 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             f"{ASSUMED}{column.name} counts in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; "
             "unit, zero",
         ]
+    elif unit == "s" and largest < _FIT_END and _is_fit(table):
+        zero = {"zero": _FIT_ZERO}
+        comments = [f"{ASSUMED}{column.name} counts from {_FIT_ZERO}, as files of FIT have it; zero"]
     given = {"column": column.name, "unit": unit, **zero}
     yield TimeMapping.model_validate(given), comments
+
+
+def _is_fit(table: _Table) -> bool:
+    return {"position_lat", "position_long"} <= {column.plain for column in table.columns}
 
 
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:

@@ -40,6 +40,11 @@ _ROWS = 100_000
 _FEWEST = 10
 # Names of files with the truth.
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
+# What the axes x, y and z of a file that is named so are of.
+_SENSORS = {
+    "acc": r"(?i)acc(el\w*)?(?![a-z])|acceleration", "gyr": r"(?i)gyro\w*|gyr(?![a-z])",
+    "mag": r"(?i)mag(netometer|netic\w*)?(?![a-z])", "gravity": "(?i)gravity",
+}  # fmt: skip
 # The column of times that have a file of their own.
 _STAMP = "timestamp"
 # How the line of a file begins that is left out.
@@ -126,6 +131,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
             columns.append(
                 GuessedColumn(column, plain, unit_in(table.units.get(column, "")) or unit, values)
             )
+    columns = _without_denied(_of_sensor(columns, path))
     exported = export_mapping(path, table.columns, batch)
     time = None if exported else _time(source, batch, columns, texts)
     used = time.used if time else set()
@@ -196,6 +202,31 @@ def _table(source: Source, *, is_alone: bool) -> str:
     if not_taken := [text for text in texts if text not in used and text not in sides]:
         lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
     return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
+
+
+def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
+    """Return columns whose axes x, y, z have the name of the sensor that the file's name says."""
+    sensor = next((name for name, known in _SENSORS.items() if re.search(known, path.stem)), "")
+    if not sensor or not {"x", "y", "z"} <= {column.plain for column in columns}:
+        return columns
+    return [
+        column._replace(plain=f"{sensor}_{column.plain}") if column.plain in ("x", "y", "z") else column
+        for column in columns
+    ]
+
+
+def _without_denied(columns: list[GuessedColumn]) -> list[GuessedColumn]:
+    """Leave out what a covariance says that there is none of: -1 at its front, as ROS has it."""
+    stems = [
+        stem[1]
+        for column in columns
+        if (stem := re.fullmatch("(.*)_covariance_?0", column.plain)) and np.all(column.values == -1)
+    ]
+    return [
+        column
+        for column in columns
+        if not any(re.fullmatch(f"{re.escape(stem)}_[wxyz]", column.plain) for stem in stems)
+    ]
 
 
 def _time(
