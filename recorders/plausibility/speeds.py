@@ -29,7 +29,8 @@ def leaps(motion: Motion) -> Iterator[Finding]:
     sources = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         steps_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)
-        stated_m = np.sqrt(np.nan_to_num(fixes.variances_m2[1:] + fixes.variances_m2[:-1]))
+        variances_m2 = np.maximum(np.nan_to_num(fixes.variances_m2), 0.0)
+        stated_m = np.sqrt(variances_m2[1:] + variances_m2[:-1])
         places = np.flatnonzero(jumps(fixes) & (steps_m > JUMP * stated_m))
         source = next((each for each in sources if each.topic != fixes.topic), None)
         if source is None or not len(places):

@@ -16,7 +16,7 @@ def in_words() -> Iterator[str]:
         yield from (" ".join(each.split()) for each in text.split("\n\n") if each.strip())
         yield from examples.splitlines()
         with click.Context(command, info_name=name) as context:
-            records = [each.get_help_record(context) for each in command.get_params(context)]
+            records = [each.get_help_record(context) for each in command.params]  # without --help
         options = [f"  {names}: {told}" for names, told in filter(None, records) if told]
         yield from (each for each in options if each not in said)
         said.update(options)
