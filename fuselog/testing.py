@@ -45,7 +45,8 @@ def assert_golden(
         there = read(place) if place.exists() else None
         write(place, make(runs, chosen or (there or {"settings": {}})["settings"]["estimators"]).golden)
         return
-    _require(check(runs, read(place), chosen), place)
+    mend = f"if this is intended, run once with {UPDATE}=1, which writes the golden"
+    _require(check(runs, read(place), chosen), place, mend)
 
 
 def assert_same(replayed: Replayed, golden: str | Path) -> None:
@@ -53,7 +54,7 @@ def assert_same(replayed: Replayed, golden: str | Path) -> None:
     _require(compared(read(Path(golden)), replayed), Path(golden))
 
 
-def _require(checked: Checked, golden: Path) -> None:
+def _require(checked: Checked, golden: Path, *advice: str) -> None:
     if checked.found:
         more = [each.sentence for each in checked.found[1:10]]
-        raise AssertionError("\n".join([f"{golden}:", *checked.sentences, *more]))
+        raise AssertionError("\n".join([f"{golden}:", *checked.sentences, *more, *advice]))

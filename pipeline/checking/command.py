@@ -36,6 +36,8 @@ def check_path(
     estimator.
     """
     if is_update:
+        if junit is not None:
+            raise BadInput("--junit: is for the results of a check; leave it out with --update")
         chosen = settings_of_estimators(labels, settings, settings_file)
         made = update(
             path,
@@ -50,25 +52,30 @@ def check_path(
         runs = len(made["runs"])
         say(f"{golden}: {runs} run{'s' * (runs != 1)}, {streams} streams, {size_kb:.0f} kB")
         return True
-    is_replaced = in_place is not None and len(labels) == 1
-    if (
-        (labels and not is_replaced)
-        or settings
-        or settings_file
-        or late
-        or arrival_order
-        or columns
-        or tolerances
-    ):
-        raise BadInput(
-            f"{golden}: already states what is replayed and which differences are allowed; to change "
-            "that, add --update"
-        )
     if junit is not None:
         check_files([(junit, JUNIT)], {"golden": [golden]})
-    sources, stored = runs_of(path), read(golden)
-    replaced = in_place(labels[0], sources, stored) if in_place and labels else None
-    done = check(sources, stored, replaced)
+    is_replaced = in_place is not None and len(labels) == 1
+    try:
+        if (
+            (labels and not is_replaced)
+            or settings
+            or settings_file
+            or late
+            or arrival_order
+            or columns
+            or tolerances
+        ):
+            raise BadInput(
+                f"{golden}: already states what is replayed and which differences are allowed; to "
+                "change that, add --update"
+            )
+        sources, stored = runs_of(path), read(golden)
+        replaced = in_place(labels[0], sources, stored) if in_place and labels else None
+        done = check(sources, stored, replaced)
+    except (BadInput, OSError) as error:
+        if junit is not None:
+            write_junit(junit, golden.name, error)
+        raise
     if junit is not None:
         write_junit(junit, golden.name, done)
     if as_json:

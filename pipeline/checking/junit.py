@@ -10,21 +10,32 @@ from recorders.atomic import whole_file
 NAME = "fuselog check"
 
 
-def write_junit(path: Path, golden: str, checked: Checked) -> None:
-    """Write the results of a check, without times: the same check gives the same bytes."""
-    failures = {(each.run, each.topic) for each in checked.found}
-    cases = {*checked.fields, *failures}
+def write_junit(path: Path, golden: str, outcome: Checked | Exception) -> None:
+    """Write the results of a check, or the error that left it without any.
+
+    Times are left out, so that the same check gives the same bytes.
+    """
+    cases: dict[tuple[str, str], list[str]] = {}
+    kind, element = "difference", "failure"
+    if isinstance(outcome, Exception):
+        cases["", ""] = [str(outcome)]
+        kind, element = type(outcome).__name__, "error"
+    else:
+        cases = {each: [] for each in outcome.fields}
+        for each in outcome.found:
+            cases.setdefault((each.run, each.topic), []).append(each.sentence)
+    counts = {"tests": len(cases), "failures": 0, "errors": 0}
+    counts[f"{element}s"] = sum(map(bool, cases.values()))
     root = ElementTree.Element("testsuites", name=NAME)
-    counts = {"tests": str(len(cases)), "failures": str(len(failures)), "errors": "0"}
-    suite = ElementTree.SubElement(root, "testsuite", {"name": golden, **counts})
-    for run, topic in sorted(cases):
-        about = {"classname": golden, "name": " ".join(filter(None, (run, topic)))}
+    suite = ElementTree.SubElement(
+        root, "testsuite", {"name": golden, **{name: str(count) for name, count in counts.items()}}
+    )
+    for (run, topic), sentences in sorted(cases.items()):
+        about = {"classname": golden, "name": " ".join(filter(None, (run, topic))) or "check"}
         case = ElementTree.SubElement(suite, "testcase", about)
-        own = [each for each in checked.found if (each.run, each.topic) == (run, topic)]
-        if own:
-            message = own[0].sentence
-            failure = ElementTree.SubElement(case, "failure", message=message, type="difference")
-            failure.text = "\n".join(each.sentence for each in own)
+        if sentences:
+            found = ElementTree.SubElement(case, element, message=sentences[0], type=kind)
+            found.text = "\n".join(sentences)
     ElementTree.indent(root)
     with whole_file(path) as part:
         ElementTree.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)

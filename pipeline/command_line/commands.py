@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.altering.sources import alter
 from pipeline.api.planning import plan_replay
+from pipeline.logs.folders import logs_in
 from pipeline.output.alarming import alarms_of
 from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
@@ -66,8 +67,12 @@ def replay_logs(
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
-) -> None:
-    """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
+) -> bool:
+    """Replay, write the estimates logs, judge them where there is truth, print the metrics.
+
+    Returns whether every estimator could follow one of the runs to its end.
+    """
+    logs = [log for path in logs for log in logs_in(path)]
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
     given = [settings_file] if settings_file else []
@@ -114,6 +119,10 @@ def replay_logs(
         details=details,
         unused=unused,
     )
+    failed_runs = [
+        value for key, value in done.judge.metrics.items() if split_metric(key)[1] == "failed_runs"
+    ]
+    return max(failed_runs, default=0) < len(logs)
 
 
 def companions_if(foxglove: bool) -> Companions | None:

@@ -147,18 +147,24 @@ def evaluate(
     is_flag=True,
     help="Withhold verdicts on differences below what changes do that should not matter.",
 )
+@click.option(
+    "--fail-if-worse",
+    is_flag=True,
+    help="Exit with 1 if a side is worse than the first in an error, in consistency or in failures.",
+)
 @replay_options
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
-    Or estimators over logs, LOG.mcap ... with -e for each estimator; those of which the logs have
+    Or estimators over logs or folders of logs, with -e for each estimator; those of which the logs have
     estimates already, such as an autopilot's, come first and are not replayed. All others are compared
     with the first, metric by metric over the runs that both have, with intervals of 95 % by the
     bootstrap over runs.
     """
     from pipeline.comparing.command import compare_candidates
 
-    compare_candidates(list(sides), list(labels), **options)
+    if not compare_candidates(list(sides), list(labels), **options):
+        click.get_current_context().exit(1)
 
 
 @command(

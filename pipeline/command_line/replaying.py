@@ -98,13 +98,15 @@ folds_option = click.option(
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
 
+    LOGS are logs or folders of logs. The exit code is 1 if an estimator failed in every run.
     --set gate_probability=1 sets a parameter of all estimators that have it, --set
     ekf.gate_probability=1 of one. --set /fix.delay_s=0.3 alters the topic /fix as it is read, here as in
     run, tune, diagnose and compare; --set /fix=? says what can be set.
     """
     from pipeline.command_line.commands import replay_logs
 
-    replay_logs(list(logs), list(names), **options)
+    if not replay_logs(list(logs), list(names), **options):
+        click.get_current_context().exit(1)
 
 
 @command(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.comparing.comparing import compare
-from pipeline.comparing.groups import recorded_labels
+from pipeline.comparing.groups import recorded_labels, with_logs_of_folders
 from pipeline.output.alarms import NOT_TESTED
 from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, progress, say, warn
@@ -39,12 +39,17 @@ def compare_candidates(
     stress: bool,
     gap_limit_s: float,
     as_json: bool,
+    fail_if_worse: bool,
     settings_file: Path | None,
     settings: Sequence[str],
-) -> None:
-    """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
+) -> bool:
+    """Compare, print a table for each pair and case and the verdicts, write folder and timeline.
+
+    With `fail_if_worse`, returns whether no candidate is worse than the first; see `Differences.worse`.
+    """
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     alterations, own = split_texts(settings)
+    candidates = with_logs_of_folders(candidates, labels, recover=recover)
     has = recorded_labels(candidates, recover=recover)
     recorded = [label for label in labels if label in has]
     chosen = settings_of_estimators([label for label in labels if label not in has], own, settings_file)
@@ -60,6 +65,7 @@ def compare_candidates(
         stress=stress,
         progress=progress,
     )
+    worse = found.worse() if fail_if_worse else []
     written = []
     if out is not None:
         written.append(found.save(out).folder)
@@ -68,6 +74,8 @@ def compare_candidates(
         written.append(save)
     for note in found.notes:
         warn(note)
+    if worse:
+        warn("worse than the first: " + ", ".join(f"{each.second} in {each.quantity}" for each in worse))
     if as_json:
         print_json(
             {
@@ -79,7 +87,7 @@ def compare_candidates(
                 "written": [str(path) for path in written],
             }
         )
-        return
+        return not worse
     table = found.table.replace({np.nan: None})
     for (first, second, case_), rows in table.groupby(["first", "second", "case"], sort=False):
         columns = [title.format(first=first, second=second) for title in COLUMNS.values()]
@@ -91,3 +99,4 @@ def compare_candidates(
         say(sentence)
     for path in written:
         say(str(path))
+    return not worse

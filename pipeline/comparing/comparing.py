@@ -20,9 +20,11 @@ from pipeline.comparing.groups import (
     runs_of,
     table_of_runs,
     unlike_runs,
+    with_logs_of_folders,
 )
 from pipeline.comparing.paired import ALL, Paired, under_stress
 from pipeline.comparing.scenes import scene_of, side_by_side
+from pipeline.output import words
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -37,6 +39,7 @@ from recorders.log import open_log
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource
 from replay.judging.errors.differences import (
+    FEWEST_RUNS,
     NATS,
     Difference,
     Target,
@@ -94,6 +97,22 @@ class Differences:
         return [
             each.sentence for each in sorted(self.paired, key=lambda p: order.index(p.found.verdict))
         ]
+
+    def worse(self) -> list[Paired]:
+        """Return the errors, consistencies and failures of which a candidate is worse than the first.
+
+        Each has its whole interval beyond the margin.
+
+        Raises BadInput where none of them has enough runs, since there is nothing to judge by.
+        """
+        judged = [each for each in self.paired if _is_judged(each.quantity)]
+        runs = max((each.found.runs for each in judged), default=0)
+        if runs < FEWEST_RUNS:
+            raise BadInput(
+                f"{runs_of(runs)} cannot show that a side is worse, since an interval takes "
+                f"{FEWEST_RUNS}; give more runs, or leave out --fail-if-worse"
+            )
+        return [each for each in judged if each.found.verdict == "worse" and not each.is_withheld]
 
     def __repr__(self) -> str:
         return "\n".join([*self.notes, *self.sentences])
@@ -182,6 +201,11 @@ class Differences:
         return [each.log.path for each in sources if isinstance(each, LogSource)]
 
 
+def _is_judged(key: str) -> bool:
+    is_of_group = words.quantity(key).group == words.CONSISTENCY
+    return is_of_group or words.is_error(key) or key == "failed_runs"
+
+
 def _target_text(target: Target) -> str:
     return "" if target is None else f"{target:g}" if isinstance(target, float) else target
 
@@ -216,7 +240,7 @@ def compare(
 
     Args:
         candidates: result folders, estimates logs or folders of them, and trajectory files; or with
-            `estimators` logs to replay.
+            `estimators` logs to replay, or folders of them.
         estimators: which ones, as for `replay`, or the labels of estimates that a recording has beside
             its sensors, which come first; by default those that all candidates have, or the only ones.
         truth: the true trajectory, as a file, where all candidates are files.
@@ -243,13 +267,14 @@ def compare(
     """
     if not 0 <= margin < np.inf:
         raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which means 2 %")
-    paths = [Path(candidate) for candidate in candidates]
+    named = [label for each in estimators for label in _labels(each)]
+    paths = with_logs_of_folders(list(map(Path, candidates)), named, recover=recover)
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
     givens = inputs_of(
         paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
-    groups = list(comparable_groups(givens, [label for each in estimators for label in _labels(each)]))
+    groups = list(comparable_groups(givens, named))
     notes = [note for group in groups for candidate in group for note in candidate.notes]
     paired: list[Paired] = []
     times: list[pd.DataFrame] = []
@@ -263,7 +288,6 @@ def compare(
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
     found = None
     if stress:
-        named = [label for each in estimators for label in _labels(each)]
         if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
             raise BadInput(
                 f"--stress: {paths[0]} is no log to replay; give logs, and estimators with -e"

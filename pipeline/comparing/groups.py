@@ -17,6 +17,7 @@ from pipeline.comparing.candidates import (
     of_result,
     of_trajectory,
 )
+from pipeline.logs.folders import recordings_in
 from pipeline.output.results import RESULT_FILE
 from pipeline.runs.ensemble import Progress
 from pipeline.runs.estimates import labels_of, recorded_estimators
@@ -79,6 +80,16 @@ def inputs_of(
             if number not in found:
                 found[number] = of_trajectory(path, source, topic, gap_limit_s)
     return [found[number] for number in range(len(paths))]
+
+
+def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recover: bool) -> list[Path]:
+    """Return paths with the logs to replay of each folder in its place."""
+    found: list[Path] = []
+    for path in paths:
+        logs = [] if (path / RESULT_FILE).is_file() else recordings_in(path)
+        is_replayed = "log" in {kind_of(log, labels, recover=recover) for log in logs}
+        found += logs if is_replayed else [path]
+    return found
 
 
 def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:

@@ -12,7 +12,12 @@ def logs_in(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    files = [each for each in sorted(path.glob("*.mcap")) if not each.match("*.estimates.mcap")]
+    files = recordings_in(path)
     if not files:
         raise BadInput(f"{path}: has no logs to replay; give a log, or a folder or result with some")
     return files
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """List a folder's logs by name, without the estimates beside them; none where it is no folder."""
+    return [each for each in sorted(folder.glob("*.mcap")) if not each.match("*.estimates.mcap")]

@@ -154,6 +154,21 @@ def test_junit(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) -> Non
     assert "the golden has" in path.read_text(encoding="utf-8")
 
 
+def test_junit_says_why_nothing_was_checked(
+    golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """Continuous integration shows the sentence in place of a file that is missing or of last time."""
+    path = tmp_path / "check.xml"
+    other = tmp_path / "other.mcap"
+    fl.write(other, fl.record("landmarks", seed=5, duration_s=1.0))
+    said = fuselog("check", other, "--against", golden, "--junit", path)
+    [suite] = ElementTree.parse(path).getroot()
+    assert (said.code, suite.get("errors"), suite.get("failures")) == (2, "1", "0")
+    error = suite.find("testcase/error")
+    assert error is not None
+    assert error.get("message") == said.err.removeprefix("fuselog: ").strip() != ""
+
+
 def test_a_third_party_tests_its_own_estimator(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,7 +183,8 @@ def test_a_third_party_tests_its_own_estimator(
     monkeypatch.delenv("FUSELOG_UPDATE_GOLDENS")
     assert_golden(runs, golden, mine)
     assert_golden(runs, golden)
-    with pytest.raises(AssertionError, match=r"seed 4 /estimates/mine/.* the golden has"):
+    said = r"(?s)seed 4 /estimates/mine/.* the golden has.*FUSELOG_UPDATE_GOLDENS=1"
+    with pytest.raises(AssertionError, match=said):
         assert_golden(runs, golden, {"mine": {"kind": "ekf", "sigma_range_m": 0.2}})
 
 

@@ -21,6 +21,8 @@ import fuselog as fl
 from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 from tests.pipeline.conftest import heeding_interrupts
+from tests.replay.foreign.test_isolation import SANE, run_with
+from tests.replay.foreign.test_programs import FAIL, PROGRAM, python
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -676,3 +678,16 @@ def test_an_environment_variable_that_cannot_be_is_named(
     assert said.code == 2
     assert said.err.startswith(f"fuselog: {name}={value}: {expected}")
     assert said.err.count("\n") == 1
+
+
+def test_a_replay_whose_only_run_failed_fails_a_build(fuselog: Fuselog, tmp_path: Path) -> None:
+    """Of two runs one estimate is left, and of a folder each log is a run."""
+    for each in (SANE, float(FAIL)):
+        folder = tmp_path / f"{each:g}"
+        folder.mkdir()
+        fl.write(folder / f"{each:g}.mcap", run_with(each))
+    estimator = ("-e", f"exec:{python(PROGRAM)}")
+    sane, failed = tmp_path / "1", tmp_path / f"{FAIL}"
+    for folders, code in (((failed,), 1), ((sane,), 0), ((sane, failed), 0)):
+        said = fuselog("replay", *folders, *estimator, "--out", tmp_path / "out")
+        assert (said.code, "it was told to fail" in said.err) == (code, failed in folders)

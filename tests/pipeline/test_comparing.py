@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import rerun.blueprint as rrb
+import tomli_w
 
 import fuselog as fl
 from pipeline.comparing.candidates import _stored
@@ -76,6 +77,20 @@ def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: 
     times = saved.tables["times"].query("quantity == 'nees'")
     assert (times["low"] > 0).mean() > 0.5
     assert any("sigma_range_m" in note for note in found.notes)
+    assert "nees" in {each.quantity for each in found.worse()}
+
+
+def test_a_worse_candidate_fails_a_build(logs: list[Path], fuselog: Fuselog, tmp_path: Path) -> None:
+    """A folder of logs is replayed; of too few runs nothing can be said, which is no success either."""
+    settings = tmp_path / "settings.toml"
+    settings.write_text(tomli_w.dumps({"ekf": {}, "tight": TIGHT}), encoding="utf-8")
+    build = ("--fail-if-worse", "--settings", settings)
+    for first, second, code in (("ekf", "tight", 1), ("tight", "ekf", 0)):
+        said = fuselog("compare", logs[0].parent, "-e", first, "-e", second, *build)
+        assert (said.code, "worse than the first: tight in" in said.err) == (code, code == 1)
+    said = fuselog("compare", *logs[:4], "-e", "ekf", "-e", "tight", *build)
+    assert said.code == 2
+    assert "4 runs cannot show that a side is worse" in said.err
 
 
 @pytest.mark.paper
