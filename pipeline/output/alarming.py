@@ -22,6 +22,8 @@ from replay.judging.metrics.measuring import metric_key
 USUAL_GATE = 0.99  # where it is not known
 RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
 LARGEST = 1e300  # as JSON has no infinity
+# Squared errors so many times too large are no matter of covariances: 10,000 standard deviations.
+DIVERGED = 1e8
 UNUSED = 0.05  # of a topic's messages
 
 
@@ -192,10 +194,11 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
 
 
 def _expected(value: float, low: float, high: float) -> str:
-    size = "small" if value > high else "large"
-    return (
-        f"where a consistent filter is within {low:.3g} and {high:.3g}: its covariances are too {size}"
-    )
+    if value > DIVERGED * high:
+        why = "it diverged, or its covariances are of another unit"
+    else:
+        why = f"its covariances are too {'small' if value > high else 'large'}"
+    return f"where a consistent filter is within {low:.3g} and {high:.3g}: {why}"
 
 
 def _beyond(value: float, low: float, high: float) -> float:

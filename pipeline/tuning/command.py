@@ -56,9 +56,8 @@ def tune_logs(
     with status() as show:
 
         def tell(best: Best) -> None:
-            values = ", ".join(
-                f"{name} {value:.4g}" for name, value in zip(free, best.point, strict=bool(free))
-            )
+            named = zip(best.names, best.point, strict=True)
+            values = ", ".join(f"{name} {value:.4g}" for name, value in named)
             show(f"{best.evaluations} evaluations; best so far: {values}")
 
         find = search or partial(tune, free=free, by=by, grid=grid)

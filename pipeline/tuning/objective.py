@@ -168,6 +168,7 @@ class Best(NamedTuple):
     evaluations: int
     point: Floats
     cost: float
+    names: Sequence[str] = ()
 
 
 def silent(_: Best) -> None:
@@ -210,7 +211,7 @@ class Objective:
             [self._cost([of_run[number] for of_run in sums]) for number in range(len(points))]
         )
         least = int(np.argmin(costs))
-        best = Best(self.best.evaluations + len(points), points[least], float(costs[least]))
+        best = Best(self.best.evaluations + len(points), points[least], float(costs[least]), self.names)
         if self.best.cost <= best.cost:
             best = self.best._replace(evaluations=best.evaluations)
         self.best = best

@@ -27,7 +27,7 @@ from pipeline.calibrating.car import (
 from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from pipeline.tuning.information import information
-from pipeline.tuning.objective import in_memory
+from pipeline.tuning.objective import Best, in_memory
 from recorders.models.inertial import from_mounting
 from replay.engine.replaying.estimator import bind
 from tests.goldens import keeping
@@ -50,7 +50,9 @@ def test_the_car_of_the_sheet() -> None:
     car = drive(1)
     sums = [car.odometry[:, 0].sum(), car.odometry[:, 1].sum(), car.fix_m.sum(), car.compass_rad.sum()]
     assert sums == pytest.approx([10018.5904476, 14.594704982, 96427.5316865, 895.280996548], rel=1e-9)
-    found = fl.calibrate(recorded(car), "ekf", set=OPEN)
+    told = list[Best]()
+    found = fl.calibrate(recorded(car), "ekf", set=OPEN, on_best=told.append)
+    assert list(told[-1].names) == found.parameters["parameter"].tolist()
     rows = found.parameters.set_index("parameter").loc[list(NAMES)]
     forward, turn, bias, *others = rows["value"]
     values = np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])

@@ -691,3 +691,14 @@ def test_a_replay_whose_only_run_failed_fails_a_build(fuselog: Fuselog, tmp_path
     for folders, code in (((failed,), 1), ((sane,), 0), ((sane, failed), 0)):
         said = fuselog("replay", *folders, *estimator, "--out", tmp_path / "out")
         assert (said.code, "it was told to fail" in said.err) == (code, failed in folders)
+
+
+def test_errors_beyond_any_covariance_are_called_divergence(
+    here: Path, fuselog: Fuselog, world: Path
+) -> None:
+    """A hundred standard deviations are a matter of covariances, a hundred thousand are not."""
+    for sigma_m, why in ((1e-3, "its covariances are too small"), (1e-6, "it diverged")):
+        own = ("--set", f"sigma_range_m={sigma_m}", "--set", "gate_probability=1")
+        said = fuselog("replay", world / "log.mcap", "-e", "ekf", *own, "--out", here / "e.mcap")
+        assert said.code == 0
+        assert [line for line in said.out.splitlines() if "NIS is" in line and why in line], said.out
