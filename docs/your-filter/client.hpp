@@ -38,7 +38,7 @@ inline std::vector<double> doubles(const std::string &frame, size_t at)
 template <typename Filter> void serve(const std::string &description, size_t n, size_t t, size_t m)
 {
     std::unique_ptr<Filter> own;
-    write("D" + description);
+    write("D{\"protocol\": 2, " + description.substr(description.find('{') + 1));
     for (uint32_t size; std::fread(&size, sizeof size, 1, stdin) == 1;) {
         std::string frame(size, '\0');
         if (std::fread(&frame[0], 1, size, stdin) != size)
@@ -51,20 +51,20 @@ template <typename Filter> void serve(const std::string &description, size_t n, 
             own = std::make_unique<Filter>(parameters.data(), parameters.size() - 1, read<uint64_t>(frame, 1));
             continue;
         } else if (frame[0] == 'S') {
-            const auto prior = doubles(frame, 10);
-            const bool has = read<uint8_t>(frame, 9);
-            status = own->start(read<int64_t>(frame, 1), has ? prior.data() : nullptr, has ? &prior[n] : nullptr);
+            const auto prior = doubles(frame, 14);
+            const bool has = read<uint8_t>(frame, 13);
+            status = own->start(read<int64_t>(frame, 5), has ? prior.data() : nullptr, has ? &prior[n] : nullptr);
         } else if (frame[0] == 'T') {
-            wanted = read<uint8_t>(frame, 13);
-            status = own->take(read<int32_t>(frame, 1), read<int64_t>(frame, 5), doubles(frame, 14).data());
+            wanted = read<uint8_t>(frame, 17);
+            status = own->take(read<int32_t>(frame, 5), read<int64_t>(frame, 9), doubles(frame, 18).data());
             said = m > 0 ? own->innovation(innovation.data(), innovation.data() + m) : -1;
         } else {
-            status = own->predict(read<int64_t>(frame, 1));
+            status = own->predict(read<int64_t>(frame, 5));
         }
         const bool tells = status <= 0 && wanted && own->state(state.data(), state.data() + n) == 0;
         const bool measured = status <= 0 && (said == 0 || said == -2);
         const uint8_t flags = tells | measured << 1 | (measured && said == -2) << 2;
-        std::string reply("R");
+        std::string reply = "R" + frame.substr(1, 4);  // the number of what it answers
         reply.append(reinterpret_cast<const char *>(&status), sizeof status).append(1, static_cast<char>(flags));
         if (tells)
             reply.append(reinterpret_cast<const char *>(state.data()), state.size() * sizeof(double));

@@ -31,7 +31,7 @@ def serve(description, make):
     def numbers(frame, at):
         return array("d", frame[at:]).tolist()  # of little-endian machines, which nearly all are
 
-    write(b"D" + json.dumps(description).encode())
+    write(b"D" + json.dumps({**description, "protocol": 2}).encode())
     own = None
     while head := given.read(4):
         frame = given.read(struct.unpack("<I", head)[0])
@@ -42,15 +42,15 @@ def serve(description, make):
                 own = make(numbers(frame, 9), seed)
                 continue
             if kind == b"S":
-                time_ns, has_prior = struct.unpack_from("<qB", frame, 1)
-                prior = numbers(frame, 10) if has_prior else []
+                time_ns, has_prior = struct.unpack_from("<qB", frame, 5)
+                prior = numbers(frame, 14) if has_prior else []
                 square = [prior[n + t * i : n + t * i + t] for i in range(t)]
                 own.start(time_ns, *((prior[:n], square) if has_prior else (None, None)))
             elif kind == b"T":
-                topic, time_ns, wanted = struct.unpack_from("<iqB", frame, 1)
-                innovation = own.take(topic, time_ns, numbers(frame, 14))
+                topic, time_ns, wanted = struct.unpack_from("<iqB", frame, 5)
+                innovation = own.take(topic, time_ns, numbers(frame, 18))
             elif kind == b"P":
-                own.predict(struct.unpack_from("<q", frame, 1)[0])
+                own.predict(struct.unpack_from("<q", frame, 5)[0])
                 wanted = True
             if wanted and (said := own.state()) is not None:
                 flags, told = 1, [*said[0], *(x for row in said[1] for x in row)]
@@ -59,4 +59,5 @@ def serve(description, make):
                 told += [*innovation[0], *(x for row in innovation[1] for x in row)]
         except Failed as failed:
             status, flags, told = failed.args[0], 0, []
-        write(struct.pack("<ciB", b"R", status, flags) + array("d", map(float, told)).tobytes())
+        head = b"R" + frame[1:5] + struct.pack("<iB", status, flags)  # the number of what it answers
+        write(head + array("d", map(float, told)).tobytes())

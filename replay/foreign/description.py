@@ -107,6 +107,7 @@ class Description(_Part):
         output: what its topic of estimates ends with.
         failures: sentences; a function that returns n means the n-th.
         digest: of a filter that `fuselog deploy` wrote, that of its graphs and numbers.
+        protocol: of a program that answers messages, the version that it speaks.
     """
 
     summary: str
@@ -119,6 +120,7 @@ class Description(_Part):
     output: str = Field("state", pattern=r"^\w+$")
     failures: tuple[str, ...] = ()
     digest: str = ""
+    protocol: int = 1
 
     @cached_property
     def tangent(self) -> int:

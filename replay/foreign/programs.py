@@ -14,6 +14,7 @@ from pydantic import Field, create_model
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
+from recorders.parameters import build
 from replay.engine.compiling.compile import core_count
 from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.replaying.truth import TRUTH, truths_among
@@ -33,6 +34,7 @@ from replay.foreign.processes.tasks import RunGiven
 _PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 LOG, TABLES, OUT = "log", "csv", "out"
 ESTIMATE = "/estimates/"
+LIMITS = ("time_limit_s", "memory_limit_mb")  # which hold from the start of a program on
 
 
 class StreamParameters(ForeignParameters):
@@ -72,7 +74,9 @@ class _OfPrograms(Estimator[Any]):
                     f"estimator {label}: {word}: a program that streams has no places to fill; give "
                     "{log} and {out} to one that reads a log"
                 )
-        return _of_stream(words)
+        own = {name: settings[name] for name in LIMITS if name in settings}
+        limits = Limits.of(build(StreamParameters, own, f"estimator {label}"))
+        return _of_stream(words, limits)
 
 
 EXEC = _OfPrograms(
@@ -86,8 +90,8 @@ EXEC = _OfPrograms(
 # --- programs that stream ---------------------------------------------------------------------------
 
 
-def _of_stream(words: tuple[str, ...]) -> Estimator[Any]:
-    description = _described(words, _state_of(words))
+def _of_stream(words: tuple[str, ...], limits: Limits) -> Estimator[Any]:
+    description = _described(words, _state_of(words), limits)
 
     def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
         return follow_runs_streaming(words, runs, description, limits)
@@ -120,8 +124,12 @@ def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 @lru_cache(maxsize=64)
-def _described(words: tuple[str, ...], state: tuple[tuple[int, int], ...]) -> Description:  # noqa: ARG001
-    return describe_stream(words, f"exec:{words[0]}", Limits.of(StreamParameters()))
+def _described(
+    words: tuple[str, ...],
+    state: tuple[tuple[int, int], ...],  # noqa: ARG001
+    limits: Limits,
+) -> Description:
+    return describe_stream(words, f"exec:{words[0]}", limits)
 
 
 # --- programs that read a log -----------------------------------------------------------------------

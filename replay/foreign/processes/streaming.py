@@ -3,15 +3,16 @@
 Every frame is its length, 4 bytes, and so many bytes: a letter for what it is, and numbers, all of them
 little-endian. The program begins with its description, and answers every frame but the first, in order:
 
-    D  program: the description, JSON
+    D  program: the description, JSON, with the version of this protocol
     C  create: seed u64, parameters f64 each
-    S  start: time i64, 1 or 0 whether there is a prior, and its mean and covariance f64 each
-    T  take: topic i32, time i64, 1 or 0 whether an estimate is wanted, fields f64 each
-    P  predict: time i64; an estimate is wanted
-    R  program: status i32, flags u8; mean and covariance with flag 1; innovation and its covariance with
-       flag 2, and 4 where a gate kept it out
+    S  start: number u32, time i64, 1 or 0 whether there is a prior, and its mean and covariance f64 each
+    T  take: number u32, topic i32, time i64, 1 or 0 whether an estimate is wanted, fields f64 each
+    P  predict: number u32, time i64; an estimate is wanted
+    R  program: number u32 of the frame that it answers, status i32, flags u8; mean and covariance with
+       flag 1; innovation and its covariance with flag 2, and 4 where a gate kept it out
 
-A status from 1 on counts in the description's failures. The end of standard input is the end.
+A status from 1 on counts in the description's failures. The end of standard input is the end; an answer
+that nobody asked for is an error.
 """
 
 import queue
@@ -19,6 +20,7 @@ import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +46,9 @@ from replay.foreign.processes.tasks import RunGiven, sizes_of
 from replay.foreign.results import Results, begun, fill_squares, results
 
 MOST_BYTES = 16 << 20  # of a frame
-_REPLY, _HEAD = struct.Struct("<iB"), struct.Struct("<I")
+_REPLY, _HEAD = struct.Struct("<IiB"), struct.Struct("<I")
+PROTOCOL = 2
+ENDS_S = 1.0  # how long a program may take to end by itself
 ESTIMATE, INNOVATION, REJECTED = 1, 2, 4  # flags
 
 
@@ -117,16 +121,30 @@ class Stream(Program):
                 raise Ended(f"sent a frame {frame.body[:1]!r} where {letter!r} was due")
             return frame.body[1:]
 
+    def check_end(self) -> None:
+        """Raise Ended where it says more than it was asked before it ends, or is ended."""
+        with suppress(queue.Empty):
+            frame = self._frames.get(timeout=ENDS_S)
+            if frame.body or frame.fault:
+                raise Ended(frame.fault or "sent one answer more than it was asked for,")
+
 
 def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Description:
-    """Ask a program for its description; raises BadInput where it gives none."""
-    stream = Stream(words, limits._replace(time_s=STARTS_S))
+    """Ask a program for its description; raises BadInput where it gives none, or of another protocol."""
+    stream = Stream(words, limits)
     try:
-        return read_description(stream.next(b"D"), where)
+        found = read_description(stream.next(b"D"), where)
     except Ended as ended:
         raise BadInput(f"{where}: the program {ended}, before it gave its description") from None
     finally:
         stream.end()
+    if found.protocol != PROTOCOL:
+        raise BadInput(
+            f"{where}: its description states protocol {found.protocol}, and this is {PROTOCOL}: add "
+            f'"protocol": {PROTOCOL} to it, and begin each answer with the number that S, T and P begin '
+            "with (u32), as this version's client.py and client.hpp do"
+        )
+    return found
 
 
 def frames_of(given: RunGiven, description: Description) -> Iterator[bytes]:
@@ -134,23 +152,26 @@ def frames_of(given: RunGiven, description: Description) -> Iterator[bytes]:
     static, events = given.static, given.events
     widths = [each.width for each in description.topics]
     yield struct.pack("<cQ", b"C", given.seed) + np.array(given.parameters, "<f8").tobytes()
-    taken = struct.Struct("<ciqB")
+    numbers = count()
+    taken = struct.Struct("<cIiqB")
     for source, time_ns, row in zip(static.source, static.time_ns, static.data, strict=True):
-        yield taken.pack(b"T", source, time_ns, 0) + row[: widths[source]].astype("<f8").tobytes()
+        head = taken.pack(b"T", next(numbers), source, time_ns, 0)
+        yield head + row[: widths[source]].astype("<f8").tobytes()
     if given.prior is None:
-        yield struct.pack("<cqB", b"S", int(events.time_ns[0]), 0)
+        yield struct.pack("<cIqB", b"S", next(numbers), int(events.time_ns[0]), 0)
     else:
         time_ns, mean, covariance = given.prior
-        numbers = np.concatenate([mean.ravel(), covariance.ravel()]).astype("<f8").tobytes()
-        yield struct.pack("<cqB", b"S", time_ns, 1) + numbers
+        prior = np.concatenate([mean.ravel(), covariance.ravel()]).astype("<f8").tobytes()
+        yield struct.pack("<cIqB", b"S", next(numbers), time_ns, 1) + prior
     columns = zip(
         events.source.tolist(), events.time_ns.tolist(), events.wants_estimate.tolist(), strict=True
     )
     for (source, time_ns, wants), row in zip(columns, events.data.astype("<f8"), strict=True):
         if source < 0:
-            yield struct.pack("<cq", b"P", time_ns)
+            yield struct.pack("<cIq", b"P", next(numbers), time_ns)
         else:
-            yield taken.pack(b"T", source, time_ns, wants) + row[: widths[source]].tobytes()
+            head = taken.pack(b"T", next(numbers), source, time_ns, wants)
+            yield head + row[: widths[source]].tobytes()
 
 
 def follow_stream(
@@ -172,14 +193,14 @@ def follow_stream(
     try:
         stream.next(b"D", STARTS_S)
         stream.write(frames_of(given, description))
-        for _ in range(len(given.static.source) + 1):
-            status, _, _ = _reply(stream.next(b"R"), description)
-            _check(status, description)
+        before = len(given.static.source) + 1
+        for number in range(before):
+            _reply(stream.next(b"R"), number, description)
         for event in range(len(given.events.time_ns)):
             made.progress[0] = event
-            status, mean, innovation = _reply(stream.next(b"R"), description)
-            _check(status, description)
+            mean, innovation = _reply(stream.next(b"R"), before + event, description)
             _note(made, event, given, mean, innovation)
+        stream.check_end()
     except _Failed as failed:
         at = max(int(made.progress[0]), 0)
         failure = Failure(int(given.events.time_ns[at]), str(failed))
@@ -198,25 +219,28 @@ class _Failed(Exception):
     """Says why the filter itself failed."""
 
 
-def _check(status: int, description: Description) -> None:
-    if status > 0:
-        raise _Failed(reason_of_code(OWN + status, description))
-
-
 def _reply(
-    body: bytes, description: Description
-) -> tuple[int, np.ndarray | None, tuple[np.ndarray, bool] | None]:
-    """Read a reply: status, mean and covariance, innovation with covariance and whether it was used."""
+    body: bytes, due: int, description: Description
+) -> tuple[np.ndarray | None, tuple[np.ndarray, bool] | None]:
+    """Read the reply to a frame: mean and covariance, innovation and covariance, whether it was used.
+
+    Raises Ended where it is the reply to another frame or too long or short, _Failed where it says that
+    the filter failed.
+    """
     n, t, m = sizes_of(description)
-    status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (0, 0xFF)
+    number, status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (due, 0, 0xFF)
+    if number != due:
+        raise Ended(f"answered frame {number} where {due} was due: it has to answer every frame once,")
     estimate, innovation = (n + t * t) * bool(flags & ESTIMATE), (m + m * m) * bool(flags & INNOVATION)
     wanted = _REPLY.size + 8 * (estimate + innovation)
     if len(body) != wanted:
         sizes = f"{1 + len(body)} bytes with flags {flags}, where {1 + wanted} were due,"
         raise Ended(f"sent a reply of {sizes}")
+    if status > 0:
+        raise _Failed(reason_of_code(OWN + status, description))
     numbers = np.frombuffer(body, "<f8", offset=_REPLY.size)
     state = numbers[:estimate] if estimate else None
-    return status, state, (numbers[estimate:], not flags & REJECTED) if innovation else None
+    return state, (numbers[estimate:], not flags & REJECTED) if innovation else None
 
 
 def _note(

@@ -6,12 +6,13 @@ import struct
 import sys
 import time
 
-HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL = range(-1, -7, -1)
+HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP = range(-1, -9, -1)
 DESCRIPTION = {
     "summary": "does as it is told",
     "topics": [{"topic": "/range", "fields": ["range_m"]}],
     "state": {"range_m": "linear"},
     "failures": ["it was told to fail"],
+    "protocol": 2,
 }
 
 
@@ -26,7 +27,7 @@ while head := sys.stdin.buffer.read(4):
         continue
     status, flags, numbers = 0, 0, b""
     if frame[:1] == b"T":
-        _, _, wanted, value = struct.unpack("<iqBd", frame[1:])
+        _, _, wanted, value = struct.unpack("<iqBd", frame[5:])
         if value == HALF:
             os.write(1, struct.pack("<I", 22) + b"R....")
             sys.exit()
@@ -38,4 +39,9 @@ while head := sys.stdin.buffer.read(4):
             time.sleep(60)
         status, flags = int(value == FAIL), wanted
         numbers = struct.pack("<dd", value, 0.1)[: 8 if value == OTHER_SIZE else 16] if wanted else b""
-    write(struct.pack("<ciB", b"R", status, flags) + numbers)
+        if value == SKIP:
+            continue
+    answer = b"R" + frame[1:5] + struct.pack("<iB", status, flags) + numbers
+    write(answer)
+    if frame[:1] == b"T" and value == TWICE:
+        write(answer)

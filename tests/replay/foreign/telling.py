@@ -18,7 +18,7 @@ def reply(status=0, told=b"", innovation=None):
     if innovation is not None and innovation[0] <= 90.0:
         flags += 6 if innovation[0] > 50.0 else 2
         numbers += struct.pack("<6d", *innovation, 2.0, 0.5, 0.5, 3.0)
-    write(struct.pack("<ciB", b"R", status, flags) + numbers)
+    write(b"R" + frame[1:5] + struct.pack("<iB", status, flags) + numbers)
 
 
 def state():
@@ -32,16 +32,16 @@ while head := sys.stdin.buffer.read(4):
         mean[:3] = struct.unpack("<Q2d", frame[1:])
         continue
     if frame[:1] == b"S":
-        time_ns, _, *prior = struct.unpack("<qB9d", frame[1:82])
-        covariance = frame[82:]
+        time_ns, _, *prior = struct.unpack("<qB9d", frame[5:86])
+        covariance = frame[86:]
         mean[3], mean[4] = time_ns, sum((k + 1) * each for k, each in enumerate(prior))
         reply()
     elif frame[:1] == b"P":
-        mean[6:8] = -1.0, struct.unpack("<q", frame[1:])[0]
+        mean[6:8] = -1.0, struct.unpack("<q", frame[5:])[0]
         reply(told=state())
     else:
-        topic, time_ns, wanted = struct.unpack("<iqB", frame[1:14])
-        fields = struct.unpack(f"<{len(frame[14:]) // 8}d", frame[14:])
+        topic, time_ns, wanted = struct.unpack("<iqB", frame[5:18])
+        fields = struct.unpack(f"<{len(frame[18:]) // 8}d", frame[18:])
         if topic == 0:
             mean[5] = 10.0 * mean[5] + fields[0] + 0.1 * fields[1] + 0.01 * fields[2]
             reply()

@@ -27,16 +27,18 @@ from replay.foreign.processes.process import Program
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 
-HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL = range(-1, -7, -1)  # as in the program
+HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP = range(-1, -9, -1)  # as in the program
 PROGRAM = Path(__file__).with_name("program.py")
 RUNS = {
     SANE: "",
     HALF: "the filter ended within a frame at message 500 (/range)",
     PRINT: "the filter wrote 'hello from the filter' to standard output, which is no frame, at message",
     LEAVE: "the filter ended with exit code 1: no more at message 500 (/range)",
-    OTHER_SIZE: "sent a reply of 14 bytes with flags 1, where 22 were due, at message 500",
+    OTHER_SIZE: "sent a reply of 18 bytes with flags 1, where 26 were due, at message 500",
     MUTE: "the filter took longer than 3 s (time_limit_s) at message 500 (/range)",
     FAIL: "it was told to fail",
+    TWICE: "answered frame 500 where 501 was due",
+    SKIP: "answered frame 501 where 500 was due",
 }
 
 
@@ -56,7 +58,33 @@ def test_programs_that_fail_end_their_own_runs() -> None:
     for (command, reason), estimates in zip(RUNS.items(), done.estimates, strict=True):
         assert sum(reason in each for each in done.failures) == (1 if reason else len(RUNS) - 1), reason
         assert len(estimates["/estimates/mine/failure"]) == bool(reason)
-        assert len(estimates["/estimates/mine/state"]) == (AT if reason else MESSAGES), command
+        states = AT + (command == TWICE) if reason else MESSAGES
+        assert len(estimates["/estimates/mine/state"]) == states, command
+
+
+def test_an_answer_too_many_at_the_end_is_an_error() -> None:
+    """The last message is answered twice: nothing comes after it that could be out of step."""
+    log = run_with(float(TWICE))
+    whole = {topic: stream.take(slice(0, AT + 1)) for topic, stream in log.streams.items()}
+    done = fl.replay(
+        memory_source(Recording(list(whole.values())), log.run), {"mine": program(python(PROGRAM))}
+    )
+    assert ["one answer more" in each for each in done.failures] == [True]
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_a_program_that_does_not_describe_itself_as_this_version_is_refused(tmp_path: Path) -> None:
+    old = tmp_path / "old.py"
+    old.write_text(PROGRAM.read_text().replace('"protocol": 2,', ""))
+    with pytest.raises(
+        BadInput, match=r'states protocol 1, and this is 2: add "protocol": 2 to it, and'
+    ):
+        fl.replay(run_with(SANE), {"mine": program(python(old))})
+    silent = tmp_path / "silent.py"
+    silent.write_text("import time; time.sleep(600)")
+    mine = program(python(silent), time_limit_s=0.5)
+    with pytest.raises(BadInput, match=r"took longer than 0\.5 s \(time_limit_s\), before it gave its"):
+        fl.replay(run_with(SANE), {"mine": mine})
 
 
 def test_a_program_cannot_go_back() -> None:

@@ -108,7 +108,7 @@ def expected(source: MemorySource, run: int) -> tuple[list[list[float]], list[li
 @pytest.mark.parametrize("way", ["here", "apart", "program"])
 def test_what_a_filter_is_told_comes_back(compile_filter: Compile, tmp_path: Path, way: str) -> None:
     """Of two runs, the first of which fails at a message and keeps what was said before it."""
-    text = json.dumps(DESCRIPTION)
+    text = json.dumps({**DESCRIPTION, "protocol": 2})
     if way == "program":
         (tmp_path / "description.json").write_text(text, encoding="utf-8")
         command = python(Path(__file__).with_name("telling.py"), f"'{tmp_path / 'description.json'}'")
@@ -150,7 +150,7 @@ def test_what_a_filter_is_told_comes_back(compile_filter: Compile, tmp_path: Pat
 @pytest.mark.parametrize("in_process", [True, False])
 def test_a_filter_goes_back_until_it_fails(compile_filter: Compile, in_process: bool) -> None:
     """Ranges reach the log after what was measured behind them, which the filter is told again then."""
-    text = json.dumps(DESCRIPTION)
+    text = json.dumps({**DESCRIPTION, "protocol": 2})
     path = compile_filter(Path(__file__).with_name("telling.c"), DESCRIPTION=json.dumps(text))
     mine = {"kind": "lib", "path": str(path), "in_process": in_process, **SETTINGS, "every_s": None}
     sources = []
