@@ -17,6 +17,7 @@ from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from replay.engine.streams.sources import LogSource, MemorySource
 
 AXES = "xyz"
+STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries the channel names
 STATED = "covariance_rad2"  # by a channel of orientations: their variances
 ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
@@ -143,10 +144,12 @@ def bare(name: str) -> str:
     return name.rpartition("_")[0] if unit_of(name) else name
 
 
-def entry_of(field_: str, place: int) -> str:
-    """Return what an entry of a vector is called: `position_x_m` of `position_m`."""
-    stem, _, unit = field_.rpartition("_")
-    return f"{stem}_{AXES[place]}_{unit}"
+def names_in(stream: Stream, field_: str) -> list[str]:
+    """Name the entries of a vector: as the channel states them, else `position_x_m` of `position_m`."""
+    if field_ in STATED_ENTRIES and stream.components:
+        return stream.components
+    stem = bare(field_)
+    return [f"{stem}_{axis}{field_.removeprefix(stem)}" for axis in AXES]
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
@@ -303,13 +306,11 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
     for each in given.empty.schema:
         if each.kind not in ("real", "vector") or each.name not in given.empty.columns:
             continue
-        if each.name in ("mean", "state"):
-            entries = enumerate(given.empty.components)
-            fields |= {component: (each.name, place) for place, component in entries}
-            continue
-        fields[each.name] = each.name, None
+        if each.name not in ("mean", "state"):
+            fields[each.name] = each.name, None
         if each.kind == "vector" and not each.name.startswith("covariance"):
-            fields |= {entry_of(each.name, place): (each.name, place) for place in range(len(AXES))}
+            names = names_in(given.empty, each.name)
+            fields |= {name: (each.name, place) for place, name in enumerate(names)}
     for fits in (
         [each for each in fields if each == name],
         [each for each in fields if bare(each) == name],

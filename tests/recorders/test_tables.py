@@ -632,14 +632,14 @@ becomes = "TruthState"
 fields = { state = ["w", "x", "y", "z"] }
 components = "a_w,a_x,a_y,a_z"
 kinds = "quaternion,quaternion,quaternion,quaternion"
-""", "table.csv: /truth: the quaternions of state: the vector at (0,) has length 1.41421356"),
+""", "table.csv: /truth: 1 of its quaternions is not of unit length, the first of length 1.41421356"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
 [[tables.streams]]
 topic = "/o"
 becomes = "Orientation"
 fields = { quaternion = ["w", "x", "y", "z"] }
 mounting_deg = [180, 0, 0]
-""", "table.csv: /o: its quaternions: the vector at (0,) has length 1.41421356"),
+""", "table.csv: /o: 1 of its quaternions is not of unit length, the first of length 1.41421356"),
 ]  # fmt: skip
 
 
@@ -649,6 +649,25 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(
 ) -> None:
     """Columns, units, times and values that cannot be used."""
     assert sentence in refusal(text, mapping.replace(old, new) if old else mapping)
+
+
+def test_quaternions_not_of_unit_length_are_scaled_or_left_out(imported: Callable[..., Any]) -> None:
+    """Of an orientation and of a state, each counted."""
+    fields = 'fields = { quaternion = ["w", "x", "y", "z"] }'
+    components = 'components = "a_w,a_x,a_y,a_z"\nkinds = "quaternion,quaternion,quaternion,quaternion"'
+    stream = '[[tables.streams]]\ntopic = "/o"\nbecomes = "Orientation"\n' + fields
+    state = stream.replace("/o", "/truth").replace("Orientation", "TruthState")
+    state = state.replace("quaternion =", "state =") + "\n" + components
+    mapping = f'[[tables]]\ntime = {{ column = "t" }}\n{stream}\n{state}\n'
+    text = "t,w,x,y,z\n1,1,0,0,0\n2,2,0,0,0\n3,0,0,0,0\n"
+    for setting, kept in (("normalise", 2), ("skip", 1)):
+        streams, notes = imported(text, mapping, quaternions=setting)
+        for topic, field in (("/o", "quaternion"), ("/truth", "state")):
+            assert streams[topic][field].tolist() == [[1.0, 0.0, 0.0, 0.0]] * kept
+            left_out = notes[f"{topic}: messages left out: a quaternion that is not of unit length"]
+            assert left_out == str(3 - kept)
+            scaled = f"{topic}: messages with a quaternion that was scaled to unit length"
+            assert notes.get(scaled) == ("1" if setting == "normalise" else None)
 
 
 def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
 """Imports ROS logs: topics become streams, and what is not taken is told."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ class _Import:
         self._readers, self._not_taken = choose(bag, parameters)
         names = stream_names(self._readers, parameters)
         origin = None if parameters.origin is None else Origin(*parameters.origin)
-        self._streams = StreamMaker(bag.path, parameters.clock, names, origin)
+        self._streams = StreamMaker(bag.path, parameters.clock, names, origin, parameters.quaternions)
         self._pending: dict[tuple[Connection, int], _Pending] = defaultdict(_Pending)
         self._waiting_messages = self._waiting_bytes = 0
         self._read: Counter[str] = Counter()
@@ -119,12 +120,14 @@ class _Import:
         return connection in self._readers and self._readers[connection].taken is None
 
     def _transforms(
-        self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64]
-    ) -> list[tuple[Pair, Transforms]]:
-        try:
-            return list(transforms_of(messages, log_time_ns))
-        except BadInput as error:
-            raise BadInput(f"{self.path}: topic {topic}: {error}") from None
+        self,
+        topic: str,
+        messages: Messages,
+        log_time_ns: NDArray[np.int64],
+        tell: Callable[[str, int], None],
+    ) -> Iterator[tuple[Pair, Transforms]]:
+        where, quaternions = f"{self.path}: topic {topic}", self._parameters.quaternions
+        return transforms_of(messages, log_time_ns, where, quaternions, tell)
 
     def _named_chains(self) -> list[Chain]:
         """Return the chains of the named pairs; all transforms of the bag are read once to find them."""
@@ -146,8 +149,9 @@ class _Import:
                 for messages in reader.type.read(raw, which):
                     if isinstance(messages, Undecodable):
                         continue  # told when it is read for the streams
+                    logged_ns = batch.log_time_ns[messages.rows]
                     for pair, found in self._transforms(
-                        batch.connection.topic, messages, batch.log_time_ns[messages.rows]
+                        batch.connection.topic, messages, logged_ns, lambda *_: None
                     ):
                         if reader.is_static:
                             static[pair] = found
@@ -161,7 +165,8 @@ class _Import:
     def _take_transforms(
         self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64], *, is_static: bool
     ) -> None:
-        for pair, transforms in self._transforms(topic, messages, log_time_ns):
+        tell = partial(self._streams.tell, topic)
+        for pair, transforms in self._transforms(topic, messages, log_time_ns, tell):
             self._mountings.add(pair, transforms)
             if is_static:
                 what = "what named transforms and mountings are composed with"

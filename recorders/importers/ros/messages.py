@@ -161,13 +161,17 @@ def _inertial(messages: Messages) -> Iterator[Part]:
         lacking={"specific_force_mps2": no_force, "turn_rate_radps": no_rate},
     )
     orientation = quaternion(messages, "orientation")
-    is_none = has_none(messages, "orientation_covariance") | (orientation == 0.0).all(axis=1)
     yield Part(
         "orientation",
         schemas.ORIENTATION,
         {"quaternion": orientation},
         constants={"covariance_rad2": covariance(messages, "orientation_covariance")},
-        dropped={"without an orientation": is_none},
+        dropped={
+            "without an orientation: orientation_covariance[0] is -1": has_none(
+                messages, "orientation_covariance"
+            ),
+            "without an orientation: its quaternion is zero": (orientation == 0.0).all(axis=1),
+        },
     )
 
 

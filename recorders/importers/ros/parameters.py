@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, PositiveFloat
 
-from recorders.importers.mapping import Place
+from recorders.importers.mapping import Place, Quaternions
 from recorders.parameters import Parameters
 
 Clock = Literal["header", "bag"]
@@ -38,6 +38,8 @@ class RosParameters(Parameters):
         origin: latitude and longitude (deg) and perhaps height (m) of the origin of the plane that poses
             and positions are in, whatever their frames are called; not that of transforms, nor of what
             an odometry adds up to.
+        quaternions: what becomes of messages whose quaternions are not of unit length: "refuse" stops
+            the import, "normalise" scales them, "skip" leaves such messages out.
     """
 
     clock: Clock = "header"
@@ -49,3 +51,4 @@ class RosParameters(Parameters):
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0
     origin: Place | None = None
+    quaternions: Quaternions = "refuse"
