@@ -15,6 +15,7 @@ from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
+from recorders.plausibility.stamps import have_rate
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
@@ -252,9 +253,10 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
         multiples = np.rint(steps / usual)
         is_regular = np.abs(steps / usual - multiples) < 0.2
         gaps = np.flatnonzero(is_regular & (multiples > 1) & (multiples <= LONG_GAP))
-        if np.mean(is_regular) > REGULAR and len(gaps) > LOST * len(steps) and not _are_bursts(gaps):
-            lost = int(np.sum(multiples[gaps] - 1))
-            share = lost / (lost + len(stamps_ns))
+        lost = int(np.sum(multiples[gaps] - 1))
+        share = lost / (lost + len(stamps_ns))
+        is_lossy = len(gaps) > LOST * len(steps) and have_rate(multiples, share)
+        if np.mean(is_regular) > REGULAR and is_lossy and not _are_bursts(gaps):
             yield Finding(
                 "lost messages",
                 stream.topic,
