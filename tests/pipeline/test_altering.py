@@ -13,8 +13,10 @@ import pytest
 
 import fuselog as fl
 from pipeline.altering import alterations as put
+from pipeline.altering.changes import bare
 from pipeline.altering.sources import alter
 from pipeline.diagnosing.battery.car import car
+from pipeline.diagnosing.hypotheses.components import _columns
 from recorders.log.streams import concatenate
 from recorders.models.orientation import heading
 from recorders.parameters import parse_settings
@@ -170,6 +172,28 @@ def test_what_is_set_undoes_its_fault_in_the_columns(
     for name, column in before.columns.items():
         if name not in (moved, "sensor_time_ns", *turns):
             np.testing.assert_array_equal(after[name], column)
+
+
+@pytest.mark.parametrize(
+    ("components", "names"),
+    [("left_mps,right_mps", ["left_mps", "right_mps"]), ("", ["value_x", "value_y"])],
+)
+def test_entries_of_a_measured_vector_have_names(components: str, names: list[str]) -> None:
+    """Those that its channel states, for settings and in what a diagnosis says."""
+    stamps_ns = BEGIN_NS + np.arange(4) * 10**9
+    stream = fl.make_stream(
+        "/wheels",
+        fl.schemas.VECTOR_MEASUREMENT,
+        stamps_ns,
+        metadata={"components": components} if components else {},
+        value=np.ones((4, 2)),
+    )
+    assert [name for _, _, name in _columns(stream)] == names
+    source = fl.MemorySource({"/wheels": stream}, fl.RunMetadata("wheels", {}, 0, BEGIN_NS), "wheels")
+    for place, name in enumerate(names):
+        found = alter(source, {f"/wheels.{bare(name)}_scale": 3.0}).read(["/wheels"])["/wheels"]["value"]
+        assert found[:, place].tolist() == [3.0] * 4
+        assert found[:, 1 - place].tolist() == [1.0] * 4
 
 
 def test_stated_variances_and_exchanged_topics() -> None:
