@@ -38,10 +38,8 @@ Holds = Callable[[str, Sequence[Source]], NDArray[np.bool_]]
 
 # What becomes of messages whose quaternions are far from unit length.
 Quaternions = Literal["refuse", "normalise", "skip"]
-NOT_UNIT, SCALED = (
-    "a quaternion that is not of unit length",
-    "a quaternion that was scaled to unit length",
-)
+NOT_UNIT = "a quaternion that is not of unit length"
+SCALED = "a quaternion that was scaled to unit length"
 
 # How many numbers a vector has that may be missing.
 _WIDTHS = {"covariance_m2": 9, "covariance_m2ps2": 9, "covariance": 36, "covariance_ut2": 9}
@@ -95,6 +93,8 @@ class StreamMapping(Parameters):
             are turned, and orientations become the body's.
         components: components of a vector that states them, with commas.
         kinds: kinds of these components, with commas; linear without any.
+        rotation_axes: of estimates, the axes of the rotations that their covariance is of: the body's,
+            or those of the world, as in ROS.
         states: numbers that the channel states, for parameters of models: noise densities, say.
     """
 
@@ -112,6 +112,7 @@ class StreamMapping(Parameters):
     mounting_deg: tuple[float, float, float] | None = None
     components: str = ""
     kinds: str = ""
+    rotation_axes: Literal["body", "world"] = "body"
     states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
@@ -135,7 +136,8 @@ class StreamMapping(Parameters):
         if not self.components:
             return stated
         linear = ",".join("linear" for _ in self.components.split(","))
-        return {**stated, "components": self.components, "kinds": self.kinds or linear}
+        axes = {"rotation_axes": "world"} if self.rotation_axes == "world" else {}
+        return {**stated, "components": self.components, "kinds": self.kinds or linear, **axes}
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:
@@ -365,7 +367,7 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
 
 
 class OffUnit(NamedTuple):
-    """Holds which messages (n,) are left out, and which are scaled, for quaternions not of unit length."""
+    """Holds which messages (n,) are left out for their quaternions, and whose are scaled."""
 
     left_out: NDArray[np.bool_]
     scaled: NDArray[np.bool_]
@@ -396,9 +398,9 @@ def off_unit(
         if is_off.any() and quaternions == "refuse":
             count = int(is_off.sum())
             raise BadInput(
-                f"{where}: {count} of its quaternions {'is' if count == 1 else 'are'} not of unit length, "
-                f"the first of length {length[is_off.argmax()]:.9g}; check what they are, or scale them with --set "
-                "quaternions=normalise, or leave them out with --set quaternions=skip"
+                f"{where}: {count} of its quaternions {'is' if count == 1 else 'are'} not of unit "
+                f"length, the first of length {length[is_off.argmax()]:.9g}; check what they are, scale "
+                "them with --set quaternions=normalise, or leave them out with --set quaternions=skip"
             )
         off |= is_off
         zero |= is_off & (length == 0.0)

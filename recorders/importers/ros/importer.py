@@ -15,7 +15,7 @@ from recorders.importers.ros.clocks import Clocks
 from recorders.importers.ros.files.bags import Bag, open_bag
 from recorders.importers.ros.files.raw import Batch, Connection
 from recorders.importers.ros.layouts import Messages, Undecodable, by_size
-from recorders.importers.ros.messages import CHILD_FRAME, Part, as_truth, stamps_ns
+from recorders.importers.ros.messages import CHILD_FRAME, Part, as_estimate, as_truth, stamps_ns
 from recorders.importers.ros.mountings import Mountings
 from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
@@ -45,6 +45,7 @@ class _Import:
         self.path, self._bag, self._parameters = bag.path, bag, parameters
         self._readers, self._not_taken = choose(bag, parameters)
         names = stream_names(self._readers, parameters)
+        self._truth = names.get((parameters.truth or "", "truth"), "/truth")
         origin = None if parameters.origin is None else Origin(*parameters.origin)
         self._streams = StreamMaker(bag.path, parameters.clock, names, origin, parameters.quaternions)
         self._pending: dict[tuple[Connection, int], _Pending] = defaultdict(_Pending)
@@ -106,12 +107,15 @@ class _Import:
         self._clocks.note(topic, sent.stamp_ns, log_time_ns)
         frames = _frames_of(messages, reader.frame)
         for part in reader.taken.parts(messages):
-            if topic != self._parameters.truth:
+            is_truth = topic == self._parameters.truth
+            if not is_truth and topic not in self._parameters.estimates:
                 self._streams.add(sent, part, frames)
             elif part.schema is schemas.POSE:
-                self._streams.add(sent, as_truth(part), frames)
+                own = as_truth(part) if is_truth else as_estimate(part, self._truth)
+                self._streams.add(sent, own, frames)
             else:
-                fact = f"{part.kind} left out, since a filter must not read what is from the truth"
+                whose = "the truth" if is_truth else "another filter"
+                fact = f"{part.kind} left out, since a filter must not read what is from {whose}"
                 self._streams.tell(topic, fact, len(messages))
 
     # Transforms.

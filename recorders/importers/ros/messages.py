@@ -251,6 +251,21 @@ def as_truth(part: Part) -> Part:
     return Part("truth", schemas.TRUTH_STATE, {"state": state}, metadata)
 
 
+def as_estimate(part: Part, truth: str) -> Part:
+    """Take poses as the estimates of another filter, which are compared with the topic `truth`.
+
+    The covariance of a pose is of x, y, z and rotations about the fixed axes.
+    """
+    components = {name: kind for name, kind in TRUTH.items() if kind != "angle"}
+    metadata = {"components": ",".join(components), "kinds": ",".join(components.values())}
+    columns = {
+        "mean": np.column_stack([part.columns["position_m"], part.columns["quaternion"]]),
+        "covariance": part.columns["covariance"],
+    }
+    metadata |= {"rotation_axes": "world", "truth": truth}
+    return Part("estimate", schemas.GAUSSIAN_ESTIMATE, columns, metadata)
+
+
 def _twists(path: str, uncertainty: str = "") -> Taken:
     return Taken(("twist",), lambda messages: iter([_twist("twist", messages, path, uncertainty)]))
 

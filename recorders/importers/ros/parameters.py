@@ -32,6 +32,8 @@ class RosParameters(Parameters):
         names: replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic under
             /robot1.
         truth: topic whose poses become the stream `truth`, with which estimates are compared.
+        estimates: topics whose poses are those of another filter, such as /odometry/filtered: they
+            become estimates, which `fuselog evaluate` judges, and are no measurements.
         mapping: a TOML file for messages of your own.
         distribution: which one's definitions hold for messages that the bag does not define.
         clock_tolerance_s: headers that differ by more are refused as those of several clocks.
@@ -47,6 +49,7 @@ class RosParameters(Parameters):
     transforms: Names = []
     names: dict[str, str] = {}
     truth: str | None = None
+    estimates: Names = []
     mapping: str | None = None
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0

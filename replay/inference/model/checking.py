@@ -456,7 +456,8 @@ def _not_additive(
     return [
         f"{place_of(motion.noise or motion.control_noise or motion.move)}: the noise does not add up: "
         f"over {SHORT_S:g} s the variance of {names} is {ratio[wrong][0]:.3g} times that of two halves, "
-        "so that estimates depend on how many messages there are; make it proportional to duration_s"
+        "so that estimates depend on how many messages there are; let a step add a variance "
+        "proportional to duration_s"
     ]
 
 
@@ -468,10 +469,10 @@ def _spread(call: _Call, motion: Motion, state: Floats, others: list[Floats]) ->
     at = tuple(state), step_s, numbers
     if motion.noise is not None and not motion.noises:
         total += _matrix(motion.noise, at, size, motion.noise_block)
-    entering = [(motion.noise, at, 2)] if motion.noise is not None and motion.noises else []
-    if motion.control_noise is not None:
-        entering.append((motion.control_noise, at[1:], 1))
-    for noise, given, index in entering:
+    entering = motion.noise if motion.noises else None
+    for noise, given, index in ((entering, at, 2), (motion.control_noise, at[1:], 1)):
+        if noise is None:
+            continue
         slopes = _slopes(call, arguments, index)
         total += slopes @ _matrix(noise, given, slopes.shape[1]) @ slopes.T
     return total

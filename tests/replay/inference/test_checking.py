@@ -267,6 +267,6 @@ def test_noise_of_the_control_is_looked_at_too() -> None:
     """A variance of the control per message loses weight as messages get more."""
     robot = MODELS["robot"]
     check_model(robot)
-    motion = replace(robot.motion, control_noise=lambda duration_s, parameters: (1.0, 1.0))
+    motion = replace(robot.motion, control_noise=lambda *_: (1.0, 1.0))
     with pytest.warns(UserWarning, match="variance of x_m, y_m, heading_rad is 2 times"):
         check_model(replace(robot, motion=motion))
