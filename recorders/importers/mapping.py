@@ -361,7 +361,7 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
         is_whole = is_finite.all()  # then its rows need no look, which would take longer
         if is_finite.size and entry.kind != "identifier":
             finite.append(np.ones(size, bool) if is_whole else is_finite.any(axis=1))
-        if not (is_whole or entry.may_be_nan):
+        if not (is_whole or entry.may_be_nan or entry.may_be_partial):
             lacks |= ~is_finite.all(axis=1)
     return lacks | ~np.any(finite, axis=0) if finite else lacks
 

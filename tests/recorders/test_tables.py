@@ -20,7 +20,7 @@ from recorders.errors import BadInput
 from recorders.importers.tables import blocks, files
 from recorders.importers.tables.blocks import NO_END
 from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
-from recorders.log import Stream, open_log, read_streams
+from recorders.log import Stream, open_log, read_streams, write_log
 from recorders.recording import import_log, import_run
 
 GRAVITY = 9.80665
@@ -649,6 +649,26 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(
 ) -> None:
     """Columns, units, times and values that cannot be used."""
     assert sentence in refusal(text, mapping.replace(old, new) if old else mapping)
+
+
+def test_a_measurement_keeps_its_other_components(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """One cell is empty: the others are measured all the same; without any there is no message."""
+    mapping = """[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/wheels"
+becomes = "VectorMeasurement"
+fields = { value = ["left", "right"] }
+components = "left_mps,right_mps"
+"""
+    streams, notes = imported("t,left,right\n1,0.5,0.6\n2,,0.7\n3,,\n4,inf,0.8\n", mapping)
+    nan = np.nan
+    wanted = [[0.5, 0.6], [nan, 0.7], [nan, 0.8]]
+    assert_array_equal(streams["/wheels"]["value"], wanted)
+    assert notes["/wheels: messages left out: NaN or infinite"] == "1"
+    write_log(tmp_path / "log.mcap", streams.values())
+    read = read_streams(open_log(tmp_path / "log.mcap"), ["/wheels"])["/wheels"]
+    assert_array_equal(read["value"], wanted)
 
 
 def test_quaternions_not_of_unit_length_are_scaled_or_left_out(imported: Callable[..., Any]) -> None:
