@@ -15,6 +15,7 @@ from recorders.importers.units import conversion, unit_of
 from recorders.log import Stream, Topic, schemas
 from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.judging.tracks.errors import COVERS
 
 AXES = "xyz"
 STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries the channel names
@@ -39,6 +40,8 @@ WHATS = {
     "Of positions where their zero lies in the plane, in m: it is added.",
     "plane": "Of positions and states the origin of their plane, which counts as stated: latitude and "
     "longitude in deg, altitude in m. /*.plane is of all topics of a plane that state none.",
+    "covers": "Of a truth: some, if the log has targets without a truth, so that tracks of these are not "
+    "false; or all, whatever the log states.",
     "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -215,6 +218,8 @@ def _with(change: Change, given: _Setting) -> Change:
         return _plane(change, given)
     if what == "exchanged":
         return _exchange(change, given)
+    if what == "covers":
+        return _covers(change, given)
     own = change.metadata.get(STATED, given.empty.metadata.get(STATED, ""))
     if what == "covariance_scale" and own and "covariance" not in given.empty.columns:
         factor = given.number("scale", "a positive factor of variances, such as 4")
@@ -351,6 +356,14 @@ def _plane(change: Change, given: _Setting) -> Change:
         raise given.refused(EXAMPLE)
     stated = dict(list(origin.metadata.items())[: len(texts)])
     return replace(change, metadata={**change.metadata, **stated})
+
+
+def _covers(change: Change, given: _Setting) -> Change:
+    if given.empty.schema.full_name != schemas.TRUTH_STATE.full_name:
+        raise BadInput(f"--set {given.key}: only truths cover targets; leave it out")
+    if given.value not in ("some", "all"):
+        raise given.refused("some or all")
+    return replace(change, metadata={**change.metadata, COVERS: f"{given.value} targets"})
 
 
 def _plain(given: _Setting, text: str, example: str) -> float:

@@ -207,6 +207,20 @@ def test_stated_variances_and_exchanged_topics() -> None:
     np.testing.assert_array_equal(found["/other"]["position_m"], PLACES)
 
 
+def test_a_setting_says_that_truths_cover_some_targets() -> None:
+    """As the metadata of a truth does, and the other way; the result names it."""
+    log = fl.record("crossing", duration_s=20.0)
+    counts = {}
+    for value in (None, "some", "all"):
+        key = "/target1/truth.covers"
+        replay = fl.replay(log, "tracker", set={} if value is None else {key: value})
+        counts[value] = set(replay.metrics["quantity"])
+        assert any("cover some of the targets" in each for each in replay.losses) == (value == "some")
+    assert "unreferenced_targets" in counts["some"]
+    assert counts["all"] == counts[None]
+    assert "unreferenced_targets" not in counts["all"]
+
+
 @pytest.mark.paper
 def test_covariances_of_fixes_are_scaled() -> None:
     """Stated 4 times too large, and mended by what the diagnosis says."""
@@ -340,6 +354,8 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
         (f"{SEEN}.range_scale=inf", "expected a factor, such as -1 or 3.6"),
         (f"{SEEN}.range_matrix=1", "range_m is no vector of three entries"),
         (f"{SEEN}.range_sign=2", "of a topic can be set"),
+        ("/robot1/truth.covers=most", "expected some or all"),
+        (f"{SEEN}.covers=some", "only truths cover targets"),
         (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
         (f"{SEEN}.exchanged={ODOMETRY}", "only topics of one type are exchanged"),
         ("/landmarks.exchanged=3", "expected two numbers, such as 3,9, or another topic"),

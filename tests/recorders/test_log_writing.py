@@ -187,12 +187,14 @@ def test_what_a_stream_lacks_is_named():
     """The fields that are missing, and not those that were given or are made."""
     force = np.zeros((2, 3))
     given = {"specific_force_mps2": force, "turn_rate_radps": force}
-    with pytest.raises(BadInput, match=r"InertialSample also needs magnetic_field_ut; fill magnetic_field"):
+    with pytest.raises(
+        BadInput, match=r"InertialSample also needs magnetic_field_ut; fill magnetic_field"
+    ):
         make_stream("/imu", schemas.INERTIAL_SAMPLE, [1, 2], **given)
     with pytest.raises(BadInput, match=r"^topic /f: fuselog.Detection also needs scan_id$"):
         make_stream("/f", schemas.DETECTION, [1, 2], position_m=force)
     own = Schema("Wheels", "Speeds of wheels.", (Field("left_mps", "real"),))
-    with pytest.raises(BadInput, match=r"Wheels lacks .* clock.* declare Field\("sensor_time_ns", "time_ns"\)"):
+    with pytest.raises(BadInput, match=r'Wheels lacks .* Field\("sensor_time_ns", "time_ns"\)'):
         make_stream("/wheels", own, [1, 2], left_mps=[1.0, 2.0])
 
 
