@@ -63,7 +63,7 @@ def build(
     except ValidationError as error:
         first = error.errors()[0]
         path = [str(part) for part in first["loc"]]
-        name = ".".join(path)
+        name = ".".join(path).removeprefix("of_topics.")
         if first["type"] == "extra_forbidden":
             *above, last = path
             known = _names_at(kind, above)
@@ -290,7 +290,10 @@ def field_of(key: str) -> str:
     >>> field_of("/gps2/fix.lever_x_m"), field_of("lever_x_m")
     ('gps2_fix_lever_x_m', 'lever_x_m')
     """
-    return re.sub(r"\W", "_", key).strip("_") if key.startswith("/") else key
+    if not key.startswith("/"):
+        return key
+    field = re.sub(r"\W", "_", key).strip("_")
+    return f"n{field}" if field[:1].isdigit() else field
 
 
 def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:

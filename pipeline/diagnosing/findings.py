@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
+from recorders.parameters import field_of
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
 from recorders.plausibility.stamps import have_rate
@@ -102,7 +103,7 @@ def undone_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
         found += [
             (kind, topic)
             for name, kind, topic in named
-            if getattr(each.parameters, name) != fields[name].default
+            if getattr(each.parameters, field_of(name)) != fields[name.rpartition(".")[2]].default
         ]
     return found
 

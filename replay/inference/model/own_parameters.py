@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import Field, create_model
+from pydantic import create_model
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import build, field_of, meanings
@@ -60,7 +60,7 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
     for topic, table in tables.items():
         sensors = [sensor for each in found for sensor, own in each.sensors if own.name == topic]
         if not sensors:
-            taken = {own.name for each in found for _, own in each.sensors}
+            taken = dict.fromkeys(own.name for each in found for _, own in each.sensors)
             raise BadInput(
                 f"estimator {label}: {topic} is no topic of a sensor that it takes; "
                 f"{choices(topic, taken)}; --set topics.KIND=TOPIC,TOPIC takes several of a kind"
@@ -139,14 +139,16 @@ def _with_fields(
     parameters: type[ModelParameters], owned: Mapping[str, tuple[str, str]]
 ) -> type[ModelParameters]:
     """Add the topics' own parameters to those of a model, with the bounds of what they stand for."""
-    said, fields = meanings(parameters), dict[str, Any]()
+    said, fields, lines = meanings(parameters), dict[str, Any](), list[str]()
     for field, (topic, name) in owned.items():
         entry = parameters.model_fields[name]
         bounds: Any = (
             Annotated[(entry.annotation, *entry.metadata)] if entry.metadata else entry.annotation
         )
-        fields[field] = (bounds | None, Field(None, description=f"of {topic}: {said.get(name, name)}"))
-    return create_model(f"{parameters.__name__}OfTopics", __base__=parameters, **fields)
+        fields[field] = bounds | None, None
+        lines.append(f"    {field}: {said.get(name, name).rstrip('.')}; of {topic}.")
+    doc = "\n".join(["States what topics have for themselves.", "", "Attributes:", *lines])
+    return create_model(f"{parameters.__name__}OfTopics", __base__=parameters, __doc__=doc, **fields)
 
 
 def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
