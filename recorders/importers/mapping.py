@@ -408,7 +408,12 @@ def off_unit(
 
 
 def with_unit_quaternions(columns: Mapping[str, NDArray], kinds: str) -> dict[str, NDArray]:
-    """Scale the quaternions among columns to unit length: of the field, or in a state or estimate."""
+    """Scale the quaternions among columns to unit length: of the field, or in a state or estimate.
+
+    Args:
+        columns: (n,) or (n, width), by field.
+        kinds: of the components of a state or estimate, with commas.
+    """
     made = dict(columns)
     for name, which in _quaternions_in(columns, kinds):
         column = columns[name].astype(float)

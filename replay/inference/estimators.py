@@ -21,6 +21,7 @@ from replay.inference.model.augmentation import (
     augmented,
     augmented_stage,
     begin,
+    check_augmentable,
     estimated,
     with_gauss_markov,
 )
@@ -261,6 +262,7 @@ def bind_model(
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
+    check_augmentable(f"estimator {label}", model)
     renamed, more = first_and_more(parameters.topics or {})
     _check_topics(label, model, topics, renamed, more)
     things = [with_more(label, model, each, topics, more) for each in topics_of(model, topics, renamed)]

@@ -61,15 +61,14 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """Return what is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
-    list one that is asked for, one stands twice, or has no sigma.
+    Raises BadInput where the model does not list as `augmentable` what is asked for, one stands twice,
+    or has no sigma.
 
     Args:
         label: the estimator's, for errors.
         model: whose parameters are asked for.
         parameters: with `estimate` and its options.
     """
-    check_augmentable(f"estimator {label}", model)
     asked = list(map(field_of, parameters.estimate or []))
     options = {
         option: {field_of(key): value for key, value in (getattr(parameters, option) or {}).items()}

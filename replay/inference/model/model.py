@@ -363,11 +363,19 @@ class Model:
         return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
 
     def key_of(self, name: str) -> str:
-        """Return the key by which a parameter is set: `/TOPIC.NAME` of one that a topic has."""
+        """Return the key by which a parameter is set: `/TOPIC.NAME` of one that a topic has.
+
+        Args:
+            name: the parameter's.
+        """
         return ".".join(self.owned[name]) if name in self.owned else name
 
     def kind_of(self, name: str) -> str:
-        """Return the parameter that one of a topic stands for; any other is its own."""
+        """Return the parameter that one of a topic stands for; any other is its own.
+
+        Args:
+            name: the parameter's.
+        """
         return self.owned[name][1] if name in self.owned else name
 
     @property
