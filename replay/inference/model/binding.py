@@ -249,15 +249,19 @@ def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[s
     taken = {topic.name for _, topic in found.sensors} | {topic.name for _, topic in found.fallbacks}
     if found.control is not None:
         taken.add(found.control.name)
-    settings = {}
+    offered: dict[str, list[str]] = {}
     for name, topic in topics.items():
         fitting = [each for each, schema in kinds.items() if topic.schema_name in serving(schema)]
         alike = [each for each in fitting if name.endswith(f"/{each}")]
         is_only = len(fitting) == 1 and topic.schema_name != schemas.POSE.full_name
         for role in alike[:1] or (fitting if is_only else []):
             if name not in taken and role not in here and not name.startswith("/estimates/"):
-                settings[name] = f"--set topics.{role}={name}"
-    return settings
+                offered.setdefault(role, []).append(name)
+    return {
+        name: f"--set topics.{role}={','.join(names)}"
+        for role, names in offered.items()
+        for name in names
+    }
 
 
 def _found(model: Model, here: UnderPrefix) -> Found | None:
