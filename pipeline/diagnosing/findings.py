@@ -16,7 +16,7 @@ from recorders.log import Stream
 from recorders.parameters import field_of
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
-from recorders.plausibility.stamps import have_rate
+from recorders.plausibility.stamps import MOST_LOST
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
@@ -256,7 +256,7 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
         gaps = np.flatnonzero(is_regular & (multiples > 1) & (multiples <= LONG_GAP))
         lost = int(np.sum(multiples[gaps] - 1))
         share = lost / (lost + len(stamps_ns))
-        is_lossy = len(gaps) > LOST * len(steps) and have_rate(multiples, share)
+        is_lossy = len(gaps) > LOST * len(steps) and share <= MOST_LOST
         if np.mean(is_regular) > REGULAR and is_lossy and not _are_bursts(gaps):
             yield Finding(
                 "lost messages",

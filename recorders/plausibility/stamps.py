@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from recorders.plausibility.finding import Finding, digits
@@ -14,7 +13,6 @@ REGULAR, TOLERANCE = 0.8, 0.2  # of the steps that are a multiple of the usual o
 FACT = 1e-3  # of a clock's rate
 LONG_S = 10.0
 MOST_LOST = 0.6  # where more lacks, the stamps are of a clock's ticks, and no rate
-AT_RANDOM = 0.8  # of the usual steps that messages lost at random leave, those that there are at least
 # What comes regularly: what sees targets is silent where there are none.
 REGULARS = {
     each.full_name
@@ -56,7 +54,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     is_gap |= is_regular & (multiples > 1) & (np.median(multiples) > 1)
     lost = 1.0 - (len(steps_s) + 1) / (float(np.sum(steps_s)) / usual_s + 1.0)
     is_lossy = np.mean(is_gap) > GAPS or (lost > LOST and is_gap.any())
-    if np.mean(is_regular) < REGULAR or not is_lossy or not have_rate(multiples, lost):
+    if np.mean(is_regular) < REGULAR or not is_lossy or lost > MOST_LOST:
         return
     share = f"{100.0 * lost:.2g} %" if lost < 0.45 or lost > 0.55 else "half"
     at_s = (int(begin_ns[np.argmax(is_gap)]) - int(stamps_ns[0])) * 1e-9
@@ -70,18 +68,6 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         "a delay or noise that is found besides may come of it",
         mapping="look for them where the log is recorded",
     )
-
-
-def have_rate(multiples: NDArray[np.float64], lost: float) -> bool:
-    """Tell whether steps are of one rate, from which messages lack, and not of any number of ticks.
-
-    Messages lost at random leave a share of 1 - lost of the steps as they were, losses in a row more.
-
-    Args:
-        multiples: (n,) of the shortest step.
-        lost: the share of the messages that would be lost.
-    """
-    return lost <= MOST_LOST and bool(np.mean(multiples == 1.0) >= AT_RANDOM * (1.0 - lost))
 
 
 def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:

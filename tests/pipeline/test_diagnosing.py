@@ -163,7 +163,6 @@ def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySo
 @pytest.mark.parametrize(
     ("steps", "is_lossy"),
     [
-        (lambda rng: rng.integers(1, 3, 600), False),
         (lambda rng: rng.integers(1, 6, 600), False),
         (lambda rng: rng.choice([1, 2, 5], 600), False),
         (lambda rng: rng.geometric(0.3, 600), False),
