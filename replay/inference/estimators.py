@@ -271,9 +271,7 @@ def bind_model(
     stages: dict[tuple[Model, tuple[Sensor, ...]], Stage] = {}  # one for all with the same sensors
     for found in things:
         found = in_its_plane(label, kind, found, topics)
-        model, found, values = with_own_parameters(kind, found, tables, given)
-        known = {name: getattr(given, name) for name in type(given).model_fields}
-        parameters = combined(model, method)(**known, **values) if values else given
+        model, found, parameters = with_own_parameters(kind, found, tables, given)
         added = estimated(label, model, parameters)
         lacking = method.lacks(augmented(model, added.parameters, added.errors))
         if added.names and lacking:

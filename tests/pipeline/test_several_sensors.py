@@ -89,6 +89,11 @@ def test_each_topic_has_its_own_parameters(drive: fl.MemorySource) -> None:
             mean, count = nis_of(drive, topic, found)
             low, high = np.asarray(chi2.ppf(np.array([0.005, 0.995]), size * count)) / count
             assert low < mean < high, topic
+    every = [f"{kind}ekf" for kind in ("", "smoother:", "sqrt:")]  # of which some have parameters apart
+    table = fl.replay(drive, every, set={**TAKEN, **OPEN, **LEVERS, **OFFSETS}).metrics
+    likelihoods = table.query("quantity == 'log_likelihood'")["value"].to_numpy()
+    np.testing.assert_allclose(likelihoods, likelihoods[0], rtol=1e-9)
+    assert len(likelihoods) == len(every)
     one = {**TAKEN, **OPEN, **OFFSETS, "lever_x_m": 0.5, "lever_y_m": 0.2}  # of all that have no own
     found = fl.replay(drive, "ekf", set=one).innovations
     assert nis_of(drive, "/gps2/fix", found)[0] > 20.0

@@ -13,11 +13,11 @@ from typing import Annotated, Any
 from pydantic import create_model
 
 from recorders.errors import BadInput, choices
-from recorders.parameters import build, field_of, meanings
+from recorders.parameters import Parameters, build, field_of, meanings
 from replay.engine.arrays import Function
 from replay.inference.model.binding import Found
 from replay.inference.model.model import Model, Sensor
-from replay.inference.model.parameters import ModelParameters, number_fields
+from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.validation import trial_state
 
@@ -25,9 +25,9 @@ Tables = Mapping[str, Mapping[str, Any]]
 
 
 def with_own_parameters(
-    model: Model, found: Found, tables: Tables, parameters: ModelParameters
-) -> tuple[Model, Found, dict[str, Any]]:
-    """Return a model whose topics have parameters of their own, its topics, and the parameters' values.
+    model: Model, found: Found, tables: Tables, parameters: Parameters
+) -> tuple[Model, Found, Any]:
+    """Return a model whose topics have parameters of their own, its topics, and the parameters.
 
     They are given to topics that some are set for, and to all of a kind of which there are several.
 
@@ -44,7 +44,7 @@ def with_own_parameters(
         if topic.name in tables or kinds.count(sensor.topic) > len(_uses(model, sensor))
     )
     if not own:
-        return model, found, {}
+        return model, found, parameters
     sensors = tuple(sensor for sensor, _ in found.sensors)
     model, sensors = _transformed(model, sensors, own)
     values = {
@@ -52,7 +52,10 @@ def with_own_parameters(
         for field, (topic, name) in model.owned.items()
     }
     pairs = zip(sensors, found.sensors, strict=True)
-    return model, found._replace(sensors=tuple((each, topic) for each, (_, topic) in pairs)), values
+    kind = _with_fields(type(parameters), tuple(model.owned.items()))
+    given = {name: getattr(parameters, name) for name in type(parameters).model_fields}
+    found = found._replace(sensors=tuple((each, topic) for each, (_, topic) in pairs))
+    return model, found, kind(**given, **values)
 
 
 def check_tables(label: str, model: Model, found: Sequence[Found], tables: Tables) -> None:
@@ -115,7 +118,7 @@ def _transformed(
                 )
     made = replace(
         model,
-        parameters=_with_fields(model.parameters, owned),
+        parameters=_with_fields(model.parameters, tuple(owned.items())),
         augmentable=_with_owned(model.augmentable, owned),
         calibration=_with_owned(model.calibration, owned),
         owned=owned,
@@ -135,12 +138,13 @@ def _with_owned(given: Mapping[str, Any], owned: Mapping[str, tuple[str, str]]) 
     return {**given, **{field: given[name] for field, (_, name) in owned.items() if name in given}}
 
 
+@lru_cache(maxsize=64)
 def _with_fields(
-    parameters: type[ModelParameters], owned: Mapping[str, tuple[str, str]]
-) -> type[ModelParameters]:
-    """Add the topics' own parameters to those of a model, with the bounds of what they stand for."""
+    parameters: type[Parameters], owned: tuple[tuple[str, tuple[str, str]], ...]
+) -> type[Any]:
+    """Add the topics' own parameters to others, with the bounds of what they stand for."""
     said, fields, lines = meanings(parameters), dict[str, Any](), list[str]()
-    for field, (topic, name) in owned.items():
+    for field, (topic, name) in owned:
         entry = parameters.model_fields[name]
         bounds: Any = (
             Annotated[(entry.annotation, *entry.metadata)] if entry.metadata else entry.annotation
