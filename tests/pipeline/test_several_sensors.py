@@ -11,12 +11,11 @@ import pytest
 import fuselog as fl
 from pipeline.altering.changes import changes_of, is_parameter
 from pipeline.deploying.deploying import deploy
-from pipeline.exploring.sliders import sliders_of
+from pipeline.exploring.session import Session
 from recorders.errors import BadInput
 from recorders.log.streams import empty_stream
 from recorders.parameters import parse_settings
 from replay.distributions import chi2
-from replay.engine.replaying.estimator import bind
 from replay.inference.estimators import registered_models
 from replay.inference.model.own_parameters import read_by
 
@@ -134,10 +133,12 @@ def test_what_is_wrong_is_named_by_its_topic(drive: fl.MemorySource) -> None:
         "/gps2/fix.lever_x_m": pytest.approx(-0.5, abs=0.03),
         "/gps2/fix.lever_y_m": pytest.approx(0.2, abs=0.03),
     }
-    [bound] = bind("ekf", [drive], {"kind": "ekf", **TAKEN, **LEVERS, **OFFSETS})
-    own = {slider.name: slider.own for slider in sliders_of(drive, {"ekf": bound})}
+    session = Session(drive, {"ekf": {**TAKEN, **LEVERS, **OFFSETS}})
+    own = {slider.name: slider.own for slider in session.sliders}
     assert own["/gps1/fix.lever_x_m"] == 0.5
     assert own["/gps2/fix.lever_x_m"] == -0.5
+    right, worse = (session.play("ekf", values) for values in ({}, {"/gps2/fix.lever_x_m": 0.0}))
+    assert right.cases["robot1"].log_likelihood > worse.cases["robot1"].log_likelihood + 100.0
 
 
 def test_commands_and_c_have_the_same_names(
@@ -154,6 +155,8 @@ def test_commands_and_c_have_the_same_names(
     settings = {"topics": {"fix": list(FIXES), "heading": ""}, **LEVERS}
     metrics = fl.replay(drive, "ekf", set=settings).metrics.set_index("quantity")["value"]
     assert done.json["metrics"]["ekf.log_likelihood.robot1"] == pytest.approx(metrics["log_likelihood"])
+    stated = fl.replay(drive, "ekf", set=settings).done.parameters["ekf"]
+    assert stated["/gps2/fix"] == {"fix_delay_s": 0.0, "lever_x_m": -0.5, "lever_y_m": 0.2}
     notes = fl.open(tmp_path / "estimates.mcap").run.notes
     stated = json.loads(notes["estimators"])["ekf"]
     assert stated["/gps2/fix"] == {"lever_x_m": -0.5, "lever_y_m": 0.2}

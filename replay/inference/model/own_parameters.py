@@ -152,7 +152,9 @@ def _with_fields(
         fields[field] = bounds | None, None
         lines.append(f"    {field}: {said.get(name, name).rstrip('.')}; of {topic}.")
     doc = "\n".join(["States what topics have for themselves.", "", "Attributes:", *lines])
-    return create_model(f"{parameters.__name__}OfTopics", __base__=parameters, __doc__=doc, **fields)
+    made = create_model(f"{parameters.__name__}OfTopics", __base__=parameters, __doc__=doc, **fields)
+    made.OWNED = dict(owned)  # type: ignore[attr-defined]
+    return made
 
 
 def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
