@@ -63,7 +63,7 @@ def build(
     except ValidationError as error:
         first = error.errors()[0]
         path = [str(part) for part in first["loc"]]
-        name = ".".join(path)
+        name = ".".join(path).removeprefix("of_topics.")
         if first["type"] == "extra_forbidden":
             *above, last = path
             known = _names_at(kind, above)
@@ -284,6 +284,18 @@ def _accepts(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
 _SIGNS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
+def field_of(key: str) -> str:
+    """Return the name under which parameters hold a number; a topic's own is set as TOPIC.NAME.
+
+    >>> field_of("/gps2/fix.lever_x_m"), field_of("lever_x_m")
+    ('gps2_fix_lever_x_m', 'lever_x_m')
+    """
+    if not key.startswith("/"):
+        return key
+    field = re.sub(r"\W", "_", key).strip("_")
+    return f"n{field}" if field[:1].isdigit() else field
+
+
 def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
     """Return the least and greatest value of a number by its full name; infinite for no bound.
 
@@ -291,7 +303,8 @@ def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
     """
     schema = kind.model_json_schema()
     tables, known = [schema], set[str]()
-    for part in name.split("."):
+    parts = [field_of(name)] if field_of(name) in schema.get("properties", {}) else name.split(".")
+    for part in parts:
         known = {each for table in tables for each in table.get("properties", {})}
         entries = [
             table["properties"][part] if part in table.get("properties", {}) else table[_OTHERS]

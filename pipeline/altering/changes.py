@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,9 +14,16 @@ from recorders.errors import BadInput, choices
 from recorders.importers.units import conversion, unit_of
 from recorders.log import Stream, Topic, schemas
 from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
+from recorders.parameters import merge, nested
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.inference.estimators import registered_models
+from replay.inference.model.own_parameters import read_by
+from replay.inference.model.parameters import ModelParameters
+from replay.judging.tracks.errors import COVERS
 
 AXES = "xyz"
+ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # of what is done to a field
+STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries the channel names
 STATED = "covariance_rad2"  # by a channel of orientations: their variances
 ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
@@ -38,6 +45,8 @@ WHATS = {
     "Of positions where their zero lies in the plane, in m: it is added.",
     "plane": "Of positions and states the origin of their plane, which counts as stated: latitude and "
     "longitude in deg, altitude in m. /*.plane is of all topics of a plane that state none.",
+    "covers": "Of a truth: some, if the log has targets without a truth, so that tracks of these are "
+    "not false; or all, whatever the log states.",
     "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -138,15 +147,56 @@ def is_of_topic(key: str) -> bool:
     return key.startswith("/")
 
 
+def is_parameter(key: str) -> bool:
+    """Tell whether a setting of a topic is a parameter of its sensor, and no alteration of the log.
+
+    No name is both: what sensors read is never called as a field of their messages with an ending.
+    """
+    _, dot, what = key.rpartition(".")
+    if not (is_of_topic(key) and dot) or what in (*WHATS, "delay"):
+        return False
+    return what in (_read_by_sensors() if what.rpartition("_")[2] in ENDINGS else _parameters())
+
+
+def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Put the parameters of topics into tables: `/TOPIC.NAME` into that of `/TOPIC`."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        found = merge(found, nested(key, value) if is_parameter(key) else {key: value})
+    return found
+
+
+@cache
+def _read_by_sensors() -> frozenset[str]:
+    """Collect the parameters that sensors of the registered models read."""
+    return frozenset(
+        name
+        for model in registered_models().values()
+        for sensor in model.all_sensors
+        for name in read_by(model, sensor)
+    )
+
+
+def _parameters() -> set[str]:
+    """Collect the parameters of all models, those that are not registered too."""
+    registered_models()
+    kinds: list[type[ModelParameters]] = [ModelParameters]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    return {name for kind in kinds for name in kind.model_fields}
+
+
 def bare(name: str) -> str:
     """Return the name of a field or component without its unit: `x` of `x_m`."""
     return name.rpartition("_")[0] if unit_of(name) else name
 
 
-def entry_of(field_: str, place: int) -> str:
-    """Return what an entry of a vector is called: `position_x_m` of `position_m`."""
-    stem, _, unit = field_.rpartition("_")
-    return f"{stem}_{AXES[place]}_{unit}"
+def names_in(stream: Stream, field_: str) -> list[str]:
+    """Name the entries of a vector: as the channel states them, else `position_x_m` of `position_m`."""
+    if field_ in STATED_ENTRIES and stream.components:
+        return stream.components
+    stem = bare(field_)
+    return [f"{stem}_{axis}{field_.removeprefix(stem)}" for axis in AXES]
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
@@ -212,6 +262,8 @@ def _with(change: Change, given: _Setting) -> Change:
         return _plane(change, given)
     if what == "exchanged":
         return _exchange(change, given)
+    if what == "covers":
+        return _covers(change, given)
     own = change.metadata.get(STATED, given.empty.metadata.get(STATED, ""))
     if what == "covariance_scale" and own and "covariance" not in given.empty.columns:
         factor = given.number("scale", "a positive factor of variances, such as 4")
@@ -249,7 +301,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
     of_heading = _of_heading(given, first_ns)
     if of_heading is not None:
         return of_heading
-    if not name or what not in ("scale", "bias", "drift", "axes", "matrix", "turn"):
+    if not name or what not in ENDINGS:
         known = f"of a topic can be set {', '.join(WHATS)}"
         raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
     full, (field_, entry) = _field(given, name)
@@ -303,13 +355,11 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
     for each in given.empty.schema:
         if each.kind not in ("real", "vector") or each.name not in given.empty.columns:
             continue
-        if each.name in ("mean", "state"):
-            entries = enumerate(given.empty.components)
-            fields |= {component: (each.name, place) for place, component in entries}
-            continue
-        fields[each.name] = each.name, None
+        if each.name not in ("mean", "state"):
+            fields[each.name] = each.name, None
         if each.kind == "vector" and not each.name.startswith("covariance"):
-            fields |= {entry_of(each.name, place): (each.name, place) for place in range(len(AXES))}
+            names = names_in(given.empty, each.name)
+            fields |= {name: (each.name, place) for place, name in enumerate(names)}
     for fits in (
         [each for each in fields if each == name],
         [each for each in fields if bare(each) == name],
@@ -350,6 +400,14 @@ def _plane(change: Change, given: _Setting) -> Change:
         raise given.refused(EXAMPLE)
     stated = dict(list(origin.metadata.items())[: len(texts)])
     return replace(change, metadata={**change.metadata, **stated})
+
+
+def _covers(change: Change, given: _Setting) -> Change:
+    if given.empty.schema.full_name != schemas.TRUTH_STATE.full_name:
+        raise BadInput(f"--set {given.key}: only truths cover targets; leave it out")
+    if given.value not in ("some", "all"):
+        raise given.refused("some or all")
+    return replace(change, metadata={**change.metadata, COVERS: f"{given.value} targets"})
 
 
 def _plain(given: _Setting, text: str, example: str) -> float:

@@ -13,7 +13,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from pipeline.altering.changes import Change, changes_of, is_of_topic
+from pipeline.altering.changes import Change, by_topic, changes_of, is_of_topic
 from pipeline.altering.planes import in_one_plane
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic
@@ -123,13 +123,18 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split settings into those of topics and all others.
+    """Split settings into alterations of topics, and parameters, some of them of single topics.
 
-    >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1})
-    ({'/fix.delay_s': 0.3}, {'gate_probability': 1})
+    >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1, "/fix.lever_x_m": 0.4})
+    ({'/fix.delay_s': 0.3}, {'gate_probability': 1, '/fix': {'lever_x_m': 0.4}})
     """
-    of_topics = {key: value for key, value in settings.items() if is_of_topic(key)}
-    return of_topics, {key: value for key, value in settings.items() if key not in of_topics}
+    others = by_topic(settings)
+    altering = {
+        key: value
+        for key, value in others.items()
+        if is_of_topic(key) and not isinstance(value, Mapping)
+    }
+    return altering, {key: value for key, value in others.items() if key not in altering}
 
 
 @dataclass(frozen=True, repr=False)

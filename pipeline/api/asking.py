@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.changes import WHATS, is_of_topic
+from pipeline.altering.changes import WHATS, is_of_topic, is_parameter
 from pipeline.api.catalog import Entry, rows_of, stated_of
 from pipeline.logs.constraints import ConstraintParameters
 from pipeline.output.terminal import print_table
@@ -37,8 +37,10 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
         options: the command's.
     """
     names = [text.removesuffix(ASKED).strip() for text in texts if text.endswith(ASKED)]
-    of_topics = [row for name in names if is_of_topic(name) for row in _of_topic(name)]
-    others = [name for name in names if not is_of_topic(name)]
+    altering = [name for name in names if is_of_topic(name) and not is_parameter(name)]
+    of_topics = [row for name in altering for row in _of_topic(name)]
+    others = [name.rpartition(".")[2] if is_of_topic(name) else name for name in names]
+    others = [other for name, other in zip(names, others, strict=True) if name not in altering]
     takers = list(TAKERS[takes](options)) if others else []
     table = [*of_topics, *(row for name in others for row in _answer(name, takers))]
     print_table(["parameter", "of", "default", "unit", "accepts", "meaning"], table)

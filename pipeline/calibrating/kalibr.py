@@ -32,24 +32,34 @@ def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
       - [0, 0, 1, 0]
       - [0, 0, 0, 1]
       timeshift_sensor_body: -0.15
+    >>> print(kalibr_yaml({"/gps2/fix.fix_delay_s": 0.2}, []).removeprefix(HEAD).strip())
+    /gps2/fix:
+      timeshift_sensor_body: -0.2
     """
     sensors: dict[str, list[str]] = {}
-    if {*LEVER} & {*values}:
-        arm = np.array([values.get(name, 0.0) for name in LEVER])
-        sensors["fix"] = _transform(np.eye(3), -arm)
-    if HEADING in values:
-        turned = Rotation.from_euler("z", values[HEADING]).as_matrix()
-        sensors["heading"] = _transform(turned.T, np.zeros(3))
-    if {*MOUNTING} & {*values}:
-        angles = [values.get(name, 0.0) for name in reversed(MOUNTING)]
-        turned = Rotation.from_euler("ZYX", angles).as_matrix()
-        sensors["inertial"] = _transform(turned.T, np.zeros(3))
-    for name, value in values.items():
-        if name.endswith(DELAY):
-            shift = f"timeshift_sensor_body: {-value:.6g}"
-            sensors.setdefault(name.removesuffix(DELAY), []).append(shift)
-        elif name not in (*LEVER, *MOUNTING, HEADING):
-            sensors.setdefault("errors", []).append(f"{name}: {value:.6g}")
+    for topic in dict.fromkeys(name.rpartition(".")[0] for name in values):
+        own = {
+            name.rpartition(".")[2]: value
+            for name, value in values.items()
+            if name.rpartition(".")[0] == topic
+        }
+        if {*LEVER} & {*own}:
+            arm = np.array([own.get(name, 0.0) for name in LEVER])
+            sensors[topic or "fix"] = _transform(np.eye(3), -arm)
+        if HEADING in own:
+            turned = Rotation.from_euler("z", own[HEADING]).as_matrix()
+            sensors[topic or "heading"] = _transform(turned.T, np.zeros(3))
+        if {*MOUNTING} & {*own}:
+            angles = [own.get(name, 0.0) for name in reversed(MOUNTING)]
+            turned = Rotation.from_euler("ZYX", angles).as_matrix()
+            sensors[topic or "inertial"] = _transform(turned.T, np.zeros(3))
+        for name, value in own.items():
+            if name.endswith(DELAY):
+                shift = f"timeshift_sensor_body: {-value:.6g}"
+                sensors.setdefault(topic or name.removesuffix(DELAY), []).append(shift)
+            elif name not in (*LEVER, *MOUNTING, HEADING):
+                key = f"{topic}.{name}" if topic else name
+                sensors.setdefault("errors", []).append(f"{key}: {value:.6g}")
     unknown = f"# not determined, as they were at the start: {', '.join(held)}\n" if held else ""
     blocks = [f"{name}:\n" + "".join(f"  {line}\n" for line in lines) for name, lines in sensors.items()]
     return HEAD + unknown + "".join(blocks)

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
+from recorders.parameters import field_of
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
+from recorders.plausibility.stamps import MOST_LOST
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
@@ -101,7 +103,7 @@ def undone_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
         found += [
             (kind, topic)
             for name, kind, topic in named
-            if getattr(each.parameters, name) != fields[name].default
+            if getattr(each.parameters, field_of(name)) != fields[name.rpartition(".")[2]].default
         ]
     return found
 
@@ -252,9 +254,10 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
         multiples = np.rint(steps / usual)
         is_regular = np.abs(steps / usual - multiples) < 0.2
         gaps = np.flatnonzero(is_regular & (multiples > 1) & (multiples <= LONG_GAP))
-        if np.mean(is_regular) > REGULAR and len(gaps) > LOST * len(steps) and not _are_bursts(gaps):
-            lost = int(np.sum(multiples[gaps] - 1))
-            share = lost / (lost + len(stamps_ns))
+        lost = int(np.sum(multiples[gaps] - 1))
+        share = lost / (lost + len(stamps_ns))
+        is_lossy = len(gaps) > LOST * len(steps) and share <= MOST_LOST
+        if np.mean(is_regular) > REGULAR and is_lossy and not _are_bursts(gaps):
             yield Finding(
                 "lost messages",
                 stream.topic,

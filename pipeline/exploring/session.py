@@ -10,6 +10,7 @@ from typing import Any
 
 import tomli_w
 
+from pipeline.altering.changes import is_of_topic
 from pipeline.altering.sources import setting_of, split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import replay as replayed
@@ -23,7 +24,7 @@ from pipeline.tuning.objective import Run, in_memory
 from pipeline.tuning.tuning import OPEN, tune
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.parameters import flat, merge, nested
+from recorders.parameters import field_of, flat, merge, nested
 from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import LogSource, MemorySource
@@ -224,7 +225,8 @@ class Session:
         ]
         if self.estimated:
             words.append(f"--set {shlex.quote(f'estimate={[*self.estimated]}')}")
-            words += [f"--set estimate_sigma.{name}={each!r}" for name, each in self.estimated.items()]
+            sigmas = {field_of(name): sigma for name, sigma in self.estimated.items()}
+            words += [f"--set estimate_sigma.{name}={sigma!r}" for name, sigma in sigmas.items()]
         return " ".join([*words, *setting_text(values)])
 
     def _bound(
@@ -234,7 +236,7 @@ class Session:
 
     def _takes(self, label: str, name: str) -> bool:
         [names] = parameters_by_label({label: self.filters[label]}).values()
-        return name.partition(".")[0] in names
+        return ("of_topics" if is_of_topic(name) else name.partition(".")[0]) in names
 
 
 def _set_to(label: str, value: Any) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.output.words import MINUS, number
 from pipeline.tuning.tuning import value_at_start
 from recorders.errors import BadInput
-from recorders.parameters import bounds_of, describe
+from recorders.parameters import bounds_of, describe, field_of
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.foreign.description import ForeignParameters
@@ -139,9 +139,9 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
             continue
         meanings = {entry.name: entry for entry in describe(type(each.parameters))}
         for name, group in _groups(label, each).items():
-            if name in found or name not in meanings:
+            if name in found or field_of(name) not in meanings:
                 continue
-            entry = meanings[name]
+            entry = meanings[field_of(name)]
             slider = _slider(name, group, entry.meaning, entry.unit, source, each)
             if slider is not None:
                 found[name] = slider

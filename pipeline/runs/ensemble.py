@@ -21,6 +21,7 @@ from pipeline.runs.settings import meanings_of
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
 from recorders.log.impossible import Rejections
+from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
@@ -279,12 +280,26 @@ def bind_from(
 
 
 def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
-    """Return the parameters of estimators by label, as JSON has them; those that are None are unused."""
+    """Return the parameters of estimators by label, as JSON has them; those that are None are unused.
+
+    Those that topics have for themselves are in a table of the topic.
+    """
     return {
-        each.name.partition("/")[0]: each.parameters.model_dump(mode="json", exclude_none=True)
+        each.name.partition("/")[0]: _as_set(each.parameters)
         for each in bound
         if each.parameters is not None
     }
+
+
+def _as_set(parameters: Parameters) -> dict[str, Any]:
+    values = parameters.model_dump(mode="json", exclude_none=True)
+    owned: Mapping[str, tuple[str, str]] = getattr(type(parameters), "OWNED", {})
+    if owned:
+        values.pop("of_topics", None)
+    for own, (topic, name) in owned.items():
+        if own in values:
+            values.setdefault(topic, {})[name] = values.pop(own)
+    return values
 
 
 def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str]]:

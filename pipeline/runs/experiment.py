@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
-from pipeline.altering.changes import is_of_topic
+from pipeline.altering.changes import by_topic, is_of_topic
 from pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
@@ -285,16 +285,18 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
     part, names = _parameters_of_source(experiment)
     own = parameters_by_label(experiment.estimators) if settings else {}
     placed: dict[str, Any] = {}
-    for key, value in settings.items():
+    for key, value in by_topic(settings).items():
         if key in entries:
             place: dict[str, Any] = {key: value}
-        elif is_of_topic(key):
+        elif is_of_topic(key) and not isinstance(value, Mapping):
             place = {"alterations": {key: value}}
         elif key in experiment.estimators:
             place = {"estimators": {key: value}}
         elif key in names:
             place = {part: {"parameters": {key: value}}}
-        elif takers := [label for label, known in own.items() if key in known]:
+        elif takers := [
+            label for label, known in own.items() if ("of_topics" if is_of_topic(key) else key) in known
+        ]:
             of_all = {"estimators": {label: {key: value} for label in takers}}
             placed = merge(of_all, placed)  # what is set for one estimator counts more
             continue

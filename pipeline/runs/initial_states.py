@@ -20,7 +20,12 @@ from replay.engine.replaying.estimator import Bound
 from replay.engine.replaying.late import Late, parse_late
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.engine.vectors.components import match_components, match_tangent, stated_components
+from replay.engine.vectors.components import (
+    in_body_axes,
+    match_components,
+    match_tangent,
+    stated_components,
+)
 from replay.engine.vectors.tangent import named_now, tangent_components, truth_at
 from replay.judging.errors.evaluation import split_topic
 
@@ -145,7 +150,9 @@ def start_from(
 
 def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clock) -> Stream:
     is_late = source.start_ns is not None and len(prior) and prior.times(order)[0] < source.start_ns
-    return origin(label, prior, source.start_ns) if is_late and source.start_ns else prior
+    if not is_late or not source.start_ns:
+        return prior
+    return origin(label, in_body_axes(prior), source.start_ns)
 
 
 def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
@@ -216,7 +223,7 @@ def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[s
 def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int) -> Stream:
     components = _components(prior, estimates.name)
     topic = _estimate_topic(estimates, label, prior, components)
-    stream = estimates.read([topic])[topic]
+    stream = in_body_axes(estimates.read([topic])[topic])
     where = f"{estimates.name}: topic {topic}, to start from"
     columns = match_components(stream.metadata, components, where)
     tangent = match_tangent(stream.metadata, components, where)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.changes import is_of_topic
+from pipeline.altering.changes import by_topic, is_of_topic, is_parameter
 from recorders.errors import BadInput, choices
 from recorders.parameters import in_few_words, meanings, merge, parse_settings
 from recorders.parsing import read_toml
@@ -41,8 +41,13 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
 
 def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the settings of topics among KEY=VALUE, by `/TOPIC.WHAT`; and the texts of all others."""
-    of_topics = [text for text in texts if is_of_topic(text.strip())]
+    of_topics = [text for text in texts if _alters(text)]
     return parse_settings(of_topics), [text for text in texts if text not in of_topics]
+
+
+def _alters(text: str) -> bool:
+    key = text.partition("=")[0].strip()
+    return is_of_topic(key) and not is_parameter(key)
 
 
 def settings_of_estimators(
@@ -77,7 +82,7 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 
     Raises BadInput where no estimator has such a parameter.
     """
-    labels, chosen = list(base), dict[str, dict[str, Any]]()
+    labels, chosen, settings = list(base), dict[str, dict[str, Any]](), by_topic(settings)
     for label in labels:
         own = settings.get(label, {})
         if not isinstance(own, dict):
@@ -85,8 +90,9 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
         chosen[label] = dict(own)
     known = parameters_by_label({label: {**base[label], **chosen[label]} for label in labels})
     for key in [each for each in settings if each not in chosen]:
-        takers = [label for label in chosen if key in known[label]]
-        if is_of_topic(key):
+        is_table = is_of_topic(key) and isinstance(settings[key], Mapping)
+        takers = [label for label in chosen if ("of_topics" if is_table else key) in known[label]]
+        if is_of_topic(key) and not is_table:
             raise BadInput(f"--set {key}: this command takes no settings of topics; leave it out")
         if not takers and key in OPTIONS:
             raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pipeline.altering.changes import is_of_topic
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
@@ -41,7 +42,7 @@ from pipeline.tuning.search import (
     least_of_grid,
 )
 from recorders.errors import BadInput, choices
-from recorders.parameters import bounds_of, merge
+from recorders.parameters import bounds_of, field_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.channels import stated
@@ -252,15 +253,16 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
     Raises BadInput where neither the settings nor the log's channels state it.
     """
     value: Any = bound.parameters
-    for part in name.split("."):
+    for part in [field_of(name)] if is_of_topic(name) else name.split("."):
         value = value.get(part) if isinstance(value, Mapping) else getattr(value, part, None)
     if value is not None:
         return value, False
-    if isinstance(bound, Recursive) and name in bound.assumed:
-        return bound.assumed[name], True
-    read = [source.topics[topic] for topic in (*bound.streams, *bound.static)]
+    if isinstance(bound, Recursive) and field_of(name) in bound.assumed:
+        return bound.assumed[field_of(name)], True
+    topic, _, own = name.rpartition(".") if is_of_topic(name) else ("", "", name)
+    read = [source.topics[each] for each in (topic, *bound.streams, *bound.static) if each]
     kind = None if bound.parameters is None else type(bound.parameters)
-    return stated(read, name, kind), False
+    return stated(read, own, kind), False
 
 
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:

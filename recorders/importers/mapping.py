@@ -9,7 +9,7 @@ units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }   # of the sour
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput, choices
 from recorders.importers.units import conversion
 from recorders.log import Schema, schemas
-from recorders.models.orientation import compose, require_unit
+from recorders.models.orientation import compose
 from recorders.parameters import Parameters
 
 Floats = NDArray[np.float64]
@@ -35,6 +35,11 @@ OneOrMore: TypeAlias = Value | list[Value]
 Read = Callable[[str], NDArray]
 # Whether each of n messages is where a source has one of some values.
 Holds = Callable[[str, Sequence[Source]], NDArray[np.bool_]]
+
+# What becomes of messages whose quaternions are far from unit length.
+Quaternions = Literal["refuse", "normalise", "skip"]
+NOT_UNIT = "a quaternion that is not of unit length"
+SCALED = "a quaternion that was scaled to unit length"
 
 # How many numbers a vector has that may be missing.
 _WIDTHS = {"covariance_m2": 9, "covariance_m2ps2": 9, "covariance": 36, "covariance_ut2": 9}
@@ -88,6 +93,8 @@ class StreamMapping(Parameters):
             are turned, and orientations become the body's.
         components: components of a vector that states them, with commas.
         kinds: kinds of these components, with commas; linear without any.
+        rotation_axes: of estimates, the axes of the rotations that their covariance is of: the body's,
+            or those of the world, as in ROS.
         states: numbers that the channel states, for parameters of models: noise densities, say.
     """
 
@@ -105,6 +112,7 @@ class StreamMapping(Parameters):
     mounting_deg: tuple[float, float, float] | None = None
     components: str = ""
     kinds: str = ""
+    rotation_axes: Literal["body", "world"] = "body"
     states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
@@ -128,7 +136,8 @@ class StreamMapping(Parameters):
         if not self.components:
             return stated
         linear = ",".join("linear" for _ in self.components.split(","))
-        return {**stated, "components": self.components, "kinds": self.kinds or linear}
+        axes = {"rotation_axes": "world"} if self.rotation_axes == "world" else {}
+        return {**stated, "components": self.components, "kinds": self.kinds or linear, **axes}
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:
@@ -230,13 +239,6 @@ class _Maker(NamedTuple):
             factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
             offsets = self._spread(mapping.offsets.get(name, 0.0), width, f"offsets of {name}")
             values = (values * factors + offsets) * self._conversions(name, width)
-        which = _quaternion_of(mapping) if name in _STATED else []
-        if which:
-            values = values.astype(float)
-            known = np.isfinite(values[:, which]).all(axis=1)
-            values[np.ix_(known, which)] = require_unit(
-                values[np.ix_(known, which)], f"{self.where}: the quaternions of {name}", _UNIT_TOLERANCE
-            )
         return values
 
     def _covariance(self, name: str, stretch: Floats) -> Floats:
@@ -317,7 +319,7 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
         whole = np.kron(np.eye(len(vectors)), turn.as_matrix())
         square = columns[covariance].reshape(-1, width, width)
         columns[covariance] = (whole @ square @ whole.T).reshape(len(square), -1)
-    which = _quaternion_of(mapping)
+    which = _quaternion_of(mapping.kinds)
     if "quaternion" in columns:
         columns["quaternion"] = _turned_back(columns["quaternion"], turn)
     elif "state" in columns and which:
@@ -329,9 +331,9 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
         )
 
 
-def _quaternion_of(mapping: StreamMapping) -> list[int]:
+def _quaternion_of(kinds: str) -> list[int]:
     """Find where a vector has the parts of a quaternion, if it has one."""
-    return [index for index, kind in enumerate(mapping.kinds.split(",")) if kind == "quaternion"]
+    return [index for index, kind in enumerate(kinds.split(",")) if kind == "quaternion"]
 
 
 def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
@@ -359,9 +361,75 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
         is_whole = is_finite.all()  # then its rows need no look, which would take longer
         if is_finite.size and entry.kind != "identifier":
             finite.append(np.ones(size, bool) if is_whole else is_finite.any(axis=1))
-        if not (is_whole or entry.may_be_nan):
+        if not (is_whole or entry.may_be_nan or entry.may_be_partial):
             lacks |= ~is_finite.all(axis=1)
     return lacks | ~np.any(finite, axis=0) if finite else lacks
+
+
+class OffUnit(NamedTuple):
+    """Holds which messages (n,) are left out for their quaternions, and whose are scaled."""
+
+    left_out: NDArray[np.bool_]
+    scaled: NDArray[np.bool_]
+
+
+def off_unit(
+    where: str,
+    columns: Mapping[str, NDArray],
+    kinds: str,
+    taken: NDArray[np.bool_],
+    quaternions: Quaternions,
+) -> OffUnit:
+    """Find the messages whose quaternions are far from unit length.
+
+    Args:
+        where: what a message begins with.
+        columns: of messages (n,), as `with_unit_quaternions` takes them.
+        kinds: of the components of a state or estimate, with commas.
+        taken: (n,), the messages that are looked at.
+        quaternions: what becomes of the messages. A quaternion of zeros cannot be scaled.
+
+    Raises BadInput if there are any, and they are neither scaled nor left out.
+    """
+    off, zero = np.zeros((2, len(taken)), bool)
+    for name, which in _quaternions_in(columns, kinds):
+        length = np.linalg.norm(columns[name][:, which], axis=1)
+        is_off = taken & (np.abs(length - 1.0) > _UNIT_TOLERANCE)
+        if is_off.any() and quaternions == "refuse":
+            count = int(is_off.sum())
+            raise BadInput(
+                f"{where}: {count} of its quaternions {'is' if count == 1 else 'are'} not of unit "
+                f"length, the first of length {length[is_off.argmax()]:.9g}; check what they are, scale "
+                "them with --set quaternions=normalise, or leave them out with --set quaternions=skip"
+            )
+        off |= is_off
+        zero |= is_off & (length == 0.0)
+    return OffUnit(off, np.zeros_like(off)) if quaternions == "skip" else OffUnit(zero, off & ~zero)
+
+
+def with_unit_quaternions(columns: Mapping[str, NDArray], kinds: str) -> dict[str, NDArray]:
+    """Scale the quaternions among columns to unit length: of the field, or in a state or estimate.
+
+    Args:
+        columns: (n,) or (n, width), by field.
+        kinds: of the components of a state or estimate, with commas.
+    """
+    made = dict(columns)
+    for name, which in _quaternions_in(columns, kinds):
+        column = columns[name].astype(float)
+        column[:, which] /= np.linalg.norm(column[:, which], axis=1, keepdims=True)
+        made[name] = column
+    return made
+
+
+def _quaternions_in(columns: Mapping[str, NDArray], kinds: str) -> Iterator[tuple[str, list[int]]]:
+    """Yield the columns with quaternions, and where they have their parts."""
+    for name in columns:
+        which = (
+            list(range(4)) if name == "quaternion" else _quaternion_of(kinds) if name in _STATED else []
+        )
+        if which:
+            yield name, which
 
 
 def checked(where: str, field: str, column: NDArray) -> NDArray:
@@ -373,7 +441,7 @@ def checked(where: str, field: str, column: NDArray) -> NDArray:
         column: (n,) or (n, width), in the field's unit.
 
     Returns:
-        The same shape; quaternions are scaled to unit length.
+        The same shape.
 
     Raises BadInput for values that nothing can mean.
     """
@@ -384,8 +452,6 @@ def checked(where: str, field: str, column: NDArray) -> NDArray:
             f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}; check the "
             "column and its unit"
         )
-    if field == "quaternion":
-        return require_unit(column, f"{where}: its quaternions", _UNIT_TOLERANCE)
     is_infinite = np.isinf(column) if column.dtype.kind == "f" else np.zeros(0, bool)
     return np.where(is_infinite, np.nan, column) if is_infinite.any() else column
 

@@ -10,6 +10,12 @@ from recorders.plausibility.finding import Finding
 from recorders.plausibility.turns import quietest
 
 LARGEST_SHARE = 0.9
+UNITS = {each.full_name for each in (schemas.INERTIAL_SAMPLE, schemas.MAGNETIC_FIELD)}
+MEASURED = {
+    "specific_force_mps2": "specific forces",
+    "turn_rate_radps": "turn rates",
+    "magnetic_field_ut": "magnetic fields",
+}
 # Of the axis that is up, and its sign: roll, pitch, yaw that turn it to z.
 UPRIGHT = {
     (0, 1): (0, -90, 0),
@@ -21,11 +27,12 @@ UPRIGHT = {
 
 
 def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose forces or turn rates are exactly zero throughout, as no sensor's are."""
-    if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
+    """Find units whose forces, turn rates or fields are exactly zero throughout, as no sensor's are."""
+    if stream.schema.full_name not in UNITS or len(stream) < FEWEST:
         return
-    for field, what in (("specific_force_mps2", "specific forces"), ("turn_rate_radps", "turn rates")):
-        if not stream[field].any():
+    for field, what in MEASURED.items():
+        column = stream.columns.get(field, np.empty(0))
+        if column.size and not column.any():
             yield Finding(
                 "values",
                 stream.topic,
@@ -33,7 +40,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(len(stream)),
                 f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
                 "not measured, and a filter that this topic drives takes them for measurements",
-                mapping="import the half that was measured as a VectorMeasurement",
+                mapping="import only what was measured, a part of a unit as a VectorMeasurement",
             )
 
 

@@ -338,7 +338,9 @@ SCORE_VECTOR = _declare(
     _identifier("gallery_id"),
     _vector("scores", may_be_nan=True),
 )
-VECTOR_MEASUREMENT = _declare("VectorMeasurement", "A measurement of any other kind.", _vector("value"))
+VECTOR_MEASUREMENT = _declare(
+    "VectorMeasurement", "A measurement of any other kind.", _vector("value", may_be_partial=True)
+)
 COURSE_FIX = _declare(
     "CourseFix",
     "A position in the log's plane (east, north), course over ground clockwise from north, and speed.",

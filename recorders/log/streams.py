@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.log.schemas import NUMPY_TYPES, Kind, Schema
 
 if TYPE_CHECKING:
@@ -191,12 +191,8 @@ def stream_of(
         if entry.may_be_absent and entry.kind == "vector"
     }
     given = {**absent, **given}
-    names = [entry.name for entry in schema]
-    if given.keys() != set(names):
-        raise BadInput(
-            f"topic {topic}: {schema.full_name} has the fields {', '.join(names)}; "
-            f"got {', '.join(given)}"
-        )
+    if given.keys() != {entry.name for entry in schema}:
+        raise BadInput(f"topic {topic}: {_misfit(schema, given)}")
     found = {
         entry.name: _as_column(topic, f"field {entry.name}", given[entry.name], entry.kind)
         for entry in schema
@@ -205,6 +201,24 @@ def stream_of(
     stream = Stream(topic, schema, published, logged, found, position, dict(metadata or {}))
     check_stream(stream, allow_nan=allow_nan)
     return stream
+
+
+def _misfit(schema: Schema, given: Mapping[str, ArrayLike]) -> str:
+    """Say how the fields that are given differ from those of the schema."""
+    name, clock = schema.full_name, "sensor_time_ns"
+    own = [entry.name for entry in schema if entry.name != clock]
+    if clock not in {entry.name for entry in schema}:
+        return (
+            f"the schema {name} lacks the sensor's own clock, which every message has; declare "
+            f'Field("{clock}", "time_ns") as its first field'
+        )
+    unknown = [each for each in given if each not in (clock, *own)]
+    if unknown:
+        return f"{name} has no field {unknown[0]}; {choices(unknown[0], own)}"
+    missing = [entry for entry in schema if entry.name not in given]
+    may = [entry.name for entry in missing if entry.may_be_nan]
+    fix = f"; fill {', '.join(may)} with NaN if nothing was measured" if may else ""
+    return f"{name} also needs {', '.join(entry.name for entry in missing)}{fix}"
 
 
 def computed_stream(

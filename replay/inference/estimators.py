@@ -21,11 +21,20 @@ from replay.inference.model.augmentation import (
     augmented,
     augmented_stage,
     begin,
+    check_augmentable,
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import in_its_plane, offers_of, roles_of, topics_of
+from replay.inference.model.binding import (
+    first_and_more,
+    in_its_plane,
+    offers_of,
+    roles_of,
+    topics_of,
+    with_more,
+)
 from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.own_parameters import check_tables, with_own_parameters
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
     assumed_of,
@@ -204,7 +213,7 @@ def _bind_fitting(
     named = given.pop("model", None)
     if named is not None:
         models = {named: load("models", named, Model)}
-    renamed = given.get("topics") or {}
+    renamed, _ = first_and_more(given.get("topics") or {})
     asked = {name: roles_of(model) for name, model in models.items()} if renamed else {}
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
@@ -253,26 +262,31 @@ def bind_model(
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
-    added = estimated(label, model, parameters)
-    lacking = method.lacks(augmented(model, added.parameters, added.errors))
-    if added.names and lacking:
-        raise BadInput(
-            f"estimator {label}: with estimate = {', '.join(parameters.estimate)} the model lacks "
-            f"{lacking}, which this method needs"
-        )
-    renamed = parameters.topics or {}
-    _check_topics(label, model, topics, renamed)
-    stages: dict[tuple[Sensor, ...], Stage] = {}  # one for all that have the same sensors
-    for found in topics_of(model, topics, renamed):
-        found = in_its_plane(label, model, found, topics)
+    check_augmentable(f"estimator {label}", model)
+    renamed, more = first_and_more(parameters.topics or {})
+    _check_topics(label, model, topics, renamed, more)
+    things = [with_more(label, model, each, topics, more) for each in topics_of(model, topics, renamed)]
+    tables, kind, given = parameters.of_topics or {}, model, parameters
+    check_tables(label, model, things, tables)
+    stages: dict[tuple[Model, tuple[Sensor, ...]], Stage] = {}  # one for all with the same sensors
+    for found in things:
+        found = in_its_plane(label, kind, found, topics)
+        model, found, parameters = with_own_parameters(kind, found, tables, given)
+        added = estimated(label, model, parameters)
+        lacking = method.lacks(augmented(model, added.parameters, added.errors))
+        if added.names and lacking:
+            raise BadInput(
+                f"estimator {label}: with estimate = {', '.join(parameters.estimate)} the model lacks "
+                f"{lacking}, which this method needs"
+            )
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        if own.sensors not in stages:
+        if (model, own.sensors) not in stages:
             try:
-                stages[own.sensors] = stage_of(*augmented_stage(own, added))
+                stages[model, own.sensors] = stage_of(*augmented_stage(own, added))
             except BadInput as error:
                 raise BadInput(f"estimator {label}: {error}") from error
-        stage = stages[own.sensors]
+        stage = stages[model, own.sensors]
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
         settings = with_gauss_markov(numbers, added)
@@ -309,11 +323,16 @@ def _check_role(label: str, role: str, roles: Collection[str]) -> None:
 
 
 def _check_topics(
-    label: str, model: Model, topics: Mapping[str, Topic], renamed: Mapping[str, str]
+    label: str,
+    model: Model,
+    topics: Mapping[str, Topic],
+    renamed: Mapping[str, str],
+    more: Mapping[str, Sequence[str]],
 ) -> None:
     """Raise BadInput where a topic stands for one that the model does not ask for, or is not there."""
-    refuse_named_truths(label, renamed, topics, {model.truth})
-    for role, name in renamed.items():
+    named = [*renamed.items(), *((role, name) for role, names in more.items() for name in names)]
+    for role, name in named:
+        refuse_named_truths(label, {role: name}, topics, {model.truth})
         _check_role(label, role, roles_of(model))
         if name and not any(topic.endswith(f"/{name.removeprefix('/')}") for topic in topics):
             raise BadInput(

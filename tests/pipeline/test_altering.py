@@ -13,8 +13,10 @@ import pytest
 
 import fuselog as fl
 from pipeline.altering import alterations as put
+from pipeline.altering.changes import bare
 from pipeline.altering.sources import alter
 from pipeline.diagnosing.battery.car import car
+from pipeline.diagnosing.hypotheses.components import _columns
 from recorders.log.streams import concatenate
 from recorders.models.orientation import heading
 from recorders.parameters import parse_settings
@@ -172,6 +174,28 @@ def test_what_is_set_undoes_its_fault_in_the_columns(
             np.testing.assert_array_equal(after[name], column)
 
 
+@pytest.mark.parametrize(
+    ("components", "names"),
+    [("left_mps,right_mps", ["left_mps", "right_mps"]), ("", ["value_x", "value_y"])],
+)
+def test_entries_of_a_measured_vector_have_names(components: str, names: list[str]) -> None:
+    """Those that its channel states, for settings and in what a diagnosis says."""
+    stamps_ns = BEGIN_NS + np.arange(4) * 10**9
+    stream = fl.make_stream(
+        "/wheels",
+        fl.schemas.VECTOR_MEASUREMENT,
+        stamps_ns,
+        metadata={"components": components} if components else {},
+        value=np.ones((4, 2)),
+    )
+    assert [name for _, _, name in _columns(stream)] == names
+    source = fl.MemorySource({"/wheels": stream}, fl.RunMetadata("wheels", {}, 0, BEGIN_NS), "wheels")
+    for place, name in enumerate(names):
+        found = alter(source, {f"/wheels.{bare(name)}_scale": 3.0}).read(["/wheels"])["/wheels"]["value"]
+        assert found[:, place].tolist() == [3.0] * 4
+        assert found[:, 1 - place].tolist() == [1.0] * 4
+
+
 def test_stated_variances_and_exchanged_topics() -> None:
     scaled = alter(_readings(), {"/compass.covariance_scale": 4})
     assert scaled.read(["/compass"])["/compass"].metadata["covariance_rad2"] == "2.0"
@@ -181,6 +205,20 @@ def test_stated_variances_and_exchanged_topics() -> None:
     found = alter(both, {"/fix.exchanged": "/other"}).read(["/fix", "/other"])
     np.testing.assert_array_equal(found["/fix"]["position_m"], PLACES + 7.0)
     np.testing.assert_array_equal(found["/other"]["position_m"], PLACES)
+
+
+def test_a_setting_says_that_truths_cover_some_targets() -> None:
+    """As the metadata of a truth does, and the other way; the result names it."""
+    log = fl.record("crossing", duration_s=20.0)
+    counts = {}
+    for value in (None, "some", "all"):
+        key = "/target1/truth.covers"
+        replay = fl.replay(log, "tracker", set={} if value is None else {key: value})
+        counts[value] = set(replay.metrics["quantity"])
+        assert any("cover some of the targets" in each for each in replay.losses) == (value == "some")
+    assert "unreferenced_targets" in counts["some"]
+    assert counts["all"] == counts[None]
+    assert "unreferenced_targets" not in counts["all"]
 
 
 @pytest.mark.paper
@@ -316,6 +354,8 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
         (f"{SEEN}.range_scale=inf", "expected a factor, such as -1 or 3.6"),
         (f"{SEEN}.range_matrix=1", "range_m is no vector of three entries"),
         (f"{SEEN}.range_sign=2", "of a topic can be set"),
+        ("/robot1/truth.covers=most", "expected some or all"),
+        (f"{SEEN}.covers=some", "only truths cover targets"),
         (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
         (f"{SEEN}.exchanged={ODOMETRY}", "only topics of one type are exchanged"),
         ("/landmarks.exchanged=3", "expected two numbers, such as 3,9, or another topic"),

@@ -23,6 +23,7 @@ from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
+from recorders.linting.lint import lint
 from replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
@@ -157,6 +158,35 @@ def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySo
     told = first(run, turn_noise_density=0.1)
     assert (told.kind, told.topic) == ("process noise", "turn_noise_density")
     assert "so that Q is too large" in told.words
+
+
+@pytest.mark.parametrize(
+    ("steps", "is_lossy"),
+    [
+        (lambda rng: rng.integers(1, 6, 600), False),
+        (lambda rng: rng.choice([1, 2, 5], 600), False),
+        (lambda rng: rng.geometric(0.3, 600), False),
+        (lambda rng: rng.geometric(0.95, 600), True),
+        (lambda rng: rng.geometric(0.6, 600), True),
+        (lambda rng: 1 + 9 * (rng.random(600) < 0.03), True),
+    ],
+)
+def test_lint_and_diagnose_agree_on_lost_messages(
+    steps: Callable[[np.random.Generator], Any], is_lossy: bool
+) -> None:
+    """Lost at random or in a row; not of an irregular topic whose stamps are of a clock's ticks."""
+    rng = np.random.default_rng(3)
+    stamps_ns = fl.simulation_stamps_ns(0.02 * np.cumsum(steps(rng)))
+    stream = fl.make_stream(
+        "/odometry",
+        fl.schemas.ODOMETRY,
+        stamps_ns,
+        forward_mps=rng.normal(size=600),
+        turn_radps=rng.normal(size=600),
+    )
+    told = [each.words for each in of_messages([stream], 0) if "are lost" in each.words]
+    linted = [each.words for each in lint([{"/odometry": stream}]) if each.cause == "lost messages"]
+    assert (bool(told), bool(linted)) == (is_lossy, is_lossy), told + linted
 
 
 @pytest.mark.paper

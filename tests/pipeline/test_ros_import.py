@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from scipy.spatial.transform import Rotation
 
 import fuselog as fl
+from pipeline.api.estimates import judge_estimates
+from recorders.recording import import_log
+from replay.distributions import chi2
+from tests.recorders.test_ros import START_NS, STEP_NS, Maker, Sent, imported, refusal, write_bag
 from tests.replay.timeline.test_timeline import read
 
 
@@ -125,3 +130,36 @@ def test_an_imported_odometry_is_replayed(real_data: Path, tmp_path: Path) -> No
     travelled_m = np.hypot(*np.diff(own["position_m"][:, :2], axis=0).T).sum()
     assert travelled_m > 10.0
     assert apart_m.max() < 0.02 * travelled_m
+
+
+def test_the_poses_of_another_filter_are_judged(tmp_path: Path) -> None:
+    """NEES of a filter whose odometry states right covariances, about the fixed axes as ROS has them."""
+    make, rng, sent = Maker(), np.random.default_rng(0), list[Sent]()
+    covariance = np.diag([0.01, 0.04, 0.09, 1e-4, 4e-4, 0.04])
+    for step in range(300):
+        at = START_NS + step * STEP_NS
+        turn = Rotation.from_euler("zyx", [0.05 * step, 0.8 * np.sin(0.07 * step), np.cos(0.05 * step)])
+        error = rng.multivariate_normal(np.zeros(6), covariance)
+        estimate = Rotation.from_rotvec(error[3:]) * turn
+        poses = (
+            ("/odometry/filtered", "nav_msgs/msg/Odometry", "pose__pose", error[:3], estimate),
+            ("/mocap", "geometry_msgs/msg/PoseStamped", "pose", np.zeros(3), turn),
+        )
+        for topic, name, path, place, orientation in poses:
+            given = {f"{path}__position__{axis}": float(place[i]) for i, axis in enumerate("xyz")}
+            given |= {
+                f"{path}__orientation": orientation.as_quat(),
+                "pose__covariance": covariance.ravel(),
+            }
+            sent.append((topic, at, make(name, at, **given)))
+    path = write_bag(tmp_path / "bag", "mcap", sent, make.store)
+    settings = {"estimates": "/odometry/filtered", "truth": "/mocap"}
+    streams, notes = imported(path, **settings)
+    assert set(streams) == {"/truth", "/estimates/odometry_filtered/pose"}
+    why = "since a filter must not read what is from another filter"
+    assert notes[f"/odometry/filtered: odometry_twist left out, {why}"] == "300"
+    import_log("ros", path, settings, tmp_path / "log.mcap")
+    judged = judge_estimates([tmp_path / "log.mcap"], comparison={}).judge.metrics
+    low, high = np.asarray(chi2.ppf(np.array([0.025, 0.975]), 6 * 300)) / 300
+    assert low < judged["odometry_filtered.nees"] < high
+    assert "has no topic /mocup" in refusal(path, estimates="/mocup")

@@ -261,6 +261,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "values",
         "turn rates are exactly zero in all",
     ),
+    "no field": (field(lambda m: 0.0 * m), MAG, "values", "fields are exactly zero in all 600"),
     "upright": (force(lambda f: f[:, [2, 1, 0]]), IMU, "mounting", "x axis up"),
     "variance -1": (variance(setting(0, 600, -1.0, 0)), FIX, "covariance", "-1"),
     "variance 0": (variance(setting(0, 9, 0.0)), FIX, "covariance", "zero in 9"),

@@ -174,13 +174,28 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         ({"scan_id": [1, 2**32]}, "field scan_id holds 4294967296, which uint32 cannot hold"),
         ({"scan_id": [1]}, "field scan_id has 1 values for 2 messages"),
         ({"scan_id": [None, 2]}, "field scan_id is not numeric"),
-        ({"speed": [1, 2]}, "fuselog.Scan has the fields sensor_time_ns, scan_id, detections; got"),
+        ({"speed": [1, 2]}, "fuselog.Scan has no field speed; there are: scan_id, detections$"),
     ],
 )
 def test_a_stream_that_cannot_be_kept_exactly_is_refused(changes, sentence):
     """Nothing is cut, wrapped or rounded on its way into a log."""
     with pytest.raises(BadInput, match=f"^topic /scan: .*{sentence}"):
         scans(**changes)
+
+
+def test_what_a_stream_lacks_is_named():
+    """The fields that are missing, and not those that were given or are made."""
+    force = np.zeros((2, 3))
+    given = {"specific_force_mps2": force, "turn_rate_radps": force}
+    with pytest.raises(
+        BadInput, match=r"InertialSample also needs magnetic_field_ut; fill magnetic_field"
+    ):
+        make_stream("/imu", schemas.INERTIAL_SAMPLE, [1, 2], **given)
+    with pytest.raises(BadInput, match=r"^topic /f: fuselog.Detection also needs scan_id$"):
+        make_stream("/f", schemas.DETECTION, [1, 2], position_m=force)
+    own = Schema("Wheels", "Speeds of wheels.", (Field("left_mps", "real"),))
+    with pytest.raises(BadInput, match=r'Wheels lacks .* Field\("sensor_time_ns", "time_ns"\)'):
+        make_stream("/wheels", own, [1, 2], left_mps=[1.0, 2.0])
 
 
 def test_nan_is_refused_where_the_schema_does_not_allow_it():

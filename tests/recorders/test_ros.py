@@ -311,7 +311,8 @@ def test_what_the_streams_say(tmp_path: Path) -> None:
     assert inertial.metadata["turn_rate_covariance_rad2ps2"] == "4,0,0,0,5,0,0,0,6"
     assert inertial.metadata["specific_force_covariance_m2ps4"] == ",".join(["nan"] * 9)
     assert "/orientation" not in streams
-    assert notes["/imu: orientation dropped: without an orientation"] == "1"
+    why = "orientation_covariance[0] is -1"
+    assert notes[f"/imu: orientation dropped: without an orientation: {why}"] == "1"
     assert_allclose(streams["/magnetic_field"]["magnetic_field_ut"][0, 0], 20.0)
     assert_allclose(streams["/magnetic_field"]["covariance_ut2"][0], own)
     odometry = streams["/r1/odometry"]
@@ -434,6 +435,34 @@ def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is
     angles = [float(each) for each in re.findall(r"mounting_\w+_rad=(\S+)", told["/inertial, mounting"])]
     vector = np.array([1.0, 2.0, 3.0])
     assert from_mounting(*angles, vector) == pytest.approx(turn.apply(vector), abs=1e-4)
+
+
+def test_quaternions_not_of_unit_length_are_scaled_or_left_out(tmp_path: Path) -> None:
+    """Poses, the truth made of poses, and transforms; zeros have no direction, and are never scaled."""
+    make, pose = Maker(), "geometry_msgs/msg/PoseStamped"
+    message_type = make.store.types["tf2_msgs/msg/TFMessage"]
+    turns = [[0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 1.2, 1.6], [0.0, 0.0, 0.0, 0.0]]
+    sent: list[Sent] = []
+    for step, turn in enumerate(turns):
+        at = START_NS + step * STEP_NS
+        for topic in ("/pose", "/mocap"):
+            sent.append((topic, at, make(pose, at, pose__orientation=turn)))
+        link = make("geometry_msgs/msg/TransformStamped", at, transform__rotation=turn)
+        sent.append(("/tf", at, message_type(transforms=[link])))
+    path = write_bag(tmp_path / "bag", "mcap", sent, make.store)
+    for setting, kept in (("normalise", 2), ("skip", 1)):
+        streams, notes = imported(path, truth="/mocap", quaternions=setting)
+        of_poses = (streams[topic]["quaternion"] for topic in ("/pose/pose", "/tf/map/base_link"))
+        for found in (*of_poses, streams["/truth"]["state"][:, 4:]):
+            assert_allclose(found, [[0.8, 0.0, 0.0, 0.6]] * kept, atol=1e-12)
+        fact = "a quaternion that is not of unit length"
+        for what in ("/pose: pose", "/mocap: truth", "/tf: transforms"):
+            assert notes[f"{what} dropped: {fact}"] == str(3 - kept)
+            scaled = notes.get(f"{what} kept with a quaternion that was scaled to unit length")
+            assert scaled == ("1" if setting == "normalise" else None)
+    assert "topic /pose: 2 of its quaternions are not of unit length" in refusal(path)
+    assert "topic /mocap: 2 of its" in refusal(path, topics="/mocap", truth="/mocap")
+    assert "topic /tf: frame base_link in map: 2 of its" in refusal(path, topics="/tf")
 
 
 def test_a_sqlite_bag(real_data: Path, tmp_path: Path) -> None:
@@ -764,7 +793,9 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
 
     pose = "geometry_msgs/msg/PoseStamped"
     turned = bag("turned", ("/pose", make(pose, pose__orientation=[0.0, 0.0, 0.0, 0.5])))
-    assert "topic /pose: its quaternions: the vector at (0,) has length 0.5" in refusal(turned)
+    assert refusal(turned).startswith(
+        "topic /pose: 1 of its quaternions is not of unit length, the first of length 0.5; check what "
+    )
     far = bag("far", ("/gps", make("sensor_msgs/msg/NavSatFix", latitude=90.5)))
     assert refusal(far) == "topic /gps: a latitude is 90.5 deg, beyond 90; check the column and its unit"
     scan = bag("scan", ("/scan", make("sensor_msgs/msg/LaserScan")), ("/pose", make(pose)))

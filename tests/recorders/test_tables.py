@@ -20,7 +20,7 @@ from recorders.errors import BadInput
 from recorders.importers.tables import blocks, files
 from recorders.importers.tables.blocks import NO_END
 from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
-from recorders.log import Stream, open_log, read_streams
+from recorders.log import Stream, open_log, read_streams, write_log
 from recorders.recording import import_log, import_run
 
 GRAVITY = 9.80665
@@ -632,14 +632,14 @@ becomes = "TruthState"
 fields = { state = ["w", "x", "y", "z"] }
 components = "a_w,a_x,a_y,a_z"
 kinds = "quaternion,quaternion,quaternion,quaternion"
-""", "table.csv: /truth: the quaternions of state: the vector at (0,) has length 1.41421356"),
+""", "table.csv: /truth: 1 of its quaternions is not of unit length, the first of length 1.41421356"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
 [[tables.streams]]
 topic = "/o"
 becomes = "Orientation"
 fields = { quaternion = ["w", "x", "y", "z"] }
 mounting_deg = [180, 0, 0]
-""", "table.csv: /o: its quaternions: the vector at (0,) has length 1.41421356"),
+""", "table.csv: /o: 1 of its quaternions is not of unit length, the first of length 1.41421356"),
 ]  # fmt: skip
 
 
@@ -649,6 +649,45 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(
 ) -> None:
     """Columns, units, times and values that cannot be used."""
     assert sentence in refusal(text, mapping.replace(old, new) if old else mapping)
+
+
+def test_a_measurement_keeps_its_other_components(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """One cell is empty: the others are measured all the same; without any there is no message."""
+    mapping = """[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/wheels"
+becomes = "VectorMeasurement"
+fields = { value = ["left", "right"] }
+components = "left_mps,right_mps"
+"""
+    streams, notes = imported("t,left,right\n1,0.5,0.6\n2,,0.7\n3,,\n4,inf,0.8\n", mapping)
+    nan = np.nan
+    wanted = [[0.5, 0.6], [nan, 0.7], [nan, 0.8]]
+    assert_array_equal(streams["/wheels"]["value"], wanted)
+    assert notes["/wheels: messages left out: NaN or infinite"] == "1"
+    write_log(tmp_path / "log.mcap", streams.values())
+    read = read_streams(open_log(tmp_path / "log.mcap"), ["/wheels"])["/wheels"]
+    assert_array_equal(read["value"], wanted)
+
+
+def test_quaternions_not_of_unit_length_are_scaled_or_left_out(imported: Callable[..., Any]) -> None:
+    """Of an orientation and of a state, each counted."""
+    fields = 'fields = { quaternion = ["w", "x", "y", "z"] }'
+    components = 'components = "a_w,a_x,a_y,a_z"\nkinds = "quaternion,quaternion,quaternion,quaternion"'
+    stream = '[[tables.streams]]\ntopic = "/o"\nbecomes = "Orientation"\n' + fields
+    state = stream.replace("/o", "/truth").replace("Orientation", "TruthState")
+    state = state.replace("quaternion =", "state =") + "\n" + components
+    mapping = f'[[tables]]\ntime = {{ column = "t" }}\n{stream}\n{state}\n'
+    text = "t,w,x,y,z\n1,1,0,0,0\n2,2,0,0,0\n3,0,0,0,0\n"
+    for setting, kept in (("normalise", 2), ("skip", 1)):
+        streams, notes = imported(text, mapping, quaternions=setting)
+        for topic, field in (("/o", "quaternion"), ("/truth", "state")):
+            assert streams[topic][field].tolist() == [[1.0, 0.0, 0.0, 0.0]] * kept
+            left_out = notes[f"{topic}: messages left out: a quaternion that is not of unit length"]
+            assert left_out == str(3 - kept)
+            scaled = f"{topic}: messages with a quaternion that was scaled to unit length"
+            assert notes.get(scaled) == ("1" if setting == "normalise" else None)
 
 
 def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Names what is written of a filter in C99: names, sizes and numbers, and the text they fill in."""
 
 import re
+from dataclasses import replace
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -72,9 +73,16 @@ class CFilter(NamedTuple):
 
     @property
     def sensors(self) -> list[tuple[str, Sensor]]:
-        """List the sensors with their names in C."""
+        """List the sensors with their names in C; of several topics of a kind, each has its own name."""
         found: dict[str, Sensor] = {}
-        for sensor in self.filtering.stage.sensors:
+        topics: dict[str, set[str]] = {}
+        for sensor, topic in self.filtering.found.sensors:
+            topics.setdefault(sensor.topic, set()).add(topic.name)
+        for sensor, (_, topic) in zip(
+            self.filtering.stage.sensors, self.filtering.found.sensors, strict=True
+        ):
+            if len(topics[sensor.topic]) > 1:
+                sensor = replace(sensor, topic=topic.name)
             name = identifier(sensor.topic)
             found[name if name not in found else f"{name}_{'_'.join(sensor.measured)}"] = sensor
         return list(found.items())

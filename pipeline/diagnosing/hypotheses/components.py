@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.altering import alterations as alter
-from pipeline.altering.changes import AXES, bare, entry_of
+from pipeline.altering.changes import AXES, bare, names_in
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
 from pipeline.diagnosing.hypotheses.hypothesis import (
     Hypothesis,
@@ -103,8 +103,8 @@ def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
         if entry.kind == "real":
             yield entry.name, None, entry.name
         elif entry.kind == "vector" and column.shape[1] <= len(AXES):
-            for place in range(column.shape[1]):
-                yield entry.name, place, entry_of(entry.name, place)
+            for place, name in zip(range(column.shape[1]), names_in(stream, entry.name), strict=False):
+                yield entry.name, place, name
 
 
 def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:

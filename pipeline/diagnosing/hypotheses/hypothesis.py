@@ -10,7 +10,7 @@ from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from recorders.log import Stream
-from recorders.parameters import Parameters
+from recorders.parameters import Parameters, field_of
 from replay.distributions import chi2
 
 Kind = Literal[
@@ -144,10 +144,11 @@ def has(parameters: Parameters | None, name: str) -> bool:
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
     """Return a parameter that a topic is read with: as given, or stated by the channel, or zero."""
-    if not has(parameters, name):
+    if not has(parameters, field_of(name)):
         return 0.0
-    value = getattr(parameters, name)
-    return float(stream.metadata.get(name, 0.0) if value is None else value)
+    value = getattr(parameters, field_of(name))
+    stated = stream.metadata.get(name.rpartition(".")[2], 0.0)
+    return float(stated if value is None else value)
 
 
 def times(at: float, low: float, high: float) -> str:

@@ -25,7 +25,7 @@ from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic
-from recorders.parameters import Parameters, in_few_words, meanings
+from recorders.parameters import Parameters, field_of, in_few_words, meanings
 from replay.engine.replaying.estimator import Bound, Reading, Recursive
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
@@ -57,7 +57,7 @@ def of_noises(
         if value is None:
             continue
         kind: Kind = "measurement noise" if topic else "process noise"
-        yield _noise(name, in_few_words(meanings(type(parameters)).get(name, "")), value, kind)
+        yield _noise(name, in_few_words(meanings(type(parameters)).get(field_of(name), "")), value, kind)
 
 
 def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
@@ -81,10 +81,12 @@ def _noise_of(
     parameters: Parameters, name: str, read: Sequence[Topic], assumed: Mapping[str, float]
 ) -> float | None:
     """Return the value of a parameter that is a noise: given, stated by a channel, or assumed."""
-    value = getattr(parameters, name)
+    value = getattr(parameters, field_of(name))
     if value is None:
-        value = stated(read, name, type(parameters), needed=False)
-        value = assumed.get(name) if np.isnan(value) else value
+        topic, _, own = name.rpartition(".")
+        first = [each for each in read if each.name == topic]
+        value = stated([*first, *read], own, type(parameters), needed=False)
+        value = assumed.get(field_of(name)) if np.isnan(value) else value
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and 0.0 < value < np.inf else None
 
@@ -135,7 +137,7 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
     for reading in readings.values():
         own = {*reading.biases.values(), *reading.factors.values()}
         for name, (kind, topics) in reading.augmentable.items():
-            value = getattr(parameters, name, None)
+            value = getattr(parameters, field_of(name), None)
             if name in own or not isinstance(value, int | float):
                 continue
             group = groups.setdefault((unit_of(name), kind, topics), [])
@@ -144,7 +146,7 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
     for (unit, kind, topics), names in groups.items():
         apart = [[name] for name in names] if kind == "angle" and len(names) > 1 else []
         for some in (names, *apart):
-            values = tuple(float(getattr(parameters, name)) for name in some)
+            values = tuple(float(getattr(parameters, field_of(name))) for name in some)
             step = STEPS.get(unit, STEPS[""])
             yield _parameters(some, values, step, topics, is_angle=kind == "angle")
 

@@ -5,6 +5,7 @@ gives /robot1/inertial. Where two topics would give the same name, both are name
 /odom/odometry, /wheels/odometry. So are poses without a covariance, which may be goals: /goal_pose/pose.
 """
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -63,8 +64,8 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
                 f"{bag.path}: topic {each.topic} cannot be taken: it is "
                 f"{found.not_taken[each.topic]}; describe it with --set mapping=FILE.toml"
             )
-    if parameters.truth is not None:
-        _check_truth(bag, parameters.truth, found.readers)
+    for option, topic in _poses_of(parameters):
+        _check_poses(bag, option, topic, found.readers)
     if not found.readers:
         left_out = some_of([f"{topic} ({why})" for topic, why in sorted(found.not_taken.items())])
         raise BadInput(f"{bag.path}: has no topic that can be imported: {left_out or 'no topics'}")
@@ -83,12 +84,15 @@ def stream_names(
     wanted = {
         (each.topic, kind): f"{below(each.topic, reader.taken)}/{kind}"
         for each, reader in readers.items()
-        if reader.taken is not None and each.topic != parameters.truth
+        if reader.taken is not None and each.topic not in (parameters.truth, *parameters.estimates)
         for kind in reader.taken.kinds
     }
     if (truth := parameters.truth) is not None:
         above = parameters.names.get(truth, truth.rpartition("/")[0]).rstrip("/")
         wanted[truth, "truth"] = f"{above}/truth"
+    for topic in parameters.estimates:
+        label = re.sub(r"\W", "_", topic.strip("/"))
+        wanted[topic, "estimate"] = f"/estimates/{label}/pose"
     counts = Counter(wanted.values())
     return {
         (topic, kind): name if counts[name] == 1 else f"{topic}/{kind}"
@@ -113,17 +117,23 @@ def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
 def _check_topics(bag: Bag, parameters: RosParameters) -> None:
     """Raise BadInput where a topic that a parameter names is not there."""
     topics = sorted({each.topic for each in bag.connections})
-    truth = [] if parameters.truth is None else [parameters.truth]
-    for topic in [*parameters.topics, *parameters.names, *truth]:
+    poses = [topic for _, topic in _poses_of(parameters)]
+    for topic in [*parameters.topics, *parameters.names, *poses]:
         if topic not in topics:
             raise BadInput(f"{bag.path}: has no topic {topic}; {choices(topic, topics)}")
 
 
-def _check_truth(bag: Bag, topic: str, readers: Mapping[Connection, Reader]) -> None:
-    """Raise BadInput where the topic of the truth has no poses."""
+def _poses_of(parameters: RosParameters) -> list[tuple[str, str]]:
+    """List the topics whose poses are the truth or estimates, each with the option that names it."""
+    truth = [] if parameters.truth is None else [("truth", parameters.truth)]
+    return [*truth, *(("estimates", topic) for topic in parameters.estimates)]
+
+
+def _check_poses(bag: Bag, option: str, topic: str, readers: Mapping[Connection, Reader]) -> None:
+    """Raise BadInput where a topic whose poses are wanted has none."""
     reader = next((each for of, each in readers.items() if of.topic == topic), None)
     if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
-        raise BadInput(f"{bag.path}: truth = {topic}: this topic has no poses; name one that has")
+        raise BadInput(f"{bag.path}: {option} = {topic}: this topic has no poses; name one that has")
 
 
 def _reader(

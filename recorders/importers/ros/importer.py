@@ -1,8 +1,9 @@
 """Imports ROS logs: topics become streams, and what is not taken is told."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from recorders.importers.ros.clocks import Clocks
 from recorders.importers.ros.files.bags import Bag, open_bag
 from recorders.importers.ros.files.raw import Batch, Connection
 from recorders.importers.ros.layouts import Messages, Undecodable, by_size
-from recorders.importers.ros.messages import CHILD_FRAME, Part, as_truth, stamps_ns
+from recorders.importers.ros.messages import CHILD_FRAME, Part, as_estimate, as_truth, stamps_ns
 from recorders.importers.ros.mountings import Mountings
 from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
@@ -44,8 +45,9 @@ class _Import:
         self.path, self._bag, self._parameters = bag.path, bag, parameters
         self._readers, self._not_taken = choose(bag, parameters)
         names = stream_names(self._readers, parameters)
+        self._truth = names.get((parameters.truth or "", "truth"), "/truth")
         origin = None if parameters.origin is None else Origin(*parameters.origin)
-        self._streams = StreamMaker(bag.path, parameters.clock, names, origin)
+        self._streams = StreamMaker(bag.path, parameters.clock, names, origin, parameters.quaternions)
         self._pending: dict[tuple[Connection, int], _Pending] = defaultdict(_Pending)
         self._waiting_messages = self._waiting_bytes = 0
         self._read: Counter[str] = Counter()
@@ -105,12 +107,15 @@ class _Import:
         self._clocks.note(topic, sent.stamp_ns, log_time_ns)
         frames = _frames_of(messages, reader.frame)
         for part in reader.taken.parts(messages):
-            if topic != self._parameters.truth:
+            is_truth = topic == self._parameters.truth
+            if not is_truth and topic not in self._parameters.estimates:
                 self._streams.add(sent, part, frames)
             elif part.schema is schemas.POSE:
-                self._streams.add(sent, as_truth(part), frames)
+                own = as_truth(part) if is_truth else as_estimate(part, self._truth)
+                self._streams.add(sent, own, frames)
             else:
-                fact = f"{part.kind} left out, since a filter must not read what is from the truth"
+                whose = "the truth" if is_truth else "another filter"
+                fact = f"{part.kind} left out, since a filter must not read what is from {whose}"
                 self._streams.tell(topic, fact, len(messages))
 
     # Transforms.
@@ -119,12 +124,14 @@ class _Import:
         return connection in self._readers and self._readers[connection].taken is None
 
     def _transforms(
-        self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64]
-    ) -> list[tuple[Pair, Transforms]]:
-        try:
-            return list(transforms_of(messages, log_time_ns))
-        except BadInput as error:
-            raise BadInput(f"{self.path}: topic {topic}: {error}") from None
+        self,
+        topic: str,
+        messages: Messages,
+        log_time_ns: NDArray[np.int64],
+        tell: Callable[[str, int], None],
+    ) -> Iterator[tuple[Pair, Transforms]]:
+        where, quaternions = f"{self.path}: topic {topic}", self._parameters.quaternions
+        return transforms_of(messages, log_time_ns, where, quaternions, tell)
 
     def _named_chains(self) -> list[Chain]:
         """Return the chains of the named pairs; all transforms of the bag are read once to find them."""
@@ -146,8 +153,9 @@ class _Import:
                 for messages in reader.type.read(raw, which):
                     if isinstance(messages, Undecodable):
                         continue  # told when it is read for the streams
+                    logged_ns = batch.log_time_ns[messages.rows]
                     for pair, found in self._transforms(
-                        batch.connection.topic, messages, batch.log_time_ns[messages.rows]
+                        batch.connection.topic, messages, logged_ns, lambda *_: None
                     ):
                         if reader.is_static:
                             static[pair] = found
@@ -161,7 +169,8 @@ class _Import:
     def _take_transforms(
         self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64], *, is_static: bool
     ) -> None:
-        for pair, transforms in self._transforms(topic, messages, log_time_ns):
+        tell = partial(self._streams.tell, topic)
+        for pair, transforms in self._transforms(topic, messages, log_time_ns, tell):
             self._mountings.add(pair, transforms)
             if is_static:
                 what = "what named transforms and mountings are composed with"

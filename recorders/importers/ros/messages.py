@@ -161,13 +161,17 @@ def _inertial(messages: Messages) -> Iterator[Part]:
         lacking={"specific_force_mps2": no_force, "turn_rate_radps": no_rate},
     )
     orientation = quaternion(messages, "orientation")
-    is_none = has_none(messages, "orientation_covariance") | (orientation == 0.0).all(axis=1)
     yield Part(
         "orientation",
         schemas.ORIENTATION,
         {"quaternion": orientation},
         constants={"covariance_rad2": covariance(messages, "orientation_covariance")},
-        dropped={"without an orientation": is_none},
+        dropped={
+            "without an orientation: orientation_covariance[0] is -1": has_none(
+                messages, "orientation_covariance"
+            ),
+            "without an orientation: its quaternion is zero": (orientation == 0.0).all(axis=1),
+        },
     )
 
 
@@ -245,6 +249,21 @@ def as_truth(part: Part) -> Part:
     state = np.column_stack([part.columns["position_m"], heading(orientation), orientation])
     metadata = {"components": ",".join(TRUTH), "kinds": ",".join(TRUTH.values())}
     return Part("truth", schemas.TRUTH_STATE, {"state": state}, metadata)
+
+
+def as_estimate(part: Part, truth: str) -> Part:
+    """Take poses as the estimates of another filter, which are compared with the topic `truth`.
+
+    The covariance of a pose is of x, y, z and rotations about the fixed axes.
+    """
+    components = {name: kind for name, kind in TRUTH.items() if kind != "angle"}
+    metadata = {"components": ",".join(components), "kinds": ",".join(components.values())}
+    columns = {
+        "mean": np.column_stack([part.columns["position_m"], part.columns["quaternion"]]),
+        "covariance": part.columns["covariance"],
+    }
+    metadata |= {"rotation_axes": "world", "truth": truth}
+    return Part("estimate", schemas.GAUSSIAN_ESTIMATE, columns, metadata)
 
 
 def _twists(path: str, uncertainty: str = "") -> Taken:

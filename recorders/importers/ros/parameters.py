@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, PositiveFloat
 
-from recorders.importers.mapping import Place
+from recorders.importers.mapping import Place, Quaternions
 from recorders.parameters import Parameters
 
 Clock = Literal["header", "bag"]
@@ -32,12 +32,16 @@ class RosParameters(Parameters):
         names: replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic under
             /robot1.
         truth: topic whose poses become the stream `truth`, with which estimates are compared.
+        estimates: topics whose poses are those of another filter, such as /odometry/filtered: they
+            become estimates, which `fuselog evaluate` judges, and are no measurements.
         mapping: a TOML file for messages of your own.
         distribution: which one's definitions hold for messages that the bag does not define.
         clock_tolerance_s: headers that differ by more are refused as those of several clocks.
         origin: latitude and longitude (deg) and perhaps height (m) of the origin of the plane that poses
             and positions are in, whatever their frames are called; not that of transforms, nor of what
             an odometry adds up to.
+        quaternions: what becomes of messages whose quaternions are not of unit length: "refuse" stops
+            the import, "normalise" scales them, "skip" leaves such messages out.
     """
 
     clock: Clock = "header"
@@ -45,7 +49,9 @@ class RosParameters(Parameters):
     transforms: Names = []
     names: dict[str, str] = {}
     truth: str | None = None
+    estimates: Names = []
     mapping: str | None = None
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0
     origin: Place | None = None
+    quaternions: Quaternions = "refuse"

@@ -9,7 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.importers.mapping import checked, not_finite
+from recorders.importers.mapping import (
+    NOT_UNIT,
+    SCALED,
+    Quaternions,
+    checked,
+    not_finite,
+    off_unit,
+    with_unit_quaternions,
+)
 from recorders.importers.ros.messages import SIGMAS, Part
 from recorders.importers.ros.parameters import Clock
 from recorders.log import Schema, Stream, make_stream
@@ -68,13 +76,14 @@ class StreamMaker:
         clock: Clock,
         names: Mapping[tuple[str, str], str],
         origin: Origin | None = None,
+        quaternions: Quaternions = "refuse",
     ) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
         self.came_of: dict[str, dict[str, None]] = defaultdict(dict)
         self.first_ns: int | None = None
         self.noise: dict[str, str] = {}
         self._path, self._clock, self._names = path, clock, names
-        self._origin = origin
+        self._origin, self._quaternions = origin, quaternions
         self._written: dict[str, _Written] = {}
         self._streams: dict[tuple[str, ...], str] = {}
 
@@ -122,7 +131,12 @@ class StreamMaker:
         for reason, which in dropped.items():
             self.tell(sent.topic, f"{part.kind} dropped: {reason}", int((which & keep).sum()))
             keep &= ~which
-        for reason, which in part.doubtful.items():
+        where, kinds = f"{self._path}: topic {sent.topic}", part.metadata.get("kinds", "")
+        off = off_unit(where, part.columns, kinds, keep, self._quaternions)
+        self.tell(sent.topic, f"{part.kind} dropped: {NOT_UNIT}", int(off.left_out.sum()))
+        keep &= ~off.left_out
+        doubtful = {**part.doubtful, f"with {SCALED}": off.scaled}
+        for reason, which in doubtful.items():
             self.tell(sent.topic, f"{part.kind} kept {reason}", int((which & keep).sum()))
         return keep
 
@@ -154,7 +168,9 @@ class StreamMaker:
         size = len(next(iter(part.columns.values())))
         which = slice(None) if len(rows) == size else rows
         where = f"{self._path}: topic {sent.topic}"
-        columns = {key: checked(where, key, column[which]) for key, column in part.columns.items()}
+        columns = {key: column[which] for key, column in part.columns.items()}
+        columns = with_unit_quaternions(columns, part.metadata.get("kinds", ""))
+        columns = {key: checked(where, key, column) for key, column in columns.items()}
         constants = {key: column[which] for key, column in part.constants.items()}
         widths = {key: column.shape[1] for key, column in columns.items() if column.ndim == 2}
         if name not in self._written:

@@ -6,16 +6,23 @@ linearly and along the shortest rotation, as tf2 does it, and never beyond their
 what no such time has passed, so that memory stays bounded.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from recorders.importers.mapping import (
+    NOT_UNIT,
+    SCALED,
+    Quaternions,
+    off_unit,
+    with_unit_quaternions,
+)
 from recorders.importers.ros.layouts import Messages
 from recorders.importers.ros.messages import quaternion, stamps_ns, vector
-from recorders.models.orientation import compose, conjugate, require_unit, rotate
+from recorders.models.orientation import compose, conjugate, rotate
 
 Floats = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -49,15 +56,22 @@ class Transforms:
 
 
 def transforms_of(
-    messages: Messages, log_time_ns: NDArray[np.int64]
+    messages: Messages,
+    log_time_ns: NDArray[np.int64],
+    where: str,
+    quaternions: Quaternions,
+    tell: Callable[[str, int], None],
 ) -> Iterator[tuple[Pair, Transforms]]:
     """Yield the transforms in messages, by parent and child.
 
     Args:
         messages: n of them.
         log_time_ns: (n,), the stamps of the recorder.
+        where: what a message to the user begins with.
+        quaternions: what becomes of those that are not of unit length.
+        tell: is told a fact about transforms, and of how many it holds.
 
-    Raises BadInput where a quaternion is not of unit length.
+    Raises BadInput if a quaternion is not of unit length, and neither scaled nor left out.
     """
     for number in range(messages.layout.counts["transforms"]):
         path = f"transforms.{number}"
@@ -67,15 +81,26 @@ def transforms_of(
         for parent, child in dict.fromkeys(zip(parents.tolist(), children.tolist(), strict=True)):
             rows = (parents == parent) & (children == child)
             pair = _frame(parent), _frame(child)
-            what = f"the rotation of frame {pair[1]} in {pair[0]}"
-            found = Transforms(
-                np.asarray(stamp_ns)[rows],
-                log_time_ns[rows],
-                messages.rows[rows],
-                vector(messages, f"{path}.transform.translation")[rows],
-                require_unit(quaternion(messages, f"{path}.transform.rotation")[rows], what, 1e-3),
+            what = f"{where}: frame {pair[1]} in {pair[0]}"
+            rotation = {"quaternion": quaternion(messages, f"{path}.transform.rotation")}
+            off = off_unit(what, rotation, "", rows, quaternions)
+            tell(f"transforms dropped: {NOT_UNIT}", int(off.left_out.sum()))
+            tell(f"transforms kept with {SCALED}", int(off.scaled.sum()))
+            kept = rows & ~off.left_out
+            if not kept.any():
+                continue
+            yield (
+                pair,
+                Transforms(
+                    np.asarray(stamp_ns)[kept],
+                    log_time_ns[kept],
+                    messages.rows[kept],
+                    vector(messages, f"{path}.transform.translation")[kept],
+                    with_unit_quaternions({"quaternion": rotation["quaternion"][kept]}, "")[
+                        "quaternion"
+                    ],
+                ),
             )
-            yield pair, found
 
 
 def _frame(name: bytes) -> str:

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
 from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import Place, checked, mapped, schema_of
+from recorders.importers.mapping import (
+    Place,
+    Quaternions,
+    checked,
+    mapped,
+    off_unit,
+    schema_of,
+    with_unit_quaternions,
+)
 from recorders.importers.tables.mapping import (
     ConstantStream,
     Delay,
@@ -41,6 +49,8 @@ class TableParameters(Parameters):
         seed: seed of the noise that a mapping adds.
         origin: latitude and longitude (deg) and perhaps height (m) of the plane's origin, in place of
             that which the mapping states.
+        quaternions: what becomes of messages whose quaternions are not of unit length: "refuse" stops
+            the import, "normalise" scales them, "skip" leaves such messages out.
     """
 
     mapping: str = ""
@@ -49,6 +59,7 @@ class TableParameters(Parameters):
     delays_s: dict[str, Delay] = {}
     seed: NonNegativeInt = 0
     origin: Place | None = None
+    quaternions: Quaternions = "refuse"
 
 
 def read(path: Path, parameters: TableParameters) -> Blocks:
@@ -71,16 +82,17 @@ def read(path: Path, parameters: TableParameters) -> Blocks:
     if parameters.origin is not None:
         origin = Origin(**dict(zip(Origin.model_fields, parameters.origin, strict=False)))
         mapping = mapping.model_copy(update={"origin": origin})
-    found.blocks = _blocks(paths, mapping, np.random.default_rng(parameters.seed), found)
+    found.blocks = _blocks(paths, mapping, parameters, found)
     return found
 
 
 def _blocks(
-    paths: list[Path], mapping: LogMapping, generator: np.random.Generator, result: Blocks
+    paths: list[Path], mapping: LogMapping, parameters: TableParameters, result: Blocks
 ) -> Iterator[list[Stream]]:
     files, others = find_files(mapping, paths)
+    generator = np.random.default_rng(parameters.seed)
     counts: ReadCounts = Counter()
-    sources = [Rows(file, counts, generator) for file in files]
+    sources = [Rows(file, counts, generator, parameters.quaternions) for file in files]
     firsts = {
         number: first
         for number, source in enumerate(sources)
@@ -135,7 +147,9 @@ def _constant(own: ConstantStream, time_ns: int) -> Stream:
         )
 
     found = mapped(own.mapping, 1, read_none, read_none, own.topic)
-    columns = {name: checked(own.topic, name, column) for name, column in found.columns.items()}
+    off_unit(own.topic, found.columns, own.kinds, np.ones(len(found.rows), bool), "refuse")
+    columns = with_unit_quaternions(found.columns, own.kinds)
+    columns = {name: checked(own.topic, name, column) for name, column in columns.items()}
     times = np.full(len(found.rows), time_ns)
     schema = schema_of(own.mapping, own.topic)
     return make_stream(own.topic, schema, times, metadata=own.mapping.metadata, **columns)

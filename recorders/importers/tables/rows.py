@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
+from recorders.importers.mapping import (
+    NOT_UNIT,
+    SCALED,
+    Mapped,
+    Quaternions,
+    Source,
+    checked,
+    mapped,
+    not_finite,
+    off_unit,
+    schema_of,
+    with_unit_quaternions,
+)
 from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
 from recorders.importers.tables.blocks import lines_of
 from recorders.importers.tables.files import (
@@ -47,14 +59,21 @@ _STAMP = "\0stamp"
 class Rows:
     """Imports a file: its next batch lies ready, and what is left out is counted.
 
-    `generator` makes the noise that the mapping asks for. Raises BadInput if the file cannot be read,
-    or lacks a column that its mapping names.
+    `generator` makes the noise that the mapping asks for; `quaternions` says what becomes of those that
+    are not of unit length. Raises BadInput if the file cannot be read, or lacks a column that its
+    mapping names.
     """
 
-    def __init__(self, found: FileMatch, counts: ReadCounts, generator: np.random.Generator) -> None:
+    def __init__(
+        self,
+        found: FileMatch,
+        counts: ReadCounts,
+        generator: np.random.Generator,
+        quaternions: Quaternions,
+    ) -> None:
         self.path, self.mapping, self._names = found.path, found.table, dict(found.names)
         self._more, self._stamps_path = found.more, found.stamps
-        self._counts, self._generator = counts, generator
+        self._counts, self._generator, self._quaternions = counts, generator, quaternions
         own = self.mapping
         self.table = self._open()
         self.count = 0
@@ -510,6 +529,11 @@ class Rows:
         for reason, which in {**found.dropped, "NaN or infinite": lacking}.items():
             self._tell(topic, f"messages left out: {reason}", int((which & keep).sum()))
             keep = keep & ~which
+        where = f"{self.path}: {topic}"
+        off = off_unit(where, found.columns, own.kinds, keep, self._quaternions)
+        self._tell(topic, f"messages left out: {NOT_UNIT}", int(off.left_out.sum()))
+        self._tell(topic, f"messages with {SCALED}", int(off.scaled.sum()))
+        keep &= ~off.left_out
         return np.flatnonzero(keep)[: 1 if own.only_first else None]
 
     def _stream(
@@ -530,7 +554,9 @@ class Rows:
             is_geodetic = self.mapping.geodetic is not None or own.becomes == "GeodeticFix"
             own_frame = {FRAME: self.path.name}  # nobody says where on earth that is
             metadata |= plane.metadata if plane.is_stated or is_geodetic else own_frame
-        columns = {name: checked(where, name, column[rows]) for name, column in found.columns.items()}
+        columns = {name: column[rows] for name, column in found.columns.items()}
+        columns = with_unit_quaternions(columns, own.kinds)
+        columns = {name: checked(where, name, column) for name, column in columns.items()}
         for name, sigma in own.noise.items():
             columns[name] = columns[name] + sigma * self._generator.normal(size=columns[name].shape)
             self._tell(topic, f"messages with simulated noise, {name}: {sigma:g}", len(rows))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic
-from recorders.parameters import Parameters, ParametersType, build
+from recorders.parameters import Parameters, ParametersType, build, merge, nested
 from recorders.registry import foreign_code, load
 from replay.engine.compiling.kernel_source import DoesNotCompile
 from replay.engine.renamed import renamed
@@ -261,7 +261,12 @@ def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     Raises BadInput where the name is unknown or sets what a setting sets otherwise, or a foreign filter
     may not be run or does not answer.
     """
-    values = dict(settings)
+    values = {name: value for name, value in settings.items() if not name.startswith("/")}
+    for name, value in settings.items():
+        if name.startswith("/"):  # a parameter of a topic, or all of its own
+            own = value if isinstance(value, Mapping) else None
+            table = {name: own} if own is not None else nested(name, value)
+            values["of_topics"] = merge(values.get("of_topics", {}), table)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
     for name, value in variant.items():

@@ -18,7 +18,7 @@ from recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane, tangent_a
 from recorders.models.orientation import compose
 from recorders.models.planar import wrap_angle
 from replay.engine.arrays import Floats
-from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.components import in_body_axes, stated_components
 from replay.engine.vectors.tangent import manifold_blocks, tangent_components
 
 # Components of one vector in the log's frame, which turn together; the first is the position.
@@ -108,6 +108,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
     own = stated_in(stream.topic, stream.metadata)
     if own is None or own == origin:
         return stream
+    stream = in_body_axes(stream)
     movement, schema = between(own, origin), stream.schema.full_name
     columns = dict(stream.columns)
     if schema in _STATES and len(stream):

@@ -13,6 +13,7 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.results import gaussian_stream
 from replay.engine.vectors.components import (
     Components,
+    in_body_axes,
     match_components,
     match_tangent,
     stated_components,
@@ -51,7 +52,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
         prior: Gaussian estimates of all runs.
         components: wanted, by name, with their kinds.
     """
-    stream, runs = prior.stream, prior.runs
+    stream, runs = in_body_axes(prior.stream), prior.runs
     where = f"topic {stream.topic}"
     names, kinds = (stream.metadata.get(name, "") for name in ("components", "kinds"))
     layout = _layout(names, kinds, tuple(components.items()), where)

@@ -1,13 +1,20 @@
 """Matches a vector's components by the names that its channel states; their order never matters."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import cast
 
+import numpy as np
+
 from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.models.orientation import conjugate, rotate
 from recorders.models.states import state_metadata
 from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
 
 Components = Mapping[str, Kind]
+# In the metadata of Gaussian estimates: the axes of the rotation vectors that their covariances are of.
+ROTATION_AXES = "rotation_axes"
 
 
 def components_of(names: Sequence[str]) -> Components:
@@ -79,3 +86,31 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
             "component a name of its own and a kind; an axis has two in a row, a quaternion four"
         )
     return dict(zip(names, cast("list[Kind]", kinds), strict=True))
+
+
+def in_body_axes(stream: Stream) -> Stream:
+    """Return Gaussian estimates whose covariances are of rotations about the axes of the body.
+
+    A channel may state that they are about those of the world, as in ROS: `rotation_axes` = "world".
+    Raises BadInput if it states other axes, or no kinds.
+    """
+    axes = stream.metadata.get(ROTATION_AXES, "body")
+    if axes == "body":
+        return stream
+    where = f"topic {stream.topic}"
+    if axes != "world":
+        raise BadInput(f"{where}: its channel states {ROTATION_AXES} = {axes}; state body or world")
+    kinds = list(stated_components(stream.metadata, {}, where).values())
+    size = sum(TANGENT_WIDTHS[kind] for kind, _ in manifold_blocks(kinds))
+    turn, row = np.tile(np.eye(size), (len(stream), 1, 1)), 0
+    for kind, columns in manifold_blocks(kinds):
+        if kind == "quaternion":  # its rows are the world's axes in those of the body
+            back = conjugate(stream["mean"].reshape(len(stream), len(kinds))[:, None, columns])
+            turn[:, row : row + 3, row : row + 3] = rotate(back, np.eye(3)).swapaxes(1, 2)
+        row += TANGENT_WIDTHS[kind]
+    covariance = turn @ stream["covariance"].reshape(-1, size, size) @ turn.swapaxes(1, 2)
+    return replace(
+        stream,
+        columns={**stream.columns, "covariance": covariance.reshape(len(stream), size * size)},
+        metadata={**stream.metadata, ROTATION_AXES: "body"},
+    )

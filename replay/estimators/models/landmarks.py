@@ -240,6 +240,7 @@ RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
 DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps": "linear"}
 SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
+COMPASS_ERRORS: Mapping[str, Kind] = {"bias_heading_rad": "angle"}
 LEVER: Mapping[str, Kind] = {"lever_x_m": "linear", "lever_y_m": "linear"}
 # How well each needs to be known before it is said to be: 1 %, 1 % of a radian per second, 20 cm, 50 ms.
 DRIVE_CALIBRATION: Mapping[str, float] = {
@@ -317,7 +318,7 @@ ROBOT = Model(
     MOTION,
     control=ODOMETRY,
     output="pose",
-    augmentable={**SIGHT_ERRORS, **DRIVE_ERRORS, **LEVER},
+    augmentable={**SIGHT_ERRORS, **COMPASS_ERRORS, **DRIVE_ERRORS, **LEVER},
     calibration={
         **DRIVE_CALIBRATION,
         **dict.fromkeys(LEVER, 0.2),

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from recorders.models.inertial import into_body, into_plane, product, rotation
 from recorders.models.planar import Components
 from replay.engine.arrays import Booleans, Floats
@@ -143,6 +143,8 @@ def read_velocity(stream: Stream) -> Floats:
 def read_field(stream: Stream) -> Floats:
     """Return the field (n, 3), once a period: its first sample there, of a slower magnetometer too."""
     field = stream["magnetic_field_ut"]
+    if field.shape[1:] != (3,):  # the magnetometer has a topic of its own
+        return np.full((len(stream), 3), np.nan)
     known = np.flatnonzero(np.isfinite(field).all(axis=1))
     if len(known) in (0, len(field)):
         return np.where(first_of_periods(stream)[:, None], field, np.nan)
@@ -154,6 +156,11 @@ def read_field(stream: Stream) -> Floats:
     return found
 
 
+def read_own_field(stream: Stream) -> Floats:
+    """Return the field (n, 3) of a magnetometer with a topic of its own, once a period."""
+    return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
+
+
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Find orientation and field by the means of the rest: force is up there, and the field north.
 
@@ -161,10 +168,13 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """
     stream = streams["inertial"]
     begin_ns = int(stream.publish_time_ns[0])
-    rest = stream.take(stream.publish_time_ns <= begin_ns + round(parameters.rest_s * 1e9))
+    until_ns = begin_ns + round(parameters.rest_s * 1e9)
+    rests = [each.take(each.publish_time_ns <= until_ns) for each in streams.values()]
+    rest = stream.take(stream.publish_time_ns <= until_ns)
+    fields = [each["magnetic_field_ut"] for each in rests if each["magnetic_field_ut"].shape[1:] == (3,)]
     force, field = (
-        np.nanmean(rest[name], axis=0) if np.isfinite(rest[name]).any() else np.full(3, np.nan)
-        for name in ("specific_force_mps2", "magnetic_field_ut")
+        np.nanmean(values, axis=0) if np.isfinite(values).any() else np.full(3, np.nan)
+        for values in (rest["specific_force_mps2"], np.concatenate([np.empty((0, 3)), *fields]))
     )
     if not np.isfinite(field).all():
         raise BadInput(
@@ -209,6 +219,14 @@ ATTITUDE = Model(
             linear=True,
         ),
         Sensor(UNIT.topic, UNIT.schema, FIELD, feel_north, field_noise, read=read_field),
+        Sensor(
+            "magnetic_field",
+            schemas.MAGNETIC_FIELD,
+            FIELD,
+            feel_north,
+            field_noise,
+            read=read_own_field,
+        ),
     ),
     Motion(move, move_noise, gap_noise=gap_noise),
     control=UNIT,

@@ -20,6 +20,7 @@ from replay.engine.api.functions import batch, each_run
 from replay.engine.api.inputs import Given, Messages, OneRun
 from replay.engine.api.outputs import Estimates, Results
 from replay.engine.arrays import Floats, Integers
+from replay.estimators.orientation.magnetometers import with_magnetometer
 from replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
 from replay.estimators.orientation.resting import of_nine_axes
 from replay.estimators.orientation.triad import triad, unit
@@ -240,9 +241,25 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     samples = streams["inertial"]
     force, rate, field = (np.ascontiguousarray(samples[name]) for name in FIELDS)
     time_ns = samples.publish_time_ns
-    step_s = float(np.median(np.diff(time_ns))) * 1e-9
-    vqf = VQF(step_s, tauAcc=parameters.inclination_s, tauMag=parameters.heading_s)
-    mean = vqf.updateBatch(rate, force, field)["quat9D"]
+    step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
+    if not has_field.any():
+        raise BadInput(f"topic {samples.topic}: has no magnetic field; estimator vqf needs one")
+    slower = len(has_field) / int(has_field.sum())
+    vqf = VQF(
+        step_s,
+        magTs=slower * step_s,
+        tauAcc=parameters.inclination_s,
+        tauMag=parameters.heading_s,
+    )
+    if has_field.all():
+        mean = vqf.updateBatch(rate, force, field)["quat9D"]
+    else:
+        mean = np.empty((len(rate), 4))
+        for row in range(len(rate)):
+            vqf.update(rate[row], force[row])
+            if has_field[row]:
+                vqf.updateMag(field[row])
+            mean[row] = vqf.getQuat9D()
     return Estimates(time_ns, mean, np.tile(parameters.covariance, (len(mean), 1, 1)))
 
 
@@ -259,12 +276,14 @@ MAHONY = of_nine_axes(
         follow=follow_mahony,
     )
 )
-VQF = batch(
-    "VQF of Laidig and Seel, by the package vqf",
-    parameters=VqfParameters,
-    streams={"inertial": schemas.INERTIAL_SAMPLE},
-    static={},
-    components=ORIENTATION,
-    truth="truth",
-    solve=each_run(solve_vqf),
+VQF = with_magnetometer(
+    batch(
+        "VQF of Laidig and Seel, by the package vqf",
+        parameters=VqfParameters,
+        streams={"inertial": schemas.INERTIAL_SAMPLE},
+        static={},
+        components=ORIENTATION,
+        truth="truth",
+        solve=each_run(solve_vqf),
+    )
 )

@@ -24,6 +24,7 @@ from replay.estimators.orientation.inertial import (
     run_inertial_filter,
     start_inertial_filter,
 )
+from replay.estimators.orientation.magnetometers import with_magnetometer
 from replay.estimators.orientation.reckoning import run_dead_reckoning, start_reckoning
 from replay.estimators.orientation.resting import LONGEST_S, of_nine_axes, rests_of
 
@@ -145,9 +146,11 @@ GYRO = of_nine_axes(
         follow_all=_follow_all,
     )
 )
-TRIAD = of_inertial_samples(
-    "the TRIAD attitude of every sample's accelerometer and magnetometer",
-    InertialParameters,
-    _start_triad,
-    follow_all=_follow_all,
+TRIAD = with_magnetometer(
+    of_inertial_samples(
+        "the TRIAD attitude of every sample's accelerometer and magnetometer",
+        InertialParameters,
+        _start_triad,
+        follow_all=_follow_all,
+    )
 )

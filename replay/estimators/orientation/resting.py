@@ -16,6 +16,7 @@ from recorders.log import Clock, Stream
 from replay.engine.arrays import Booleans, Floats
 from replay.engine.replaying.estimator import Bound, Estimator, Initialization, Initialized, Recursive
 from replay.engine.streams.blocks import Ragged
+from replay.estimators.orientation.magnetometers import with_magnetometer
 from replay.inference.run.first_messages import Fact, started
 
 REST = "rest"  # what `start` finds the samples of the rest under
@@ -90,7 +91,7 @@ def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
             found.append(replace(each, initialization=Initialization(each.streams, find)))
         return found
 
-    return replace(estimator, bind=bind)
+    return with_magnetometer(replace(estimator, bind=bind))
 
 
 def _find(
@@ -108,8 +109,8 @@ def _find(
     field = samples.stream.columns.get("magnetic_field_ut")
     if len(samples.stream) and (field is None or not np.isfinite(field).all(axis=1).any()):
         raise BadInput(
-            f"topic {topic}: has no magnetic field, by which the heading is found; import it into the "
-            "same message, fields.magnetic_field_ut = [...] in the mapping"
+            f"topic {topic}: has no magnetic field, by which the heading is found, and no topic "
+            "magnetic_field has it; import it, as fields.magnetic_field_ut = [...] in the mapping"
         )
     if not seeks_rest:
         return Initialized({}, [])

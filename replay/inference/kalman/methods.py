@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import BeforeValidator, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build
@@ -38,6 +38,10 @@ from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 
 
+def _as_list(value: object) -> object:
+    return [each.strip() for each in value.split(",")] if isinstance(value, str) else value
+
+
 class MethodParameters(Parameters):
     """Defines the options of every method.
 
@@ -49,7 +53,9 @@ class MethodParameters(Parameters):
         estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
         estimate_time_s: time within about which it returns to its value (Gauss-Markov), in s, by name.
         topics: which topic stands for one that the model asks for, such as {pose = "/amcl_pose/pose"};
-            an empty name leaves a sensor out.
+            an empty name leaves a sensor out, and several, with commas or as a list, are all taken.
+        of_topics: by topic, parameters of its own in place of those of its kind, as
+            --set /gps2/fix.lever_x_m=0.4 gives them.
     """
 
     every_s: PositiveFloat | None = None
@@ -58,7 +64,8 @@ class MethodParameters(Parameters):
     estimate_sigma: dict[str, PositiveFloat] | None = None
     estimate_drift: dict[str, NonNegativeFloat] | None = None
     estimate_time_s: dict[str, PositiveFloat] | None = None
-    topics: dict[str, str] | None = None
+    topics: dict[str, Annotated[list[str], BeforeValidator(_as_list)]] | None = None
+    of_topics: dict[str, dict[str, float]] | None = None
 
 
 class UnscentedParameters(MethodParameters):

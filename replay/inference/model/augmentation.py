@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput, choices
+from recorders.parameters import field_of
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.priors import gaussians
@@ -60,20 +61,18 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """Return what is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
-    list one that is asked for, one stands twice, or has no sigma.
+    Raises BadInput where the model does not list as `augmentable` what is asked for, one stands twice,
+    or has no sigma.
 
     Args:
         label: the estimator's, for errors.
         model: whose parameters are asked for.
         parameters: with `estimate` and its options.
     """
-    check_augmentable(f"estimator {label}", model)
-    asked = parameters.estimate or []
+    asked = list(map(field_of, parameters.estimate or []))
     options = {
-        "estimate_sigma": parameters.estimate_sigma or {},
-        "estimate_drift": parameters.estimate_drift or {},
-        "estimate_time_s": parameters.estimate_time_s or {},
+        option: {field_of(key): value for key, value in (getattr(parameters, option) or {}).items()}
+        for option in ("estimate_sigma", "estimate_drift", "estimate_time_s")
     }
     for option, given in options.items():
         for name in given.keys() - set(asked):

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import takewhile
 from typing import NamedTuple
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.log import Schema, Topic, schemas
 from recorders.log.planes import FRAME, is_framed, plane_in_words, stated_in
 from replay.engine.arrays import Floats
@@ -89,6 +89,50 @@ def serving(schema: Schema) -> tuple[str, ...]:
     """Return the schemas, by their full names, whose messages a sensor of this schema takes."""
     geodetic = (GEODETIC,) if schema is schemas.POSITION_FIX else ()
     return (schema.full_name, *geodetic)
+
+
+def first_and_more(
+    named: Mapping[str, str | Sequence[str]],
+) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Split topics by the model's names for them: the first that is named so, and the others.
+
+    >>> first_and_more({"pose": "/amcl/pose", "fix": ["/gps1/fix", "/gps2/fix"]})
+    ({'pose': '/amcl/pose', 'fix': '/gps1/fix'}, {'fix': ['/gps2/fix']})
+    """
+    listed = {role: [names] if isinstance(names, str) else list(names) for role, names in named.items()}
+    firsts = {role: names[0] if names else "" for role, names in listed.items()}
+    return firsts, {role: names[1:] for role, names in listed.items() if names[1:]}
+
+
+def with_more(
+    label: str,
+    model: Model,
+    found: Found,
+    topics: Mapping[str, Topic],
+    more: Mapping[str, Sequence[str]],
+) -> Found:
+    """Add further topics of the kinds that a model's sensors have, each next to the first of its kind.
+
+    Raises BadInput if one has another message than its kind, or the kind is no sensor that is taken.
+    """
+    sensors = list(found.sensors)
+    for role, names in more.items():
+        kinds = [sensor for sensor, _ in found.sensors if sensor.topic == role]
+        for name in names:
+            topic = topics.get(resolved(name, found.prefix))
+            serves = [each for each in kinds if topic and topic.schema_name in serving(each.schema)]
+            if topic is None or not serves:
+                known = [
+                    each
+                    for each, own in topics.items()
+                    for kind in kinds
+                    if own.schema_name in serving(kind.schema)
+                ]
+                why = f"no topic of the log that serves as {role}; {choices(name, known)}"
+                raise BadInput(f"estimator {label}: topics.{role}: {name}: {why}")
+            place = max(place for place, (sensor, _) in enumerate(sensors) if sensor.topic == role)
+            sensors[place + 1 : place + 1] = [(each, topic) for each in serves]
+    return found._replace(sensors=tuple(sensors))
 
 
 def topics_of(
@@ -205,15 +249,19 @@ def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[s
     taken = {topic.name for _, topic in found.sensors} | {topic.name for _, topic in found.fallbacks}
     if found.control is not None:
         taken.add(found.control.name)
-    settings = {}
+    offered: dict[str, list[str]] = {}
     for name, topic in topics.items():
         fitting = [each for each, schema in kinds.items() if topic.schema_name in serving(schema)]
         alike = [each for each in fitting if name.endswith(f"/{each}")]
         is_only = len(fitting) == 1 and topic.schema_name != schemas.POSE.full_name
         for role in alike[:1] or (fitting if is_only else []):
             if name not in taken and role not in here and not name.startswith("/estimates/"):
-                settings[name] = f"--set topics.{role}={name}"
-    return settings
+                offered.setdefault(role, []).append(name)
+    return {
+        name: f"--set topics.{role}={','.join(names)}"
+        for role, names in offered.items()
+        for name in names
+    }
 
 
 def _found(model: Model, here: UnderPrefix) -> Found | None:

@@ -3,6 +3,7 @@
 What `check_model` finds at random states is one sentence with the function's file and line.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -33,6 +34,8 @@ from replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
+# Of the step in which noise has to add up, and how near; and the share of a variance from others.
+SHORT_S, ADDS_UP, FROM_OTHERS = 0.01, 0.1, 0.01
 STEP = 1e-5  # of central differences
 TURN = 2.0 * np.pi
 
@@ -79,7 +82,9 @@ def check_model(
         seed: of the random states, controls and points of a map.
 
     Returns:
-        Sentences on what was checked, and on what was not.
+        Sentences on what was checked, on what was not, and on process noise that does not add up: it
+        is not the same over two half steps as over a whole one. There is a warning of that too, and no
+        error: filters of regular steps are published with noise per step.
 
     Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
     from central differences or from those written by hand, a number of components is wrong, what is
@@ -132,7 +137,14 @@ def check_model(
         for sensor in model.sensors:
             if not sensor.covariance:
                 _check_noise(sensor.noise, (numbers,), sensor.noises or len(sensor.measured))
-    return _checked(model, calls, parts, len(tried))
+        doubts = [
+            doubt
+            for motion in motions.values()
+            for doubt in _not_additive(model, motion, numbers, tried, rng)
+        ]
+    for doubt in dict.fromkeys(doubts):
+        warnings.warn(doubt, stacklevel=2)
+    return Checked([*_checked(model, calls, parts, len(tried)), *dict.fromkeys(doubts)])
 
 
 class Checked(tuple[str, ...]):
@@ -210,19 +222,27 @@ def _check_derivatives(
     except BadInput as error:
         raise AssertionError(str(error)) from error
     linearise(*given, work)
-    arguments = [state, *others]
-    for index, (name, size) in enumerate(sizes.items()):
-        for column in range(size):
-            add = boxplus(kinds if index == 0 else ("linear",) * size)
-            ends = []
-            for sign in (1.0, -1.0):
-                moved = [each.copy() for each in arguments]
-                add(moved[index], sign * STEP * np.eye(size)[column])
-                ends.append(call.value(*moved))
-            slopes = _difference(ends[0], ends[1], outputs) / (2.0 * STEP)
+    for index, name in enumerate(sizes):
+        for column, slopes in enumerate(_slopes(call, [state, *others], index).T):
             _compare(call, getattr(work, name), slopes, (name, column), 1e-6, "by central differences")
     _check_by_hand(call, part, state, others, work)
     return np.array(work.state)
+
+
+def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
+    """Compute the Jacobian (outputs, size) by one of the arguments, by central differences."""
+    outputs = tuple(call.outputs.values())
+    kinds = tuple(call.state.values()) if index == 0 else ("linear",) * len(arguments[index])
+    add, size = boxplus(kinds), tangent_size(kinds)
+    slopes = np.empty((tangent_size(outputs), size))
+    for column in range(size):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = [each.copy() for each in arguments]
+            add(moved[index], sign * STEP * np.eye(size)[column])
+            ends.append(call.value(*moved))
+        slopes[:, column] = _difference(ends[0], ends[1], outputs) / (2.0 * STEP)
+    return slopes
 
 
 def _check_correction(
@@ -386,15 +406,73 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
 
 def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, block: int = 0) -> None:
     """Check variances, or the rows of a lower triangle."""
-    if noise is None:
+    if noise is None or not size:
         return
-    numbers = np.array(noise(*arguments), dtype=float)
-    if len(numbers) == size:
-        smallest = float(numbers.min(initial=0.0))
-        scale = 0.0
-    else:
-        matrix = np.zeros((size, size))
-        adding_noise(size, block)(matrix, numbers)
-        smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
+    matrix = _matrix(noise, arguments, size, block)
+    smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
     if not smallest >= -scale:
         raise AssertionError(f"{place_of(noise)} gives a negative variance, {smallest:.6g}")
+
+
+def _matrix(noise: Function, arguments: tuple[Any, ...], size: int, block: int = 0) -> Floats:
+    """Make the covariance (size, size) of variances, or of the rows of a lower triangle."""
+    numbers, matrix = np.array(noise(*arguments), dtype=float), np.zeros((size, size))
+    if len(numbers) == size:
+        return np.diag(numbers)
+    adding_noise(size, block)(matrix, numbers)
+    return matrix
+
+
+def _not_additive(
+    model: Model, motion: Motion, numbers: Any, states: Floats, rng: np.random.Generator
+) -> list[str]:
+    """Say which components get another variance in one step than in two halves of it.
+
+    A component that gets a share of its variance from others over the step is left out: there the noise
+    may be an approximation of their order.
+    """
+    whole, half = (
+        _motion_call(model, motion, numbers)._replace(rest=(step_s, numbers))
+        for step_s in (SHORT_S, 0.5 * SHORT_S)
+    )
+    ratios = []
+    for state in states:
+        others = whole.others(rng)
+        once, first = (_spread(each, motion, state, others) for each in (whole, half))
+        middle = half.value(state, *others)
+        transition = _slopes(half, [middle, *others], 0)
+        kept = transition @ first @ transition.T
+        twice = np.diagonal(kept + _spread(half, motion, middle, others))
+        own = np.diagonal(transition) ** 2 * np.diagonal(first)
+        is_own = np.abs(np.diagonal(kept) - own) <= FROM_OTHERS * twice
+        ratios.append(np.where(is_own & (twice > 0.0), np.diagonal(once) / twice, 1.0))
+    ratio = np.median(ratios, axis=0)
+    wrong = np.abs(ratio - 1.0) > ADDS_UP
+    if not wrong.any():
+        return []
+    names = ", ".join(
+        name for name, is_wrong in zip(_tangent(model.state), wrong, strict=True) if is_wrong
+    )
+    return [
+        f"{place_of(motion.noise or motion.control_noise or motion.move)}: the noise does not add up: "
+        f"over {SHORT_S:g} s the variance of {names} is {ratio[wrong][0]:.3g} times that of two halves, "
+        "so that estimates depend on how many messages there are; let a step add a variance "
+        "proportional to duration_s"
+    ]
+
+
+def _spread(call: _Call, motion: Motion, state: Floats, others: list[Floats]) -> Floats:
+    """Compute the covariance that a step adds: additive noise, that which enters, and the control's."""
+    (step_s, numbers), arguments = call.rest, [state, *others]
+    size = tangent_size(tuple(call.state.values()))
+    total = np.zeros((size, size))
+    at = tuple(state), step_s, numbers
+    if motion.noise is not None and not motion.noises:
+        total += _matrix(motion.noise, at, size, motion.noise_block)
+    entering = motion.noise if motion.noises else None
+    for noise, given, index in ((entering, at, 2), (motion.control_noise, at[1:], 1)):
+        if noise is None:
+            continue
+        slopes = _slopes(call, arguments, index)
+        total += slopes @ _matrix(noise, given, slopes.shape[1]) @ slopes.T
+    return total

@@ -294,6 +294,8 @@ class Model:
             `replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
         calibration: the parameters that say how sensors are mounted, scaled, biased and delayed, each
             with a useful standard deviation: what is known no better counts as not determined.
+        owned: by their names the parameters that single topics have, each with the topic and what it is
+            called there; see `replay.inference.model.own_parameters`.
 
     A thing on a line, whose range from the origin is measured:
 
@@ -343,6 +345,7 @@ class Model:
     needs_sensor: bool = True
     augmentable: Components = field(default_factory=dict)
     calibration: Mapping[str, float] = field(default_factory=dict)
+    owned: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     start: Start | None = None
     correct: Correction | None = None
     takes_fixes: bool = True
@@ -358,6 +361,22 @@ class Model:
             return self.sensors
         components = list(self.state)
         return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
+
+    def key_of(self, name: str) -> str:
+        """Return the key by which a parameter is set: `/TOPIC.NAME` of one that a topic has.
+
+        Args:
+            name: the parameter's.
+        """
+        return ".".join(self.owned[name]) if name in self.owned else name
+
+    def kind_of(self, name: str) -> str:
+        """Return the parameter that one of a topic stands for; any other is its own.
+
+        Args:
+            name: the parameter's.
+        """
+        return self.owned[name][1] if name in self.owned else name
 
     @property
     def finds_start(self) -> bool:

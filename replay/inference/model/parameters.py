@@ -1,8 +1,9 @@
 """Defines the options of every model, and the numbers that its functions read."""
 
 from collections import namedtuple
+from collections.abc import Mapping
 from functools import cache, lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, PositiveFloat
 
@@ -45,6 +46,8 @@ class ModelParameters(Parameters):
         switch_nis: above this NIS a measurement counts less and less, as in dynamic covariance scaling.
         sigma_fix_m: standard deviation of each component of a fix that does not state its covariance.
     """
+
+    OWNED: ClassVar[Mapping[str, tuple[str, str]]] = {}  # see `Model.owned`
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
     gate_reopens_s: PositiveFloat | None = None

@@ -83,7 +83,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     settings = np.array(
         [
             [
-                _stated(found, [*first, *everything], name, model.parameters)
+                _stated(found, [*first, *everything], model.kind_of(name), model.parameters)
                 if given[name] is None
                 else float(given[name])
                 for name in names
@@ -93,7 +93,8 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     )
     for row, (sensor, topic) in enumerate(found.sensors, start=1):
         for name, read in sensor.stated.items():
-            if given[name] is None and name not in topic.metadata and not np.isnan(read(topic.metadata)):
+            is_stated = model.kind_of(name) in topic.metadata
+            if given[name] is None and not is_stated and not np.isnan(read(topic.metadata)):
                 settings[row, names.index(name)] = read(topic.metadata)
     lacking = [
         (row, name)
@@ -106,9 +107,12 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
         missing = list(dict.fromkeys(name for _, name in lacking))
         usual = model.start.parameters if model.start is not None else {}
         better = ", or numbers that you know better" if usual else ""
-        mend = " ".join(f"--set {name}={usual.get(name, '...')}" for name in missing)
+        mend = " ".join(
+            f"--set {model.key_of(name)}={usual.get(model.kind_of(name), '...')}" for name in missing
+        )
+        asked = ", ".join(map(model.kind_of, missing))
         raise BadInput(
-            f"topic {[*own[row], *everything][0].name} does not state {', '.join(missing)}; give "
+            f"topic {[*own[row], *everything][0].name} does not state {asked}; give "
             f"{'it' if len(missing) == 1 else 'them'} with {mend}{better}"
         )
     if stage.modes:
@@ -207,13 +211,15 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
     names = number_fields(stage.model.parameters)
     given = {name: getattr(parameters, name) for name in names}
     read = set().union(*_needed(f"estimator {label}", stage, tuple(given.items())))
-    stating = _stating(found)
+    stating, model = _stating(found), stage.model
+    usual = {name: start.parameters.get(model.kind_of(name)) for name in names}
     return {
         name: number
-        for name, number in start.parameters.items()
-        if name in read
+        for name, number in usual.items()
+        if number is not None
+        and name in read
         and given[name] is None
-        and np.isnan(_stated(found, stating, name, stage.model.parameters))
+        and np.isnan(_stated(found, stating, model.kind_of(name), model.parameters))
         and name not in origin_parameters(found, parameters)
     }
 
@@ -241,6 +247,6 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))
     if sensor.noise is not None:
         sensor.noise(parameters)
-    mend = "".join(f"; give --set {name}=..." for name in sorted(parameters.read))
+    mend = "".join(f"; give --set {model.key_of(name)}=..." for name in sorted(parameters.read))
     what = sensor.covariance if isinstance(sensor.covariance, str) else "its covariance"
     return f"topic {topic}: {what} is missing{mend}"

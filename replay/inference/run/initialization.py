@@ -102,8 +102,9 @@ class Initializer:
     def _aligns(self) -> bool:
         """Tell whether fixes alone have to determine the whole state, and can."""
         model = self.stage.model
-        sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
-        return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
+        kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
+        can_align = bool(model.start and model.start.align)
+        return can_align and len(kinds) == 1 and max(kinds.values()) < model.size
 
     def find(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
@@ -202,7 +203,8 @@ class Initializer:
 
     def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
         """Report that fixes did not determine all, where a run begins without."""
-        [measured] = [sensor.measured for _, sensor, _ in self._measuring]
+        _, sensor, _ = self._measuring[0]
+        measured = sensor.measured
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
         text = (
             f"{names}: unknown at the start, since with these noise densities the path between the "
@@ -269,9 +271,9 @@ class Initializer:
             ragged = first[topic.name]
             if origins is not None and topic in self.found.geodetic:
                 ragged = in_plane(ragged, origins)
-            given[sensor.topic] = ragged
+            given.setdefault(sensor.topic, ragged)  # the first of its kind
             given |= {each.topic: static[each.topic] for each in sensor.maps}
-        return given, reading_settings(number_fields(model.parameters))(self.settings, 0)
+        return given, self._parameters()
 
     def _checked_prior(
         self,
@@ -317,13 +319,17 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Begin runs just after first fixes that, with the path between them, determine the state."""
-        numbers = [number for number, _, _ in self._measuring]
+        """Begin runs just after first fixes that, with the path between them, determine the state.
+
+        Of several topics of a kind, these are the fixes of the first.
+        """
+        numbers = [number for number, _, _ in self._measuring[:1]]
         sensors = tuple(self.found.sensors[number] for number in numbers)
         found = self.found._replace(sensors=sensors)
         stage = self.stage._replace(sensors=tuple(sensor for sensor, _ in sensors))
         settings = self.settings[[0, *(1 + number for number in numbers)]]
-        names = [topic.name for topic in self._starting]
+        others = {topic.name for _, _, topic in self._measuring[1:]}
+        names = [topic.name for topic in self._starting if topic.name not in others]
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
         events, _ = filter_events(stage, found, block, Context({}, origins), settings)
@@ -332,20 +338,18 @@ class Initializer:
             events, _ = compensate_delays(stage, events, delays_ns, is_end=True)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
-            solved = self._align(events, run, stage, settings)
+            solved = self._align(events, run, stage)
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
         return Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
 
-    def _align(
-        self, events: FilterEvents, run: int, stage: Stage, settings: Floats
-    ) -> tuple[int, Floats, Floats] | None:
+    def _align(self, events: FilterEvents, run: int, stage: Stage) -> tuple[int, Floats, Floats] | None:
         """Align a run: stamp, mean and covariance at the last of its first fixes; None if they end."""
         model = stage.model
         assert model.start is not None
         assert model.start.align is not None
-        parameters = reading_settings(number_fields(model.parameters))(settings, 0)
+        parameters = self._parameters()
         state, control = (0.0,) * model.size, np.zeros(model.controls)
         path: list[Any] = []
         places: list[Floats] = []
@@ -376,6 +380,16 @@ class Initializer:
                 if solved is not None:
                     return time_ns + 1, *solved
         return None
+
+    def _parameters(self) -> Any:
+        """Return the parameters; of those that topics have, these are the first topic's of each kind."""
+        model = self.stage.model
+        names, numbers = number_fields(model.parameters), self.settings.copy()
+        for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):
+            for field, (owner, name) in model.owned.items():
+                if owner == topic.name:
+                    numbers[0, names.index(name)] = numbers[number, names.index(field)]
+        return reading_settings(names)(numbers, 0)
 
     def _complaints(self) -> str:
         complaints = [

@@ -53,16 +53,19 @@ def reading_of(stage: Stage, found: Found) -> Reading:
             read = np.where([name in replaced for name in control.components], 0.0, read)
         return read
 
+    biases, factors = _own_errors(stage, found)
+    key = model.key_of
     return Reading(
         tuple(drives),
         kinds,
         {topic: tuple(name for each in own for name in each.measured) for topic, own in sensors.items()},
         numbers,
-        _noises(stage, found),
-        _augmentable(stage, found),
-        *_own_errors(stage, found),
-        {topic.name: sensor.delay for sensor, topic in found.sensors if sensor.delay},
-        _calibration(stage, found),
+        {key(name): topic for name, topic in _noises(stage, found).items()},
+        {key(name): each for name, each in _augmentable(stage, found).items()},
+        {place: key(name) for place, name in biases.items()},
+        {place: key(name) for place, name in factors.items()},
+        {topic.name: key(sensor.delay) for sensor, topic in found.sensors if sensor.delay},
+        {key(name): sigma for name, sigma in _calibration(stage, found).items()},
     )
 
 

@@ -18,7 +18,7 @@ from recorders.log import Clock, Stream
 from recorders.trajectories import Trajectory
 from replay.engine.streams.planes import HEADING, VECTORS, Movement, moved_states
 from replay.engine.streams.sources import LogSource
-from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.components import in_body_axes, stated_components
 from replay.judging.errors.planes import ALIGNED
 
 Floats = NDArray[np.float64]
@@ -142,6 +142,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
 
     Raises BadInput where a planar state would be turned out of its plane.
     """
+    estimates = in_body_axes(estimates)
     components = stated_components(estimates.metadata, {}, f"topic {estimates.topic}")
     is_flat = components.get(HEADING) == "angle" or any(
         0 < len(components.keys() & set(vector)) < len(vector) for vector in VECTORS

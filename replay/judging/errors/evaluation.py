@@ -23,6 +23,7 @@ from replay.engine.streams.planes import into_plane_of
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import (
     Components,
+    in_body_axes,
     match_components,
     match_tangent,
     stated_components,
@@ -226,6 +227,7 @@ def errors_of(
     is of another kind.
     """
     sources = [each.source for each in truths]
+    estimates = replace(estimates, stream=in_body_axes(estimates.stream))
     stream = estimates.stream
     components = _components(stream)
     truth_topic = stream.metadata.get("truth", "")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
@@ -11,6 +12,8 @@ from recorders.errors import BadInput
 from recorders.log import RunMetadata
 from recorders.models.orientation import axis_angle_between
 from recorders.recording import Recording
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import memory_source
 from replay.estimators.orientation.inertial import (
     InertialModel,
@@ -222,10 +225,31 @@ def test_a_unit_that_never_rests_is_refused(kind: str, rate_radps: float) -> Non
 METHODS = ({"kind": "gyro"}, {"kind": "bingham-inertial"}, {"kind": "madgwick"}, {"kind": "mahony"})
 
 
-@pytest.mark.parametrize("settings", [*METHODS, {"kind": "ekf", "model": "orientation"}])
+def with_own_topic(source: fl.MemorySource, topic: str) -> fl.MemorySource:
+    """The fields of a unit as those of a magnetometer, a millisecond before the unit's samples."""
+    samples = source.streams["/body/inertial"]
+    rows = np.isfinite(samples["magnetic_field_ut"]).all(axis=1)
+    fields = fl.make_stream(
+        topic,
+        fl.schemas.MAGNETIC_FIELD,
+        samples.publish_time_ns[rows] - 10**6,
+        magnetic_field_ut=samples["magnetic_field_ut"][rows],
+        covariance_ut2=np.full((int(rows.sum()), 9), np.nan),
+    )
+    without = {**samples.columns, "magnetic_field_ut": np.empty((len(samples), 0))}
+    streams = {samples.topic: replace(samples, columns=without), topic: fields}
+    return replace(source, streams=streams)
+
+
+@pytest.mark.parametrize(
+    "settings", [*METHODS, {"kind": "vqf"}, {"kind": "triad"}, {"kind": "ekf", "model": "orientation"}]
+)
 @pytest.mark.parametrize("every", [3, 10])
 def test_a_slower_magnetometer_is_one_of_its_own_rate(settings: dict[str, str], every: int) -> None:
-    """Between its samples there are NaN: no sample, and no reading; the turn of 90 degrees is found."""
+    """Between its samples there are NaN: no sample, and no reading; the turn of 90 degrees is found.
+
+    On a topic of its own, in the unit's namespace or another, it gives the same.
+    """
     source, world = nine_axes(
         np.interp(np.arange(0.0, 20.0, 1.0 / RATE_HZ), [6.0, 9.0], [0.0, 90.0]), 0.0
     )
@@ -233,11 +257,40 @@ def test_a_slower_magnetometer_is_one_of_its_own_rate(settings: dict[str, str], 
     field = samples["magnetic_field_ut"].copy()
     field[np.arange(len(field)) % every != 1] = np.nan
     slower = replace(samples, columns={**samples.columns, "magnetic_field_ut": field})
-    replay = fl.replay(replace(source, streams={samples.topic: slower}), {"of": settings})
-    assert not replay.failures
-    last = replay.estimates[0]["/estimates/of/body/state"]["mean"][-1, :4]
-    error = world[-1].inv() * Rotation.from_quat(last, scalar_first=True)
-    assert np.degrees(error.magnitude()) < 3.0
+    nine = replace(source, streams={samples.topic: slower})
+    found = []
+    for log in (nine, *(with_own_topic(nine, f"/{name}/magnetic_field") for name in ("body", "mag"))):
+        done = fl.replay(log, {"of": settings})
+        assert not done.failures
+        mean = done.estimates[0]["/estimates/of/body/state"]["mean"][:, :4]
+        last = mean[np.isfinite(mean).all(axis=1)][-1]
+        found.append(mean)
+        error = world[-1].inv() * Rotation.from_quat(last, scalar_first=True)
+        assert np.degrees(error.magnitude()) < 3.0
+    assert_array_equal(found[1], found[2])
+    if settings["kind"] != "ekf":  # which takes the field at its own stamp
+        assert_array_equal(found[0], found[1])
+
+
+@pytest.mark.parametrize("kind", ["madgwick", "bingham-inertial"])
+def test_a_magnetometer_in_blocks_is_as_in_the_whole(kind: str) -> None:
+    """A field at the end of a block is that of the next block's first sample; of two runs as of each."""
+    runs = [
+        with_own_topic(
+            nine_axes(np.interp(np.arange(1500.0), [700, 900], ends))[0], "/body/magnetic_field"
+        )
+        for ends in ([0.0, 90.0], [0.0, -40.0])
+    ]
+    whole, parts = (
+        collect(replay(runs, bind("of", runs, {"kind": kind}), block_messages=count))
+        for count in (10**6, 7)
+    )
+    for topic, rows in whole.items():
+        if topic.endswith("/state"):
+            assert_array_equal(parts[topic]["mean"], rows["mean"])
+            alone = [bind("of", [run], {"kind": kind}) for run in runs]
+            each = [collect(replay([run], own)) for run, own in zip(runs, alone, strict=True)]
+            assert_array_equal(np.concatenate([one[topic]["mean"] for one in each]), rows["mean"])
 
 
 @pytest.mark.parametrize("settings", METHODS)

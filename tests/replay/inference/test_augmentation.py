@@ -124,7 +124,8 @@ def test_augmented_models_keep_to_what_they_declare() -> None:
 
 def test_what_can_be_estimated_is_listed() -> None:
     listed = (
-        "bias_range_m, bias_bearing_rad (angle), forward_scale, turn_bias_radps, lever_x_m, lever_y_m"
+        "bias_range_m, bias_bearing_rad (angle), bias_heading_rad (angle), forward_scale, "
+        "turn_bias_radps, lever_x_m, lever_y_m"
     )
     assert fl.models["robot"].facts["estimable"] == listed
 

@@ -26,6 +26,7 @@ MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "
 
 
 @pytest.mark.paper
+@pytest.mark.filterwarnings("ignore:.* does not add up")
 @pytest.mark.parametrize("name", MODELS)
 def test_right_models_pass(name: str) -> None:
     """All that are registered, and those of the tests: angles, an axis, a quaternion, all noises."""
@@ -239,3 +240,33 @@ def test_states_and_parameters_may_be_given() -> None:
     with pytest.raises(BadInput, match="no parameter 'sigma'"):
         check_model(VEHICLE_A, {"sigma": 2.0})
     check_model(VEHICLE_A, states=[[0.0, 0.0, np.pi, 0.0, 0.0]])  # no speed, no turn, at the cut
+
+
+GIVEN = VEHICLE_A.motion.noise
+assert GIVEN is not None
+SHARES: dict[str, Any] = {
+    "fixed": lambda duration_s: 1.0 + 0.0 * duration_s,
+    "root": lambda duration_s: duration_s**0.5,
+    "square": lambda duration_s: duration_s**2,
+}
+
+
+@pytest.mark.parametrize("case", SHARES)
+def test_noise_of_the_step_is_noticed(case: str) -> None:
+    """Noise over a step has to be that of its halves, or estimates depend on the number of messages."""
+
+    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        return tuple(SHARES[case](duration_s) for _ in range(VEHICLE_A.tangent))
+
+    with pytest.warns(UserWarning, match=r"noise \(test_checking.py, line \d+\): .* does not add up"):
+        said = check_model(replace(VEHICLE_A, motion=replace(VEHICLE_A.motion, noise=noise)))
+    assert "add up" in said[-1]
+
+
+def test_noise_of_the_control_is_looked_at_too() -> None:
+    """A variance of the control per message loses weight as messages get more."""
+    robot = MODELS["robot"]
+    check_model(robot)
+    motion = replace(robot.motion, control_noise=lambda *_: (1.0, 1.0))
+    with pytest.warns(UserWarning, match="variance of x_m, y_m, heading_rad is 2 times"):
+        check_model(replace(robot, motion=motion))

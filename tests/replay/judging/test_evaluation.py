@@ -25,9 +25,11 @@ from recorders.log import (
 from recorders.log.streams import empty_stream
 from recorders.recording import Recording
 from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.priors import priors_of
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.covariances import normalized_error_squared
 from replay.engine.vectors.tangent import truth_at
+from replay.judging.errors.alignment import Alignment, aligned_estimates
 from replay.judging.errors.evaluation import (
     chi_square_interval,
     components_without_truth,
@@ -237,6 +239,35 @@ def test_an_orientation_keeps_its_block_where_other_components_are_left_out():
     assert_allclose(errors.error, [error], atol=1e-12)
     assert_array_equal(errors.covariance, [covariance[kept][:, kept]])
     assert_allclose(errors.nees, error @ np.linalg.solve(covariance[kept][:, kept], error), rtol=1e-9)
+
+
+def test_rotation_covariances_about_the_axes_of_the_world():
+    """As ROS states them: the same numbers as about those of the body, aligned and as a prior too."""
+    own = {f"orientation_{each}": "quaternion" for each in "wxyz"}
+    kinds = {"v_mps": "linear", "x_m": "linear", "y_m": "linear", "z_m": "linear", **own}
+    stated = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
+    body = Rotation.from_rotvec([0.9, -1.1, 0.4])
+    root = np.random.default_rng(2).normal(size=(7, 7))
+    own_covariance = root @ root.T
+    turn = np.eye(7)
+    turn[4:, 4:] = body.as_matrix()
+    mean = [4, 1, 2, 3, *body.as_quat(scalar_first=True)]
+    in_body = estimates([1], [mean], own_covariance, **stated)
+    in_world = estimates([1], [mean], turn @ own_covariance @ turn.T, **stated, rotation_axes="world")
+    move = Alignment(Rotation.from_rotvec([0.1, 0.7, -0.4]).as_matrix(), np.arange(3.0))
+    true = [Truths(source(truth([1], [[3, 1, 1, 1, 1, 0, 0, 0]], **stated)))]
+    for change in (lambda stream: stream, lambda stream: aligned_estimates(stream, move)):
+        first, second = (errors_of(gather([change(each)]), true) for each in (in_body, in_world))
+        assert first is not None
+        assert second is not None
+        assert_allclose(second.covariance, first.covariance, atol=1e-12)
+        assert_allclose(second.nees, first.nees, rtol=1e-9)
+    wanted = {name: kinds[name] for name in (*own, "v_mps")}
+    first, second = (priors_of(gather([each]), wanted).covariance for each in (in_body, in_world))
+    assert_allclose(second, first, atol=1e-12)
+    wrong = estimates([1], [mean], own_covariance, **stated, rotation_axes="map")
+    with pytest.raises(BadInput, match="rotation_axes = map; state body or world"):
+        errors_of(gather([wrong]), true)
 
 
 def test_of_an_ensemble_only_what_all_truths_have_is_judged():

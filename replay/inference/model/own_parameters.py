@@ -1,0 +1,196 @@
+"""Gives topics parameters of their own: two receivers have two lever arms, a second compass its offset.
+
+A transformation of models: the sensor of a topic reads the topic's own parameter in place of that of its
+kind. It is called `/gps2/fix.lever_x_m`, and has the value of `lever_x_m` unless it is set. Methods,
+states that parameters become part of, and what is written as C have it as any other.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Annotated, Any
+
+from pydantic import create_model
+
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters, build, field_of, meanings
+from replay.engine.arrays import Function
+from replay.inference.model.binding import Found
+from replay.inference.model.model import Model, Sensor
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.settings import TracedParameters
+from replay.inference.model.validation import trial_state
+
+Tables = Mapping[str, Mapping[str, Any]]
+
+
+def with_own_parameters(
+    model: Model, found: Found, tables: Tables, parameters: Parameters
+) -> tuple[Model, Found, Any]:
+    """Return a model whose topics have parameters of their own, its topics, and the parameters.
+
+    They are given to topics that some are set for, and to all of a kind of which there are several.
+
+    Args:
+        model: the model.
+        found: its topics.
+        tables: what is set, by topic and name.
+        parameters: what is set of all topics.
+    """
+    kinds = [sensor.topic for sensor, _ in found.sensors]
+    own = tuple(
+        (number, topic.name)
+        for number, (sensor, topic) in enumerate(found.sensors)
+        if topic.name in tables or kinds.count(sensor.topic) > len(_uses(model, sensor))
+    )
+    if not own:
+        return model, found, parameters
+    sensors = tuple(sensor for sensor, _ in found.sensors)
+    model, sensors = _transformed(model, sensors, own)
+    values = {
+        field: tables.get(topic, {}).get(name, getattr(parameters, name))
+        for field, (topic, name) in model.owned.items()
+    }
+    pairs = zip(sensors, found.sensors, strict=True)
+    kind = _with_fields(type(parameters), tuple(model.owned.items()))
+    given = {name: getattr(parameters, name) for name in type(parameters).model_fields}
+    found = found._replace(sensors=tuple((each, topic) for each, (_, topic) in pairs))
+    return model, found, kind(**given, **values)
+
+
+def check_tables(label: str, model: Model, found: Sequence[Found], tables: Tables) -> None:
+    """Raise BadInput if a topic with own parameters is not taken, or its sensor reads no such one."""
+    for topic, table in tables.items():
+        sensors = [sensor for each in found for sensor, own in each.sensors if own.name == topic]
+        if not sensors:
+            taken = dict.fromkeys(own.name for each in found for _, own in each.sensors)
+            raise BadInput(
+                f"estimator {label}: {topic} is no topic of a sensor that it takes; "
+                f"{choices(topic, taken)}; --set topics.KIND=TOPIC,TOPIC takes several of a kind"
+            )
+        known = dict.fromkeys(name for sensor in sensors for name in read_by(model, sensor))
+        for name in table:
+            if name not in known:
+                raise BadInput(
+                    f"estimator {label}: {topic}.{name}: its sensor reads no such parameter; "
+                    f"{choices(name, known)}"
+                )
+        build(model.parameters, table, f"estimator {label}: {topic}")
+
+
+def read_by(model: Model, sensor: Sensor) -> list[str]:
+    """List the parameters that a sensor reads, and the motion does not."""
+    names = number_fields(model.parameters)
+    traced = TracedParameters(dict.fromkeys(names))
+    state = trial_state(model.kinds)
+    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+    sensor.measure(state, *entering, (1.0,) * sensor.reference_size, traced)
+    if sensor.noise is not None:
+        sensor.noise(traced)
+    moving = TracedParameters(dict.fromkeys(names))
+    for motion in (model.motion, *(model.modes or {}).values()):
+        entering = ((0.0,) * motion.noises,) if motion.noises else ()
+        motion.move(state, (0.0,) * model.controls, *entering, 1.0, moving)
+    read = traced.read | {sensor.delay}
+    return [name for name in names if name in read - moving.read]
+
+
+def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
+    """List the sensors of a model that one topic of this kind is for."""
+    return [each for each in model.all_sensors if each.topic == sensor.topic]
+
+
+@lru_cache(maxsize=64)
+def _transformed(
+    model: Model, sensors: tuple[Sensor, ...], own: tuple[tuple[int, str], ...]
+) -> tuple[Model, tuple[Sensor, ...]]:
+    """Give the sensors with these numbers parameters of their topics.
+
+    Raises BadInput if two topics have names that differ in their marks alone.
+    """
+    names = {number: _fields_of(topic, read_by(model, sensors[number])) for number, topic in own}
+    owned: dict[str, tuple[str, str]] = {}
+    for number, topic in own:
+        for name, field in names[number].items():
+            if owned.setdefault(field, (topic, name)) != (topic, name):
+                raise BadInput(
+                    f"{topic} and {owned[field][0]}: name one of them otherwise: merge --rename"
+                )
+    made = replace(
+        model,
+        parameters=_with_fields(model.parameters, tuple(owned.items())),
+        augmentable=_with_owned(model.augmentable, owned),
+        calibration=_with_owned(model.calibration, owned),
+        owned=owned,
+    )
+    changed = [
+        _sensor(sensor, names[number]) if number in names else sensor
+        for number, sensor in enumerate(sensors)
+    ]
+    return made, tuple(changed)
+
+
+def _fields_of(topic: str, names: Iterable[str]) -> dict[str, str]:
+    return {name: field_of(f"{topic}.{name}") for name in names}
+
+
+def _with_owned(given: Mapping[str, Any], owned: Mapping[str, tuple[str, str]]) -> dict[str, Any]:
+    return {**given, **{field: given[name] for field, (_, name) in owned.items() if name in given}}
+
+
+@lru_cache(maxsize=64)
+def _with_fields(
+    parameters: type[Parameters], owned: tuple[tuple[str, tuple[str, str]], ...]
+) -> type[Any]:
+    """Add the topics' own parameters to others, with the bounds of what they stand for."""
+    said, fields, lines = meanings(parameters), dict[str, Any](), list[str]()
+    for field, (topic, name) in owned:
+        entry = parameters.model_fields[name]
+        bounds: Any = (
+            Annotated[(entry.annotation, *entry.metadata)] if entry.metadata else entry.annotation
+        )
+        fields[field] = bounds | None, None
+        lines.append(f"    {field}: {said.get(name, name).rstrip('.')}; of {topic}.")
+    doc = "\n".join(["States what topics have for themselves.", "", "Attributes:", *lines])
+    made = create_model(f"{parameters.__name__}OfTopics", __base__=parameters, __doc__=doc, **fields)
+    made.OWNED = dict(owned)  # type: ignore[attr-defined]
+    return made
+
+
+def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
+    """Return the sensor with functions that read the topic's own parameters."""
+
+    def reading(function: Function | None, place: int = -1) -> Function | None:
+        return function and _reading(function, place, fields)
+
+    return replace(
+        sensor,
+        measure=_reading(sensor.measure, -1, fields),
+        noise=reading(sensor.noise),
+        log_likelihood=reading(sensor.log_likelihood),
+        jacobian=reading(sensor.jacobian, 2),
+        moments=reading(sensor.moments, 3),
+        delay=fields.get(sensor.delay, sensor.delay),
+        stated={fields.get(name, name): read for name, read in sensor.stated.items()},
+    )
+
+
+class _Own:
+    """Reads parameters, in place of some those of a topic."""
+
+    def __init__(self, parameters: Any, fields: Mapping[str, str]) -> None:
+        self._parameters, self._fields = parameters, fields
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._parameters, self._fields.get(name, name))
+
+
+def _reading(function: Function, place: int, fields: Mapping[str, str]) -> Function:
+    """Make a function whose parameters, at a place of its arguments, are the topic's own."""
+
+    def read(*arguments: Any) -> Any:
+        given = list(arguments)
+        given[place] = _Own(given[place], fields)
+        return function(*given)
+
+    return read
