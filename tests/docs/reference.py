@@ -3,6 +3,7 @@
 import ast
 import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
@@ -55,6 +56,7 @@ TYPES = {
 }
 
 
+@cache
 def reference() -> dict[str, str]:
     """The text of each page, by its place in the site."""
     kinds = (_kind(kind, entries(), what) for kind, (entries, what) in KINDS.items())
