@@ -29,6 +29,10 @@ test: .venv/with-test
 test-fast: .venv/with-test
 	$(MAKE) -j2 fast-tests lint
 
+# one thread for each process: with more, the products of NumPy, SciPy and scikit-learn wait for one another
+all-tests fast-tests keep-numbers: export OPENBLAS_NUM_THREADS = 1
+all-tests fast-tests keep-numbers: export OMP_NUM_THREADS = 1
+
 all-tests: .venv/with-test
 	$(BIN)/pytest -n logical --dist loadfile
 

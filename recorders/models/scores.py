@@ -103,12 +103,12 @@ def comparisons_of(stream: Stream) -> Comparisons:
     matchers = matchers_of(stream.metadata)
     probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
     users = int(max(probe.max(initial=-1), gallery.max(initial=-1))) + 1
-    pairs = np.unique(probe * users + gallery)
-    if len(pairs) != len(stream) or len(stream) != users**2:
+    pairs = probe * users + gallery
+    if len(stream) != users**2 or not (np.bincount(pairs) == 1).all():
         raise BadInput(
-            f"topic {stream.topic}: {len(stream)} score vectors, {len(pairs)} of them of different "
-            f"pairs, for {users} users; every probe must be compared with every gallery entry exactly "
-            "once"
+            f"topic {stream.topic}: {len(stream)} score vectors, {len(np.unique(pairs))} of them of "
+            f"different pairs, for {users} users; every probe must be compared with every gallery entry "
+            "exactly once"
         )
     scores = np.empty((users, users, len(matchers)))
     scores[probe, gallery] = stream["scores"]

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import i0e, i1e, log_softmax, logsumexp
+from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
 from recorders.extras import extra
@@ -84,7 +85,8 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
     with extra("papers", "a mixture on the torus"):
         from sklearn.cluster import KMeans  # which takes long to import
 
-    labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
+    with threadpool_limits(1):  # points this few only keep a second core spinning
+        labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]
     mean = np.angle(share.T @ np.exp(1j * angles))
     now = WrappedMixture(share.mean(axis=0), mean, np.tile(np.eye(2), (components, 1, 1)))

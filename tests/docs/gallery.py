@@ -1,6 +1,7 @@
 """The gallery: a card for every shipped experiment, with its picture, its command and its page."""
 
 import re
+from functools import cache
 from pathlib import Path
 
 from pipeline.api.catalog import Entry, experiments
@@ -20,6 +21,7 @@ to the page that says what it shows.
 """
 
 
+@cache
 def gallery() -> str:
     """The text of the page."""
     return HEAD + "\n".join([_card(each) for each in experiments()]) + "\n</div>\n"

@@ -3,6 +3,7 @@
 import ast
 import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
@@ -46,6 +47,7 @@ KINDS: dict[str, tuple[Callable[[], list[Entry]], str]] = {
     ),
     "metrics": (catalog.metrics, "What estimates are judged by."),
 }
+PLACES = [f"reference/{name}.md" for name in ("commands", "python", "messages", "speed", *KINDS)]
 TYPES = {
     "time_ns": "`optional sfixed64`, ns",
     "identifier": "`optional fixed32`",
@@ -54,14 +56,17 @@ TYPES = {
 }
 
 
+@cache
 def reference() -> dict[str, str]:
     """The text of each page, by its place in the site."""
-    pages = {"commands": COMMANDS, "python": _python(), "messages": _messages(), "speed": _speed()}
-    for kind, (entries, what) in KINDS.items():
-        matrix = _methods_of_models() if kind == "models" else []
-        sections = [line for entry in entries() for line in _section(entry)]
-        pages[kind] = "\n".join([f"# {kind.title()}", "", what, "", *matrix, *sections])
-    return {f"reference/{name}.md": text for name, text in pages.items()}
+    kinds = (_kind(kind, entries(), what) for kind, (entries, what) in KINDS.items())
+    return dict(zip(PLACES, [COMMANDS, _python(), _messages(), _speed(), *kinds], strict=True))
+
+
+def _kind(kind: str, entries: Sequence[Entry], what: str) -> str:
+    matrix = _methods_of_models() if kind == "models" else []
+    sections = [line for entry in entries for line in _section(entry)]
+    return "\n".join([f"# {kind.title()}", "", what, "", *matrix, *sections])
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -1,8 +1,9 @@
 """Tests of the kept numbers: what a fault is told by, and how numbers are kept on purpose."""
 
-import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from pipeline.output.charts import Chart, Panel, Series
 from pipeline.output.results import Outcome
 from recorders.log import make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
+from tests.goldens import keeping
 from tests.goldens.keeping import FOLDER, MOST_LINES, TESTS, against, capped, kept_of, read, written
 from tests.goldens.numbers import Quantities, of_outcome, of_recording
 
@@ -87,14 +89,6 @@ def test_a_long_message_is_cut() -> None:
     assert lines[MOST_LINES - 1 :] == [str(MOST_LINES - 1), "... and 5 more"]
 
 
-PLUGIN = """
-from pathlib import Path
-from tests.goldens import keeping
-
-pytest_plugins = ["tests.goldens.keeping"]
-keeping.TESTS = Path(__file__).parent
-keeping.FOLDER = keeping.TESTS / "numbers"
-"""
 MODULE = """
 from tests.goldens import keeping
 from tests.goldens.numbers import Name
@@ -111,25 +105,21 @@ def test_of_one():
 
 
 @pytest.fixture
-def tried(tmp_path: Path) -> Callable[..., tuple[int, str]]:
-    """Runs pytest in a folder of its own, with a module that finds this value."""
-    (tmp_path / "conftest.py").write_text(PLUGIN)
+def tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str]]:
+    """Runs pytest within this run, in a folder of its own, with a module that finds this value."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # the module changes within a second
+    monkeypatch.setattr(keeping, "TESTS", tmp_path)
+    monkeypatch.setattr(keeping, "FOLDER", tmp_path / "numbers")
 
     def run(value: float, *options: str, more: str = MORE) -> tuple[int, str]:
         (tmp_path / "test_it.py").write_text(MODULE.format("{}", value, more))
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            str(tmp_path),
-            f"--rootdir={tmp_path}",
-            *options,
-        ]
-        done = subprocess.run(
-            [*command, "-p", "no:cacheprovider"], cwd=TESTS.parent, capture_output=True, text=True
-        )
-        return done.returncode, done.stdout
+        sys.modules.pop("test_it", None)
+        keeping.kept.cache_clear()
+        own = ["-q", "-p", "no:cacheprovider", "-p", keeping.__name__, "--import-mode=importlib"]
+        with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+            patch.setattr(keeping, "SESSION", keeping.Session())
+            code = pytest.main([*own, f"--rootdir={tmp_path}", str(tmp_path), *options])
+        return int(code), said.getvalue()
 
     return run
 

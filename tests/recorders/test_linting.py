@@ -5,9 +5,9 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from recorders.linting.lint import lint
 from recorders.linting.magnetic import FIELD, units
 from recorders.linting.names import frames
 from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
+from recorders.plausibility.finding import Finding
 from recorders.recording import import_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
@@ -317,10 +318,16 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
 }
 
 
+@cache
+def found_of(name: str, seed: int) -> Sequence[Finding]:
+    """What is found of a fault that is put in."""
+    return lint([FAULTS[name][0](clean(seed))])
+
+
 def missed(name: str, seed: int) -> str:
     """What is said of a fault that is put in, where it is not what is to be said; else nothing."""
-    put, topic, cause, words = FAULTS[name]
-    found = lint([put(clean(seed))])
+    _, topic, cause, words = FAULTS[name]
+    found = found_of(name, seed)
     is_told = any((each.cause, each.topic) == (cause, topic) and words in each.words for each in found)
     return "" if is_told else f"{name}, seed {seed}: {[each.words for each in found]}"
 
@@ -395,14 +402,12 @@ def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None
     """From the file, as the command's --set reads it."""
     advised = 0
     for name, (put, topic, cause, words) in FAULTS.items():
-        run = put(clean(1))
-        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
-        write_log(path, list(run.values()), RunMetadata("made", epoch_ns=BEGIN_NS))
-        told = [
-            each for each in fl.lint(path) if each.cause == cause and words in each.words and each.key
-        ]
+        of_fault = [each for each in found_of(name, 1) if each.cause == cause and words in each.words]
+        told = [each for each in of_fault if each.key]
         if not told:
             continue
+        path = tmp_path / f"{advised}.mcap"
+        write_log(path, list(put(clean(1)).values()), RunMetadata("made", epoch_ns=BEGIN_NS))
         advised += 1
         mended = fl.lint(path, set={told[0].key: told[0].setting})
         assert not [each for each in mended if each.cause == cause and each.topic == topic], name
@@ -441,12 +446,12 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
 def test_every_line_of_a_mapping_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     advised = []
     for name, (put, topic, cause, words) in FAULTS.items():
-        run = put(clean(1))
-        told = [each for each in lint([run]) if each.cause == cause and words in each.words]
+        told = [each for each in found_of(name, 1) if each.cause == cause and words in each.words]
         advice = told[0].mapping
         if "in the mapping" not in advice or name == "a frame's name":  # whose bag's mapping it is of
             continue
         advised.append(name)
+        run = put(clean(1))
         mended = lint([{**run, topic: imported(tmp_path, run[topic], advice)}])
         assert not [each for each in mended if (each.cause, each.topic) == (cause, topic)], name
     assert len(advised) == 22

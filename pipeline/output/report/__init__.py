@@ -50,6 +50,7 @@ SCENES = ("scene", "lens")  # figures that a comparison keeps, which has no logs
 MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
+_NOT_PLAIN = re.compile(r"[^ -~\n\t]")  # all but printable ASCII, line breaks and tabs
 
 
 class _Timings(Parameters):
@@ -154,8 +155,8 @@ def _visible(value: object) -> object:
     """Show control characters of a text by their numbers, in all that the page is made of."""
     if not isinstance(value, str) or value.isprintable():
         return value
-    shown = "".join(
-        each if each in "\n\t" or category(each) == "Zs" else printable(each) for each in value
+    shown = _NOT_PLAIN.sub(
+        lambda each: each[0] if category(each[0]) == "Zs" else printable(each[0]), value
     )
     return Markup(shown) if isinstance(value, Markup) else shown
 

@@ -81,9 +81,11 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
     count, length, size = sequences.shape
     vectors = sequences.reshape(-1, size)
     emission = np.empty((len(vectors), *model.weights.shape))
-    patterns, pattern = np.unique(np.isnan(vectors), axis=0, return_inverse=True)
-    for number, missing in enumerate(patterns):
-        rows, kept = pattern == number, np.flatnonzero(~missing)
+    missing, left = np.isnan(vectors), np.ones(len(vectors), bool)
+    while left.any():
+        pattern = missing[np.argmax(left)]
+        rows, kept = (missing == pattern).all(axis=1), np.flatnonzero(~pattern)
+        left &= ~rows
         seen = model._replace(
             means=model.means[..., kept], covariances=model.covariances[..., kept[:, None], kept]
         )

@@ -119,7 +119,10 @@ def check_model(
         for call, part in zip(calls, parts, strict=True):
             for state in tried:
                 _check_length(call, call.value(state, *call.others(rng)))
-            by_state = [_check_derivatives(call, state, call.others(rng), part) for state in tried]
+            exact = _derivatives_of(call)
+            by_state = [
+                _check_derivatives(call, exact, state, call.others(rng), part) for state in tried
+            ]
             _check_linear(call, part.linear, by_state)
             _check_jumps(call, tried, rng)
             _check_twins(call, tried, rng)
@@ -204,29 +207,38 @@ def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
     return found[0]
 
 
-def _check_derivatives(
-    call: _Call, state: Floats, others: list[Floats], part: Motion | Sensor
-) -> Floats:
-    """Compare derivatives with differences and what is written by hand; returns that by the state."""
+def _derivatives_of(call: _Call) -> Function:
+    """Make a function of a state and other inputs that gives exact Jacobians, by the inputs' names."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
-    sizes = {"state": tangent_size(kinds), **{name: n for name, (n, _) in call.inputs.items()}}
+    counts = {name: n for name, (n, _) in call.inputs.items()}
     inputs = [Input("state", kinds, "state")]
-    inputs += [Input(name, ("linear",) * n, name if n else "") for name, (n, _) in call.inputs.items()]
-    rows = tangent_size(outputs)
-    work = SimpleNamespace(
-        values=np.empty(len(outputs)), **{name: np.zeros((rows, size)) for name, size in sizes.items()}
-    )
-    given = (tuple(state), *map(tuple, others), *call.rest)
+    inputs += [Input(name, ("linear",) * n, name if n else "") for name, n in counts.items()]
+    shapes = [(0.0,) * n for n in (len(kinds), *counts.values())]
     try:
-        linearise = derivative(traced(call.function, *arguments_like(given)), inputs, outputs, "values")
+        function = traced(call.function, *arguments_like((*shapes, *call.rest)))
+        linearise = derivative(function, inputs, outputs)
     except BadInput as error:
         raise AssertionError(str(error)) from error
-    linearise(*given, work)
-    for index, name in enumerate(sizes):
+    rows, sizes = tangent_size(outputs), {"state": tangent_size(kinds), **counts}
+
+    def exact(state: Floats, others: Sequence[Floats]) -> dict[str, Floats]:
+        jacobians = {name: np.zeros((rows, size)) for name, size in sizes.items()}
+        linearise(tuple(state), *map(tuple, others), *call.rest, SimpleNamespace(**jacobians))
+        return jacobians
+
+    return exact
+
+
+def _check_derivatives(
+    call: _Call, exact: Function, state: Floats, others: list[Floats], part: Motion | Sensor
+) -> Floats:
+    """Compare derivatives with differences and what is written by hand; returns that by the state."""
+    jacobians = exact(state, others)
+    for index, (name, jacobian) in enumerate(jacobians.items()):
         for column, slopes in enumerate(_slopes(call, [state, *others], index).T):
-            _compare(call, getattr(work, name), slopes, (name, column), 1e-6, "by central differences")
-    _check_by_hand(call, part, state, others, work)
-    return np.array(work.state)
+            _compare(call, jacobian, slopes, (name, column), 1e-6, "by central differences")
+    _check_by_hand(call, part, state, others, jacobians)
+    return jacobians["state"]
 
 
 def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
@@ -267,22 +279,25 @@ def _check_correction(
 
 
 def _check_by_hand(
-    call: _Call, part: Motion | Sensor, state: Floats, others: list[Floats], work: Any
+    call: _Call,
+    part: Motion | Sensor,
+    state: Floats,
+    others: list[Floats],
+    exact: Mapping[str, Floats],
 ) -> None:
     written: dict[str, Floats] = {}
     if isinstance(part, Motion) and part.jacobians is not None:
         control = others[0]
-        written = {name: np.zeros_like(getattr(work, name)) for name in ("state", "control")}
+        written = {name: np.zeros_like(exact[name]) for name in ("state", "control")}
         part.jacobians(tuple(state), tuple(control), *call.rest, written["state"], written["control"])
         if part.control_noise is None:  # nobody asks for it
             del written["control"]
     elif isinstance(part, Sensor) and part.jacobian is not None:
-        written = {"state": np.zeros_like(work.state)}
+        written = {"state": np.zeros_like(exact["state"])}
         part.jacobian(tuple(state), *call.rest, written["state"])
     for name, jacobian in written.items():
         for column in range(jacobian.shape[1]):
-            found = getattr(work, name)
-            _compare(call, found, jacobian[:, column], (name, column), 1e-9, "as written by hand")
+            _compare(call, exact[name], jacobian[:, column], (name, column), 1e-9, "as written by hand")
 
 
 def _compare(
@@ -358,11 +373,12 @@ def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
         others, direction = call.others(rng), np.empty(tangent_size(kinds))
         for kind, _, t, width in manifold_blocks(kinds):
             direction[t : t + width] = scales[kind] * rng.normal(size=width)
-        values = np.empty((STEPS + 1, len(call.outputs)))
-        for step in range(STEPS + 1):
-            state = states[path % len(states)].copy()
-            add(state, (step / STEPS - 0.5) * direction)
-            values[step] = call.value(state, *others)
+        along = np.repeat(states[path % len(states)][:, None], STEPS + 1, axis=1)
+        add(along, np.outer(direction, np.arange(STEPS + 1) / STEPS - 0.5))
+        rest = (*map(tuple, others), *call.rest)
+        values = np.array(
+            [call.function(state, *rest) for state in zip(*along, strict=True)], dtype=float
+        )
         change = np.diff(values[:, linear], axis=0)
         usual = np.abs(change)
         is_jump = np.abs(usual - TURN) < 0.5

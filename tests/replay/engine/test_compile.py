@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-import replay.engine.compiling.compile
 from recorders.errors import BadInput
 from recorders.importers.ros.files import ros1_file
 from recorders.importers.ulog import loops as ulog_loops
@@ -28,6 +27,7 @@ from replay.engine.compiling.kernel_cache import load
 from replay.engine.compiling.kernels import native
 from replay.engine.compiling.kernels.native import Kernel
 from replay.engine.compiling.through_numba import loop_of
+from tests.replay.engine.processes import printed
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
 MODULE = """
@@ -72,26 +72,11 @@ BOTH = pytest.mark.parametrize(
 )
 
 
-def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]:
+def imported(module: str, folder: Path, cache: Path, action: str = "error") -> list[str]:
     """What the module prints when a new process imports it."""
     (folder / "third_party.py").write_text(textwrap.dedent(module))
-    done = subprocess.run(
-        [sys.executable, "-W", "error", *options, "-c", "import third_party"],
-        cwd=folder,
-        env={
-            "HOME": str(folder),
-            "FUSELOG_CACHE": str(cache),
-            "PYTHONDONTWRITEBYTECODE": "1",  # a file changed within a second would be run as it was
-            "PYTHONPATH": str(
-                Path(replay.engine.compiling.compile.__file__).parents[2]
-            ),  # the tree that is under test
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+    environment = {"HOME": str(folder), "FUSELOG_CACHE": str(cache)}
+    return printed(["import third_party"], folder, environment, action)[0].splitlines()
 
 
 @pytest.mark.paper
@@ -124,20 +109,16 @@ def started(text: str, *arguments: str | Path) -> subprocess.Popen[str]:
 
 @BOTH
 @pytest.mark.paper
-def test_of_two_processes_that_want_a_kernel_one_compiles(
-    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch, module: str
-):
+def test_of_two_processes_that_want_a_kernel_one_compiles(tmp_path: Path, kernels: Path, module: str):
     """The other waits, and loads what the first has kept; no lock is left behind."""
-    ready = '    print("ready", flush=True)\n    input()\n'  # both are, before either compiles
+    ready = (  # both are, before either compiles
+        "    import os, pathlib, time\n"
+        "    pathlib.Path(f'ready-{os.getpid()}').touch()\n"
+        "    while len(list(pathlib.Path().glob('ready-*'))) < 2: time.sleep(0.01)\n"
+    )
     together = re.sub(r"(?m)^    (loop|native\.Kernel).*\.of\(", lambda line: ready + line[0], module)
     (tmp_path / "third_party.py").write_text(textwrap.dedent(together))
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
-    both = [started("import third_party") for _ in range(2)]
-    assert [process.stdout.readline() for process in both] == ["ready\n"] * 2
-    for process in both:
-        process.stdin.write("\n")
-        process.stdin.flush()
-    said = sorted(process.communicate()[0] for process in both)
+    said = sorted(printed(["import third_party"] * 2, tmp_path, os.environ))
     assert said == ["1.0 4.0 7.0 cached\n", "1.0 4.0 7.0 compiled\n"]
     assert [path.suffix for path in kernels.iterdir()] == [".bin"]
 
@@ -300,10 +281,8 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(
     path.write_bytes(changed.get(damage, whole))
     if damage == "another kernel's":
         values, found = np.array([[3.0, 1.0]]), np.zeros(1)
-        if found_in_the_cache is ours:
-            Kernel(root).of((values, found))(0, 1)
-        else:
-            compile_over_runs(sorted_copy)(1, values, found)
+        another = Kernel(root) if found_in_the_cache is ours else loop_of(root)
+        another.of((values, found))(0, 1)
         (other,) = set(kernels.iterdir()) - {path}
         other.replace(path)
     assert not found_in_the_cache()
@@ -601,7 +580,7 @@ FORKED = """
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_cores_work_in_memory_of_their_own_also_in_a_forked_process(tmp_path: Path):
     """Made once for each, and once to compile; a fork has none of the threads that its parent has."""
-    told = imported(FORKED, tmp_path, tmp_path / "cache", "-W", "ignore")
+    told = imported(FORKED, tmp_path, tmp_path / "cache", "ignore")
     made, total = told[0].split()
     assert int(made) <= numba.config.NUMBA_NUM_THREADS + 1
     assert (float(total), told[1]) == (499500.0, "0")

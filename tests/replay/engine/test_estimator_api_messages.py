@@ -3,8 +3,6 @@
 import logging
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,12 +12,14 @@ import pytest
 
 from recorders.errors import BadInput
 from recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
+from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.engine.api.functions import batch, each_run, recursive
 from replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
 from replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
-from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.compiling import notices
+from replay.engine.compiling.compile import compile_over_runs, compiled
 from replay.engine.compiling.kernel_cache import load
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.replaying import collect, replay
@@ -380,6 +380,10 @@ def test_topics_and_outputs_may_be_any() -> None:
     assert out["/estimates/m/found/size"]["elements"].tolist() == [5, 2]
 
 
+def halve(run: int, values: Floats) -> None:
+    values[run] *= 0.5
+
+
 @pytest.mark.paper
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
 def test_long_compiling_is_said_once(
@@ -389,38 +393,34 @@ def test_long_compiling_is_said_once(
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
     monkeypatch.setattr("replay.engine.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
-    arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
     for _ in range(2):
         load.cache_clear()
-        compile_over_runs(tracked)(2, *arguments)
+        compile_over_runs(halve)(2, np.ones(2))
     said = [record.getMessage() for record in caplog.records]
-    name = f"{tracked.__module__}.tracked"
+    name = f"{halve.__module__}.halve"
     assert said[0] == f"compiling {name}, once"
     assert re.fullmatch(rf"compiled {name} in \d+\.\d s", said[1])
     assert len(said) == 2
 
 
-@pytest.mark.paper
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
-def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
+def test_python_says_what_it_compiles_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """On standard error, as nothing else is there; not where the program logs in its own way."""
-    code = (
-        "import sys, logging, replay.engine.compiling.notices as notices, numpy as np\n"
-        "from replay.engine.compiling.compile import compiled\n"
-        "notices._PATIENCE_S = 0.0\n"
-        "if sys.argv[1:]: logging.basicConfig()\n"
-        "from recorders.models.planar import wrap_angle\n"
-        "for x in (1.0, 1): compiled(wrap_angle)(x)\n"
-    )
-    environment = {**os.environ, "FUSELOG_CACHE": str(tmp_path)}
-    said = [
-        subprocess.run(
-            [sys.executable, "-c", code, *options], env=environment, capture_output=True, text=True
-        ).stderr
-        for options in ([], ["logs"])
-    ]
+    monkeypatch.setattr(notices, "_PATIENCE_S", 0.0)
+    said = []
+    for cache, handlers in (("plain", []), ("logs", [logging.StreamHandler()])):
+        monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / cache))
+        monkeypatch.setattr(logging.getLogger(), "handlers", handlers)
+        notices._print_once.cache_clear()
+        for value in (1.0, 1):
+            load.cache_clear()
+            compiled(wrap_angle)(value)
+        said.append(capsys.readouterr().err)
     name = r"recorders\.models\.planar\.wrap_angle"
-    assert said[1] == ""
     assert re.match(
         rf"fuselog: compiling {name}, once\nfuselog: compiled {name} in \d+\.\d s\n", said[0]
     )
+    assert said[0].count("compiling") == 1
+    assert said[1] == ""
