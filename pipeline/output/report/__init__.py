@@ -14,13 +14,14 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from unicodedata import category
 from urllib.parse import unquote
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, select_autoescape
+from jinja2 import Environment, PackageLoader, Template, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
@@ -50,7 +51,6 @@ SCENES = ("scene", "lens")  # figures that a comparison keeps, which has no logs
 MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
-_NOT_PLAIN = re.compile(r"[^ -~\n\t]")  # all but printable ASCII, line breaks and tabs
 
 
 class _Timings(Parameters):
@@ -113,6 +113,20 @@ def write_report(
         ]
     names = distinct_names(results, folders)
     sections = [_section(*each, viewer=viewer) for each in zip(folders, results, names, strict=True)]
+    text = _template().render(
+        MOST_DOUBTS=MOST_DOUBTS,
+        text_colours=text_colours(),
+        sections=sections,
+        style=_asset("page.css"),
+        scripts=[_asset("plotly-basic.min.js"), _asset("page.js")],
+        terms=list(dict.fromkeys(term for section in sections for term in section.glossary)),
+    )
+    with whole_file(page) as new:
+        new.write_bytes(_signed(text.encode(errors="backslashreplace")))
+
+
+@cache
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("pipeline.output.report", "."),
         autoescape=select_autoescape(),
@@ -128,16 +142,7 @@ def write_report(
         "named": _named,
         "hues": _hues,
     }
-    text = environment.get_template("page.html").render(
-        MOST_DOUBTS=MOST_DOUBTS,
-        text_colours=text_colours(),
-        sections=sections,
-        style=_asset("page.css"),
-        scripts=[_asset("plotly-basic.min.js"), _asset("page.js")],
-        terms=list(dict.fromkeys(term for section in sections for term in section.glossary)),
-    )
-    with whole_file(page) as new:
-        new.write_bytes(_signed(text.encode(errors="backslashreplace")))
+    return environment.get_template("page.html")
 
 
 def is_report(page: Path) -> bool:
@@ -155,10 +160,8 @@ def _visible(value: object) -> object:
     """Show control characters of a text by their numbers, in all that the page is made of."""
     if not isinstance(value, str) or value.isprintable():
         return value
-    shown = _NOT_PLAIN.sub(
-        lambda each: each[0] if category(each[0]) == "Zs" else printable(each[0]), value
-    )
-    return Markup(shown) if isinstance(value, Markup) else shown
+    hidden = {each for each in {*value} - {*"\n\t"} if not each.isprintable() and category(each) != "Zs"}
+    return value.translate({ord(each): printable(each) for each in hidden}) if hidden else value
 
 
 def empty_cells(table: pd.DataFrame) -> list[str]:
