@@ -13,7 +13,6 @@ from recorders.importers.tables.columns import (
     GuessedTable,
     direction_of,
     largest_of,
-    latitude_metres,
     length_of,
     name_of,
     names_of,
@@ -34,6 +33,7 @@ from recorders.importers.tables.guessed_places import (
     speed_unit_of,
 )
 from recorders.importers.units import unit
+from recorders.models.geodesy import local_metres
 
 # What vectors are called.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
@@ -127,9 +127,9 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
     found = places_of(table, place)
     lines += found.lines
-    north, east = latitude_metres(found.latitude_deg, found.longitude_deg)
+    plane = local_metres(found.latitude_deg, found.longitude_deg).T
     table.places.extend(
-        each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
+        each._replace(values=values) for each, values in zip(place[::-1], plane, strict=True)
     )
     height = take(table.columns, ALTITUDE)
     if height:

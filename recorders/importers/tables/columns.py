@@ -80,21 +80,6 @@ def known_of(column: GuessedColumn) -> NDArray:
     return values[np.isfinite(values)]
 
 
-def latitude_metres(latitude_deg: NDArray, longitude_deg: NDArray) -> tuple[NDArray, NDArray]:
-    """Return roughly how many m places are north and east, on a sphere.
-
-    Args:
-        latitude_deg: (rows,), NaN if there is none.
-        longitude_deg: (rows,), NaN if there is none.
-
-    Returns:
-        North and east of latitude and longitude 0 (rows,), scaled by the median latitude.
-    """
-    metres = 111_195.0
-    shrunk = metres * np.cos(np.radians(np.nanmedian(latitude_deg)))
-    return metres * latitude_deg, shrunk * longitude_deg
-
-
 def stated_unit(column: GuessedColumn, usual: str) -> str:
     """Return the unit that a column's name states, if it is one of the usual one's kind."""
     is_unit = column.unit and _is_unit(column.unit) and unit(column.unit).powers == unit(usual).powers

@@ -16,10 +16,10 @@ from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     known_of,
-    latitude_metres,
     stated_unit,
 )
 from recorders.importers.units import unit
+from recorders.models.geodesy import local_metres
 
 # Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
 _AIS = {
@@ -262,7 +262,7 @@ def path_ratio(
         longitude_deg: (rows,), NaN if there is none.
         speed: (rows,), in the unknown unit.
     """
-    north, east = latitude_metres(latitude_deg, longitude_deg)
+    east, north = local_metres(latitude_deg, longitude_deg).T
     return plane_ratio(table, east, north, speed)
 
 

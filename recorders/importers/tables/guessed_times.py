@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, latitude_metres, parted
+from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, parted
 from recorders.importers.tables.files import Batch
 from recorders.importers.tables.order import Order, is_reversed, rollover_of
 from recorders.importers.tables.times import (
@@ -29,6 +29,7 @@ from recorders.importers.tables.times import (
     stamps_ns,
     texts_of,
 )
+from recorders.models.geodesy import local_metres
 
 UNKNOWN_ZERO = "2026-01-01"
 # What times of FIT files count from in s, and where numbers are more likely of 1970.
@@ -642,7 +643,7 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
         latitude, longitude = named["lat"], named["lon"]
         if np.nanmax(np.abs(latitude)) > 90 or np.nanmax(np.abs(latitude)) < 1.6:
             return None
-        north, east = latitude_metres(latitude, longitude)
+        east, north = local_metres(latitude, longitude).T
     elif {"x", "y"} <= named.keys():
         east, north = named["x"], named["y"]
     else:

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
-from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
+from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
 from recorders.importers.tables.blocks import lines_of
+from recorders.importers.tables.cells import read_ns
 from recorders.importers.tables.files import (
     Batch,
     Table,

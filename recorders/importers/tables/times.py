@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
+from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
+from recorders.importers.tables.cells import read_ns
 from recorders.parameters import Parameters
 
 CountUnit = Literal["s", "ms", "us", "ns"]
