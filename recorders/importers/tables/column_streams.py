@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.tables.columns import (
@@ -12,6 +13,7 @@ from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     direction_of,
+    frame_of,
     length_of,
     name_of,
     names_of,
@@ -257,7 +259,7 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
 def _pose(table: GuessedTable) -> Iterator[str]:
     """Write positions with and without orientation, and orientations alone."""
     columns = table.columns
-    place, factors, said = _position(columns)
+    place, factors, said = _position(columns, table.places)
     turn = [] if -1 in factors else _quaternion(columns)  # of a body in another frame than ours
     heading = take(columns, _HEADING, usual="rad") if place and not (turn or table.has_truth) else []
     if not (place or turn):
@@ -293,28 +295,36 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     yield from stream_lines(f"{table.prefix}/{topic}", becomes, why, *lines)
 
 
-def _position(columns: list[GuessedColumn]) -> tuple[list[GuessedColumn], list[int], list[str]]:
+def _position(
+    columns: list[GuessedColumn], places: Sequence[GuessedColumn]
+) -> tuple[list[GuessedColumn], list[int], list[str]]:
     """Find the columns of a position, what makes them of east, north and up, and what was assumed."""
     for up, sign in (("up", 1), ("down", -1)):
         if found := take(columns, _EAST, _NORTH, f"{_AT}({up}|{up[0]})", usual="m"):
             return found, [1, 1, sign], []
     if found := take(columns, _EAST, _NORTH, usual="m"):
         return found, [1, 1], []
-    return _along_axes(
-        take_axes(columns, *_POSITIONS, usual="m")
-        or take_axes(columns, *_POSITIONS, axes="xy", usual="m")
+    found = take_axes(columns, *_POSITIONS, usual="m") or take_axes(
+        columns, *_POSITIONS, axes="xy", usual="m"
     )
+    return _along_axes(found, [np.diff(each.values, prepend=np.nan) for each in found], places)
 
 
 def _along_axes(
-    found: list[GuessedColumn],
+    found: list[GuessedColumn], steps: Sequence[NDArray], places: Sequence[GuessedColumn]
 ) -> tuple[list[GuessedColumn], list[int], list[str]]:
-    """Return x, y and z as east, north and up, by their frame, else under an assumption."""
-    if found and found[0].frame == "ned":
+    """Return x, y and z as east, north and up: by their frame, by how places move, or assumed.
+
+    Args:
+        found: the columns.
+        steps: how far along x and y each row (rows,) is from the one before.
+        places: east and north of the rows, if these are known.
+    """
+    frame = (found[0].frame or frame_of(steps, places)) if found else "enu"
+    if frame == "ned":
         return [found[1], found[0], *found[2:]], [1, 1, -1][: len(found)], []
     names = ", ".join(each.name for each in found)
-    said = [f"{ASSUMED}{names} are {_ENU}"] if found and not found[0].frame else []
-    return found, [1] * len(found), said
+    return found, [1] * len(found), [] if frame else [f"{ASSUMED}{names} are {_ENU}"]
 
 
 def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
@@ -367,7 +377,7 @@ def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[Gu
 def truth_lines(table: GuessedTable) -> Iterator[str]:
     """Write the stream of a table's true columns, of which nothing is made that a filter could read."""
     columns = table.columns
-    place, factors, said = _position(columns)
+    place, factors, said = _position(columns, table.places)
     if not place and (geodetic := take(columns, *_GEODETIC, usual="deg")):
         found = places_of(table, geodetic)
         if found.unit not in ("deg", "ddmm.mmmm"):
@@ -461,7 +471,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
 
 def _velocity(table: GuessedTable) -> Iterator[str]:
     stem, columns = "(.*_)?v(el(ocity)?)?_?", table.columns
-    velocity, factors, said = _along_axes(take_axes(columns, "vel", "velocity", "v", usual="m/s"))
+    found = take_axes(columns, "vel", "velocity", "v", usual="m/s")
+    velocity, factors, said = _along_axes(found, [each.values for each in found], table.places)
     for up, sign in (("u(p)?", 1), ("d(own)?", -1)):
         if not velocity:
             velocity = take(columns, *(stem + each for each in ("e(ast)?", "n(orth)?", up)), usual="m/s")

@@ -242,6 +242,8 @@ def underlined(name: str) -> str:
 
 # By how much of the path one direction has to be more like the course than another.
 _CLEAR = 0.4
+# How far from the course directions are, at most, that are along it.
+_ALIKE_RAD = 0.1
 
 
 class Direction(NamedTuple):
@@ -285,6 +287,28 @@ def direction_of(
                 return Direction(*best, "so it goes with the course", is_sure=is_sure)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
+
+
+def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
+    """Tell whether steps along two axes are east and north or north and east, by how places move.
+
+    Args:
+        steps: along the first and the second axis (rows,), NaN if there is none.
+        places: east and north of the rows; none if these are not known.
+
+    Returns:
+        "enu", "ned", or nothing if the steps do not tell clearly.
+    """
+    if not places:
+        return ""
+    moved = [np.diff(each.values, prepend=np.nan) for each in places[:2]]
+    course = moved[0] + 1j * moved[1]
+    off_rad = {}
+    for frame, (east, north) in {"enu": (0, 1), "ned": (1, 0)}.items():
+        product = course * np.conj(steps[east] + 1j * steps[north])
+        off_rad[frame] = float(np.median(np.abs(np.angle(product[np.abs(product) > 0]))))
+    best, other = sorted(off_rad, key=lambda frame: off_rad[frame])
+    return best if off_rad[best] < _ALIKE_RAD < off_rad[other] - off_rad[best] else ""
 
 
 def _angle_units(largest: float) -> list[str]:

@@ -265,7 +265,8 @@ class Rows:
         """Tell whether rows are newest first, by the local times of the first ones."""
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
-        clock = self._time.model_copy(update={"zone": None, "rollover": None})
+        zone = "UTC" if self._time.zone else None
+        clock = self._time.model_copy(update={"zone": zone, "rollover": None})
         batch = {name: cells[:_LOOKED_AT] for name, cells in batch.items()}
         rows = np.arange(_size(batch))
         return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])

@@ -326,7 +326,8 @@ def _dates_ns(
     zones = np.zeros(len(joined), dtype=object)
     names: dict[str, float | ZoneInfo] = {}
     if "%p" not in mapping.format and pc.any(pc.match_substring_regex(joined, ZONED)).as_py():
-        zones = joined.to_pandas().str.extract(ZONED, expand=False).fillna(0).to_numpy()
+        written = joined.to_pandas().str.extract(ZONED, expand=False)
+        zones = np.where(written.isna(), 0, written.to_numpy(object))
         joined = pc.replace_substring_regex(joined, ZONED, "")
     found = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False)
     own = found.to_numpy(zero_copy_only=False)
@@ -354,7 +355,7 @@ def _dates_ns(
                 f"{rows[other] + 1} states one; state the zone of rows without, such as "
                 'zone = "UTC", in `time`'
             )
-    elif own.any():
+    elif zone and own.any():
         _check_offsets(since_ns[own], joined.filter(pa.array(own)), zone, rows[own], label)
     if zone:
         local = ~own & (zones == 0)
