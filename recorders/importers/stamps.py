@@ -1,11 +1,6 @@
 """Makes stamps of the numbers that others log: exact to the nanosecond, or refused."""
 
-from functools import reduce
-from typing import Any
-
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
@@ -14,11 +9,7 @@ Stamps = NDArray[np.int64]
 # A stamp that is missing.
 NOT_A_TIME = np.iinfo(np.int64).min
 # A double near 2^63 is exact to 1024.
-_BEYOND = 2.0**63 - 2**12
-# Numbers that a decimal of 38 digits holds if they are short; a large exponent crashes Arrow.
-_PARTS = r"^[-+]?[0-9]*\.?(?P<part>[0-9]*)(?P<power>(?:[eE][-+]?[0-9]{1,2})?)$"
-_SHORT, _LARGEST_POWER, _MORE_DIGITS = 30, 18, 11
-_UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
+BEYOND = 2.0**63 - 2**12
 
 
 def to_ns(
@@ -50,7 +41,7 @@ def to_ns(
         known &= given != NOT_A_TIME
     with np.errstate(over="ignore", invalid="ignore"):
         product = numbers * unit_ns
-        fits = (np.abs(product) < _BEYOND) & (np.abs(product + start) < _BEYOND)
+        fits = (np.abs(product) < BEYOND) & (np.abs(product + start) < BEYOND)
     if np.any(known & ~fits):
         value = given[np.argmax(known & ~fits)]
         raise BadInput(
@@ -64,87 +55,3 @@ def to_ns(
         product_ns = whole.astype(np.int64) * unit_ns
         product_ns += np.rint((filled - whole) * unit_ns).astype(np.int64)
     return np.where(known, product_ns + np.where(known, since, 0).astype(np.int64), NOT_A_TIME)
-
-
-def read_ns(
-    cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, mend: str
-) -> Stamps:
-    """Read cells (n,) as stamps; texts to the last digit, where a double of today has 200 ns.
-
-    Args:
-        cells: whole numbers, floats, texts that are numbers, or timestamps or durations, which have
-            their own unit.
-        digits: how many digits after the point of the unit are nanoseconds: 9 if it is a second.
-        since_ns: what they count from.
-        where: begins the sentence on values that cannot be.
-        mend: ends it.
-
-    Returns:
-        The stamps, NOT_A_TIME for a cell that is empty or NaN.
-
-    Raises BadInput if a cell is no number, or 64 bits cannot hold its stamp.
-    """
-    if pa.types.is_dictionary(cells.type):
-        cells = cells.dictionary_decode()
-    if pa.types.is_timestamp(cells.type) or pa.types.is_duration(cells.type):
-        values = cells.cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
-        return to_ns(values, _UNITS_NS[cells.type.unit], since_ns, where=where, mend=mend)
-    if pa.types.is_integer(cells.type):
-        stamps = to_ns(cells.fill_null(0).to_numpy(), 10**digits, since_ns, where=where, mend=mend)
-        return np.where(cells.is_valid().to_numpy(zero_copy_only=False), stamps, NOT_A_TIME)
-    is_text = pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type)
-    if is_text:
-        cells = pc.utf8_trim_whitespace(cells)
-        if (plain := _plain(cells, digits)) is not None:
-            return to_ns(plain, 1, since_ns, where=where, mend=mend)
-        cells = pc.replace_substring_regex(cells, r"^\+([0-9.])", r"\1")
-    try:
-        numbers = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        why = str(error).splitlines()[0]
-        raise BadInput(
-            f'{where} has cells that are not numbers ({why}); dates need unit = "date"'
-        ) from None
-    found = to_ns(numbers, 10**digits, where=where, mend=mend)
-    if is_text:
-        found = _to_the_last_digit(cells, digits, found)
-    return to_ns(found, 1, since_ns, where=where, mend=mend)
-
-
-def _plain(texts: pa.Array, digits: int) -> Stamps | None:
-    """Return texts (n,) as nanoseconds if all are digits with a point and none is finer; else None.
-
-    That is quick, and all that most files need.
-    """
-    if any(pc.any(pc.match_substring(texts, mark)).as_py() for mark in "eE+"):
-        return None
-    try:
-        decimals = texts.cast(pa.decimal128(38, digits))
-    except pa.ArrowInvalid:
-        return None
-    words: Any = np.frombuffer(decimals.buffers()[1], "<i8").reshape(-1, 2)
-    low, high = words[decimals.offset : decimals.offset + len(decimals)].T
-    known = decimals.is_valid().to_numpy(zero_copy_only=False)
-    if np.any(known & ((high != low >> 63) | (low > _BEYOND) | (low < -_BEYOND))):
-        return None
-    return np.where(known, low, NOT_A_TIME)
-
-
-def _to_the_last_digit(texts: pa.Array, digits: int, rough: Stamps) -> Stamps:
-    """Return texts (n,) as nanoseconds, which fit 64 bits; rough ones where they are written oddly."""
-    parts = pc.extract_regex(texts, _PARTS)
-    powers = pc.replace_substring_regex(pc.struct_field(parts, "power"), r"[eE+]", "")
-    power = pc.if_else(pc.equal(powers, ""), "0", powers).cast(pa.int32())
-    places = pc.subtract(pc.utf8_length(pc.struct_field(parts, "part")), power)
-    conditions = (
-        pc.less_equal(pc.utf8_length(texts), _SHORT),
-        pc.less_equal(pc.abs(power), _LARGEST_POWER),
-        pc.less_equal(places, digits + _MORE_DIGITS),
-    )
-    is_exact = pc.fill_null(reduce(pc.and_, conditions), False)
-    decimals = pc.if_else(is_exact, texts, None).cast(pa.decimal128(38, digits + _MORE_DIGITS))
-    # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
-    scaled = pc.round(decimals, digits).cast(pa.decimal128(38, digits))
-    low: Any = np.frombuffer(scaled.buffers()[1], "<i8").reshape(-1, 2)[:, 0]
-    exact = low[scaled.offset : scaled.offset + len(scaled)]
-    return np.where(is_exact.to_numpy(zero_copy_only=False), exact, rough)

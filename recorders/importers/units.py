@@ -27,6 +27,7 @@ NAMED = {
     **{name: Unit(size, _TIME) for name, size in {"s": 1, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.items()},
     **{name: Unit(size, _TIME) for name, size in {"min": 60, "h": 3600}.items()},
     **{name: Unit(size, _ANGLE) for name, size in {"rad": 1, "mrad": 1e-3, "deg": pi / 180}.items()},
+    "arcmin": Unit(pi / 180 / 60, _ANGLE),
     "semicircle": Unit(pi / 2**31, _ANGLE),
     **{name: Unit(size, _FLUX) for name, size in {"T": 1, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9}.items()},
     **{name: Unit(size, _FLUX) for name, size in {"G": 1e-4, "mG": 1e-7}.items()},
@@ -40,7 +41,7 @@ _ENDINGS = {
     "deg": "deg", "ut": "uT", "ut2": "uT", "s": "s",
 }  # fmt: skip
 _FACTOR = re.compile(r"\s*([/*]?)\s*([A-Za-z]+)(?:\^?(-?\d))?\s*")
-_NUMBER = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s+")
+_NUMBER = re.compile(r"\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s+")
 
 
 def unit(text: str) -> Unit:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
+from recorders.models.geodesy import local_metres
 from recorders.models.orientation import heading
 from recorders.models.planar import wrap_angle
 from recorders.plausibility.finding import Finding
@@ -18,7 +19,6 @@ ZIGZAG = 5.0  # by how much a step is longer than two together
 SIDEWAYS_MPS2, SLOWEST_MPS = 10.0, 1.0
 EARLIEST_NS, LATEST_NS = 31_536_000 * 10**9, 946_684_800 * 10**9  # 1971 and 2000
 FAR_H, NEAR_S = 14, 30.0
-METRES = 111_195.0  # of a degree
 _PLACED = (schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name)
 
 Floats = NDArray[np.float64]
@@ -187,9 +187,7 @@ def _places(stream: Stream) -> Floats:
     """Return places (n, 2) in m."""
     if stream.schema.full_name == schemas.POSITION_FIX.full_name:
         return np.asarray(stream["position_m"][:, :2])
-    latitude = stream["latitude_deg"]
-    shrunk = METRES * np.cos(np.radians(np.nanmedian(latitude)))
-    return np.column_stack([shrunk * stream["longitude_deg"], METRES * latitude])
+    return local_metres(stream["latitude_deg"], stream["longitude_deg"])
 
 
 def _found(stream: Stream, field: str, value: float, words: str, mapping: str) -> Finding:

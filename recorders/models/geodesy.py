@@ -95,3 +95,15 @@ def into_tangent_plane(
         np.cos(latitude) * z - np.sin(latitude) * outward,
         np.cos(latitude) * outward + np.sin(latitude) * z,
     )
+
+
+def local_metres(latitude_deg: Component, longitude_deg: Component) -> NDArray[np.float64]:
+    """Compute east and north (n, 2) in m of places from the median of them, NaN where there is none.
+
+    Args:
+        latitude_deg: (n,), NaN if there is none.
+        longitude_deg: (n,), NaN if there is none.
+    """
+    middle = np.nanmedian(latitude_deg), np.nanmedian(longitude_deg)
+    east, north, _ = into_tangent_plane((latitude_deg, longitude_deg, 0.0), (*middle, 0.0))
+    return np.stack([east, north], axis=-1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
-from recorders.models.geodesy import into_tangent_plane
+from recorders.models.geodesy import local_metres
 
 Floats = NDArray[np.float64]
 FEWEST = 20  # messages, below which nothing is said of a topic
@@ -188,13 +188,8 @@ def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: 
 
 
 def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> Fixes:
-    """Return places about the first one."""
-    place = stream["latitude_deg"][rows], stream["longitude_deg"][rows]
-    known = np.isfinite(place[0]) & np.isfinite(place[1])
-    latitude, longitude = (each[known] for each in place)
-    east, north, _ = into_tangent_plane(
-        (latitude, longitude, np.zeros_like(latitude)), (latitude[:1], longitude[:1], 0.0)
-    )
-    values = np.stack([east, north], axis=1)
-    places = Series(stream.topic, "latitude_deg", times_s[known], values)
+    """Return places about their middle."""
+    values = local_metres(stream["latitude_deg"][rows], stream["longitude_deg"][rows])
+    known = np.isfinite(values).all(axis=1)
+    places = Series(stream.topic, "latitude_deg", times_s[known], values[known])
     return _fixes(places, stream, rows[known], is_flat=False)

@@ -1,5 +1,7 @@
 """Stamps of the numbers that others log: exact or refused, whatever the text, the type or the unit."""
 
+import subprocess
+import sys
 from decimal import Decimal, localcontext
 
 import numpy as np
@@ -8,7 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, read_ns, to_ns
+from recorders.importers.stamps import NOT_A_TIME, to_ns
+from recorders.importers.tables.cells import read_ns
 
 digits = st.text("0123456789", max_size=40) | st.integers(1, 300).map("7".__mul__)
 signs = st.sampled_from(["", "", "-", "+", "--", "+-"])
@@ -65,3 +68,11 @@ def test_a_product_is_exact_or_refused(
     else:
         assert not beyond
         assert found.tolist() == [each + since_ns for each in exact]
+
+
+def test_bags_and_ulogs_are_imported_without_arrow() -> None:
+    code = (
+        "import recorders.importers.ros.importer, recorders.importers.ulog.importer, sys\n"
+        "sys.exit('pyarrow' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -99,7 +99,7 @@ def test_the_course_decides_what_a_heading_is_in(tmp_path: Path, unit: str) -> N
     log = guessed(tmp_path, "\n".join(["t;x;y;yaw", *rows]))
     turned = np.angle(np.exp(1j * (log["/truth"]["state"][:, 2] - direction)))
     assert_allclose(turned, 0.0, atol=1e-6)
-    assert "factors" not in (tmp_path / "own.toml").read_text(encoding="utf-8")
+    assert "factors." not in (tmp_path / "own.toml").read_text(encoding="utf-8")
 
 
 def test_a_decimal_comma_leaves_dates_alone(tmp_path: Path) -> None:

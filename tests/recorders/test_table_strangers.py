@@ -513,8 +513,8 @@ def test_velocities_are_read_in_the_unit_in_which_places_move(tmp_path: Path) ->
         lambda row: f"{1000 * row},{_place(row, 1e7)},111,150,-3",
     )
     got = Got(path)
-    assert got.streams["/velocity"].columns["velocity_mps"][0] == pytest.approx([1.11, 1.5, -0.03])
-    assert "along east, north and up" in got.said
+    assert got.streams["/velocity"].columns["velocity_mps"][0] == pytest.approx([1.5, 1.11, 0.03])
+    assert "along east, north and up" not in got.said
 
 
 def test_the_accuracy_of_positions_is_no_other_and_has_its_unit(tmp_path: Path) -> None:
@@ -611,3 +611,229 @@ def test_few_seconds_of_hhmmss_are_no_counter(name: str, begin: int, tmp_path: P
         tmp_path, f"{name},speed,yaw_rate", lambda row: f"{clock(row)},1,0", range(30 - begin // 3)
     )
     assert Got(path).times("/odometry")[0] == f"2026-01-01 22:13:{begin}"
+
+
+# Forms of other programs.
+
+VBO = """File created on 05/07/2019 at 13:45:12
+
+[header]
+satellites
+time
+latitude
+longitude
+velocity kmh
+heading
+height
+
+[comments]
+(c)2001 2004 Racelogic
+
+[column names]
+sats time lat long velocity heading height
+
+[data]
+"""
+
+
+def test_places_of_a_vbo_are_minutes_to_the_north_and_west(tmp_path: Path) -> None:
+    rows = [
+        f"007 1245{12 + 0.1 * k:05.2f} +{3119.0973 + 0.001 * k:.5f} +00058.4928 040.200 033.00 +0112.44"
+        for k in ROWS
+    ]
+    path = tmp_path / "lap.vbo"
+    path.write_text(VBO + "\n".join(rows) + "\n", encoding="utf-8")
+    got = Got(path)
+    fix = got.streams["/fix"]
+    assert fix["latitude_deg"][0] == pytest.approx(51.984955)
+    assert fix["longitude_deg"][0] == pytest.approx(-0.97488)
+    assert got.times("/fix")[:2] == ["2026-01-01 12:45:12", "2026-01-01 12:45:12.100000"]
+    assert "positive to the west" in got.said
+    path.write_text("\n".join(rows), encoding="utf-8")
+    with pytest.raises(BadInput, match=r"has no sections \[column names\] and \[data\]"):
+        Got(path)
+
+
+def test_a_table_of_messages_of_several_kinds_is_refused(tmp_path: Path) -> None:
+    head = "Type,Local Number,Message,Field 1,Value 1,Units 1,Field 2,Value 2,Units 2"
+    row = "Data,0,record,timestamp,{},s,position_lat,598290819,semicircles".format
+    with pytest.raises(BadInput, match=r"holds messages of several kinds.*--data record"):
+        Got(text_of(tmp_path, head, row))
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "stamp"),
+    [
+        ("value,a", lambda k: f"{5 + k % 3},{EPOCH + k}", "2023-11-14 22:13:20"),
+        ("a,value", lambda k: f"{k % 3},{(EPOCH + 40 - k) * 1000}", "2023-11-14 22:13:21"),
+        ("value,var2", lambda k: f"{k % 3},{0.01 * k:.2f}", "could be the time"),
+        ("value,time", lambda k: f"{k % 3},12h30m{k:02d}s", "whose format is not known"),
+    ],
+)
+def test_what_could_be_a_time_stops_a_made_up_rate(
+    head: str, row: Callable[[int], str], stamp: str, tmp_path: Path
+) -> None:
+    path = text_of(tmp_path, head, row)
+    if stamp.startswith("2023"):
+        assert Got(path).times("/values")[0] == stamp
+    else:
+        with pytest.raises(BadInput, match=stamp):
+            Got(path)
+
+
+# Axes.
+
+
+@pytest.mark.parametrize(
+    ("file", "head"),
+    [
+        ("log_1_vehicle_local_position_0.csv", "t,x,y,z,vx,vy,vz"),
+        ("own.csv", "t,x_ned,y_ned,z_ned,vx_ned,vy_ned,vz_ned"),
+        ("own.csv", "t,north,east,down,vel_n_m_s,vel_e_m_s,vel_d_m_s"),
+        ("own.csv", "t,PN,PE,PD,VN,VE,VD"),
+    ],
+)
+def test_axes_of_north_east_down_are_told_by_their_names(file: str, head: str, tmp_path: Path) -> None:
+    path = text_of(tmp_path, head, lambda k: f"{EPOCH + k},{2 * k},{k},{-3 * k},2,1,-3")
+    got = Got(path.rename(tmp_path / file))
+    assert got.streams["/position"]["position_m"][1].tolist() == [1, 2, 3]
+    assert got.streams["/velocity"]["velocity_mps"][1].tolist() == [1, 2, 3]
+    assert "along east" not in got.said
+
+
+def test_axes_that_nothing_names_are_assumed(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},{2 * k},{k},{-3 * k}"  # noqa: E731
+    for head in ("t,x,y,z", "t,gt_x,gt_y,gt_z"):
+        assert "are along east, north and up" in Got(text_of(tmp_path, head, row)).said
+    assert "along east" not in Got(text_of(tmp_path, "t,x_enu,y_enu,z_enu", row)).said
+
+
+def test_places_of_an_origin_are_no_fixes(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},48.1,11.5,{2 * k},{k},{-3 * k}"  # noqa: E731
+    assert set(Got(text_of(tmp_path, "t,ref_lat,ref_lon,x,y,z", row)).streams) == {
+        "/position",
+        "/values",
+    }
+
+
+# Rows without a fix.
+
+
+@pytest.mark.parametrize(
+    ("head", "none", "fix"),
+    [
+        ("field.status.status", "-1", "0"),
+        ("fixType", "0", "3"),
+        ("fix_type", "1", "4"),
+        ("gps_qual", "0", "1"),
+        ("gnssFixOK", "0", "1"),
+        ("gps_mode", "1", "3"),
+        ("status", "V", "A"),
+        ("fix", "none", "3d"),
+    ],
+)
+def test_rows_that_say_that_they_have_no_fix_are_left_out(
+    head: str, none: str, fix: str, tmp_path: Path
+) -> None:
+    path = text_of(
+        tmp_path,
+        f"t,{head},lat,lon",
+        lambda k: (
+            f"{EPOCH + k},{none},0.5,11.5" if k < 3 else f"{EPOCH + k},{fix},{48 + k * 1e-5:.5f},11.5"
+        ),
+    )
+    got = Got(path)
+    assert got.streams["/fix"]["latitude_deg"].min() > 48
+    assert "no fix in 3 rows" in got.said
+    assert got.notes["/fix: messages left out: not chosen by its 'where'"] == "3"
+    assert got.notes["origin"].startswith("48.00003, 11.5 deg")
+
+
+# Several times, zones, weeks, units.
+
+
+def test_the_stamp_of_the_header_is_the_time(tmp_path: Path) -> None:
+    path = text_of(
+        tmp_path,
+        "%time,field.header.stamp,field.latitude,field.longitude",
+        lambda k: f"{(EPOCH + k) * 10**9 + 5 * 10**8},{(EPOCH + k) * 10**9},48.1,11.5",
+    )
+    got = Got(path)
+    assert got.times("/fix")[0] == "2023-11-14 22:13:20"
+    assert "field.header.stamp is the time of the measurement, and time is not" in got.said
+
+
+@pytest.mark.parametrize(("late", "early"), [("Z", ""), ("", "+02:00"), (" EST", "")])
+def test_rows_of_which_some_state_a_zone_need_one_for_the_others(
+    late: str, early: str, tmp_path: Path
+) -> None:
+    path = text_of(
+        tmp_path,
+        "time,lat,lon",
+        lambda k: f"2025-06-01 12:00:{k:02d}{late if k > 20 else early},48.1,11.5",
+    )
+    with pytest.raises(BadInput, match=r"row \d+ holds '2025-06-01 12:00:\d\d' without a zone"):
+        Got(path)
+    with pytest.raises(BadInput, match='zone = "UTC"'):
+        Got(path, BY_TIME.replace("TIME", '{ column = "time", unit = "date" }'))
+    stated = '{ column = "time", unit = "date", zone = "UTC", order = "any" }'
+    assert len(Got(path, BY_TIME.replace("TIME", stated)).streams["/v"]) == 40
+
+
+BY_TIME = (
+    "[[tables]]\ntime = TIME\n[[tables.streams]]\ntopic = '/v'\nbecomes = 'VectorMeasurement'\n"
+    "fields.value = ['lat']\ncomponents = 'v'\n"
+)
+
+
+def test_a_gps_week_of_ten_bits_needs_the_date_of_week_0(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "week,tow,lat,lon", lambda k: f"300,{345600 + k},48.1,11.5")
+    with pytest.raises(BadInput, match=r"GPS week 300 .*`zero`"):
+        Got(path)
+    time = '{ column = "tow", week = "week"%s }'
+    with pytest.raises(BadInput, match=r"GPS week 300 .*`zero`"):
+        Got(path, BY_TIME.replace("TIME", time % ""))
+    got = Got(path, BY_TIME.replace("TIME", time % ', zero = "2019-04-07"'))
+    assert got.times("/v")[0] == "2025-01-09 00:00:00"
+
+
+def test_units_of_names_are_used_or_told(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},36,0,0,0,0,10"  # noqa: E731
+    names = ",".join(
+        f"{of}_{axis}_{unit}" for of, unit in (("linear", "kmh"), ("angular", "deg")) for axis in "xyz"
+    )
+    twist = Got(text_of(tmp_path, f"t,{names}", row)).streams["/twist"]
+    assert twist["velocity_mps"][0].tolist() == [10, 0, 0]
+    assert np.degrees(twist["turn_rate_radps"][0]) == pytest.approx([0, 0, 10])
+    row = lambda k: f"{EPOCH + k},5,0.1"  # noqa: E731
+    assert (
+        "'furlong/h' is no known unit"
+        in Got(text_of(tmp_path, "t,speed [furlong/h],yaw_rate", row)).said
+    )
+    assert set(Got(text_of(tmp_path, "t,engine_speed [rpm],yaw_rate", row)).streams) == {"/values"}
+
+
+@pytest.mark.parametrize(
+    ("cell", "stamp"),
+    [
+        ("07-Sep-2019 12:00:{:02d}", "2019-09-07 12:00:00"),
+        ('"September 7, 2019 01:00:{:02d} PM"', "2019-09-07 13:00:00"),
+        ("45000.{:05d}", "Excel"),
+    ],
+)
+def test_months_have_names_and_days_are_no_times(cell: str, stamp: str, tmp_path: Path) -> None:
+    path = text_of(tmp_path, "time,lat,lon", lambda k: f"{cell.format(k)},48.1,11.5")
+    if stamp.startswith("2019"):
+        assert Got(path).times("/fix")[0] == stamp
+    else:
+        with pytest.raises(BadInput, match=stamp):
+            Got(path)
+
+
+def test_a_date_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "date,time,lat,lon", lambda k: f"7. Sept. 19,12:00:{k:02d},48.1,11.5")
+    with pytest.raises(BadInput, match=r"date dates such as '7. Sept. 19', whose format is not known"):
+        Got(path)
+    degrees = text_of(tmp_path, "time,lat,lon", lambda k: f"{EPOCH + k},52°12'{k}\"N,11°24'{k}\"E")
+    with pytest.raises(BadInput, match="column lat holds places such as '52°12'0\"N'"):
+        Got(degrees)

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.tables.columns import (
@@ -12,8 +13,7 @@ from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     direction_of,
-    largest_of,
-    latitude_metres,
+    frame_of,
     length_of,
     name_of,
     names_of,
@@ -29,11 +29,13 @@ from recorders.importers.tables.guessed_places import (
     ALTITUDE,
     accuracy_of,
     altitude_of,
+    fixes_of,
     is_ais,
     places_of,
     speed_unit_of,
 )
 from recorders.importers.units import unit
+from recorders.models.geodesy import local_metres
 
 # What vectors are called.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
@@ -56,8 +58,12 @@ _YAW_RATE = (
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
 _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
 _ACCURACY = r"(?!.*(bearing|head|course|yaw|speed|vel|vert|time|angle))(.*_)?(accuracy|eph|h_?acc)"
-_EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
-_GEODETIC = r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?"
+_AT = "((x|y|z|p|pos|position)_|p)?"
+_EAST, _NORTH = f"{_AT}(east(ing)?|e)", f"{_AT}(north(ing)?|n)"
+# Not where an origin, a home or a goal is.
+_HERE = r"(?!(.*_)?(ref|home|origin|base|datum|target|goal|waypoint|wp|setpoint|sp)_)(.*_)?"
+_GEODETIC = rf"{_HERE}lat(itude)?", rf"{_HERE}(lon|lng|long)(gitude)?"
+_ENU = "along east, north and up, or the axes of the positions; the order of fields, factors"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
 )
@@ -71,16 +77,15 @@ _LARGEST_RATE_RADPS = 10.0
 def _inertial(table: GuessedTable) -> Iterator[str]:
     columns = table.columns
     whole = list(columns)
-    force = take_axes(columns, *_ACCELEROMETERS)
-    rate = take_axes(columns, *_GYROSCOPES)
+    force = take_axes(columns, *_ACCELEROMETERS, usual="m/s^2")
+    rate = take_axes(columns, *_GYROSCOPES, usual="rad/s")
     if not (force and rate):
         columns[:] = whole
         return
     force_unit, why = unit_by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)})
-    largest = largest_of(rate)
-    rate_unit = stated_unit(rate[0], "rad/s") or ("deg/s" if largest > _LARGEST_RATE_RADPS else "rad/s")
+    rate_unit, rate_why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     # a magnetometer of the same table is one of a nine-axis unit, which orientation filters read
-    field = take_axes(list(columns), *_MAGNETOMETERS)
+    field = take_axes(list(columns), *_MAGNETOMETERS, usual="uT")
     yield from stream_lines(
         f"{table.prefix}/inertial",
         "InertialSample",
@@ -89,15 +94,16 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
         f"fields.turn_rate_radps = {names_of(rate)}",
         *_field_lines(field)[:1],
         f"units.specific_force_mps2 = {json.dumps(force_unit)}   # {why}",
-        f"units.turn_rate_radps = {json.dumps(rate_unit)}   # the largest is {largest:.4g}",
+        f"units.turn_rate_radps = {json.dumps(rate_unit)}   # {rate_why}",
         *_field_lines(field)[1:],
-        "# The axes of the body are forward, left, up; to turn those of the sensor (roll, pitch, yaw):",
+        f"{ASSUMED}the axes of {force[0].name} and the others are the body's, forward, left and up; "
+        "mounting_deg turns those of the sensor (roll, pitch, yaw)",
         "# mounting_deg = [0, 0, 0]",
     )
 
 
 def _magnetic(table: GuessedTable) -> Iterator[str]:
-    field = take_axes(table.columns, *_MAGNETOMETERS)
+    field = take_axes(table.columns, *_MAGNETOMETERS, usual="uT")
     if field:
         yield from stream_lines(
             f"{table.prefix}/magnetic_field",
@@ -120,29 +126,32 @@ def _field_lines(field: Sequence[GuessedColumn]) -> list[str]:
 
 
 def _fix(table: GuessedTable) -> Iterator[str]:
-    place = take(table.columns, *_GEODETIC)
+    place = take(table.columns, *_GEODETIC, usual="deg")
     if not place:
         return
+    lines, has_fix = fixes_of(table)
+    place = [each._replace(values=np.where(has_fix, each.values, np.nan)) for each in place]
     fields = ("latitude_deg", "longitude_deg")
-    lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
+    lines += [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
     found = places_of(table, place)
     lines += found.lines
-    north, east = latitude_metres(found.latitude_deg, found.longitude_deg)
+    plane = local_metres(found.latitude_deg, found.longitude_deg).T
     table.places.extend(
-        each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
+        each._replace(values=values) for each, values in zip(place[::-1], plane, strict=True)
     )
-    height = take(table.columns, ALTITUDE)
+    height = take(table.columns, ALTITUDE, usual="m")
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
         lines += altitude_of(table, height[0], found.unit)
-    deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
+    deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u", usual="m")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
         if (length := stated_unit(deviations[0], "m")) not in ("", "m"):
             lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
-    elif accuracy := take(table.columns, _ACCURACY):
+    elif accuracy := take(table.columns, _ACCURACY, usual="m"):
         lines += [
-            "# The standard deviation of each axis, upwards twice that:",
+            f"{ASSUMED}{accuracy[0].name} is the standard deviation of each axis, upwards twice that; "
+            "deviations, factors",
             f"deviations.covariance_m2 = {names_of(3 * accuracy)}",
             "factors.covariance_m2 = [1, 1, 2]",
             *accuracy_of(table, accuracy[0], found.unit),
@@ -150,7 +159,8 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     elif dilution := take(table.columns, r"(.*_)?hdop"):
         lines += [
             "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
-            "# horizontally divided by the root of 2. A guess of that error is 2 m; fill in your own.",
+            "# horizontally divided by the root of 2.",
+            f"{ASSUMED}{dilution[0].name} is of a receiver with a range error of 2 m; factors",
             f"deviations.covariance_m2 = {names_of(3 * dilution)}",
             "factors.covariance_m2 = [1.4, 1.4, 2.8]",
         ]
@@ -168,8 +178,8 @@ def _target(table: GuessedTable) -> Iterator[str]:
     columns = table.columns
     whole = list(columns)
     number = take(columns, _TARGET)
-    distance = take(columns, r"(.*_)?(range|distance|dist)|r")
-    direction = take(columns, r"(.*_)?(bearing|azimuth)|angle|phi")
+    distance = take(columns, r"(.*_)?(range|distance|dist)|r", usual="m")
+    direction = take(columns, r"(.*_)?(bearing|azimuth)|angle|phi", usual="rad")
     if not (distance and direction) and not (number and (distance or direction)):
         columns[:] = whole
         return
@@ -177,18 +187,20 @@ def _target(table: GuessedTable) -> Iterator[str]:
     what = " and ".join(["a range"] * bool(distance) + ["a bearing"] * bool(direction))
     lines = [f"fields.target_id = {name_of(each)}" for each in number]
     if not number:
-        lines.append("# No column numbers the targets, so that all rows are of target 0.")
+        lines.append(
+            f"{ASSUMED}all rows are of target 0, as no column numbers targets; fields.target_id"
+        )
     for each in distance:
         lines.append(f"fields.range_m = {name_of(each)}")
         if stated := stated_unit(each, "m"):
             lines.append(f"units.range_m = {json.dumps(stated)}   # as its name says")
     for each in direction:
-        in_unit, why = unit_by_largest(each, "rad", "deg", 2 * np.pi)
+        in_unit, why = unit_by_largest([each], "rad", "deg", 2 * np.pi)
         lines += [
             f"fields.bearing_rad = {name_of(each)}",
             f"units.bearing_rad = {json.dumps(in_unit)}   # {why}",
-            "# Bearings are anticlockwise from the sensor's x axis; if these are clockwise:",
-            "# factors.bearing_rad = -1",
+            f"{ASSUMED}{each.name} is anticlockwise from the sensor's x axis; factors.bearing_rad = -1 "
+            "if it is clockwise",
         ]
     topic = {"RangeBearing": "range_bearing"}.get(becomes, becomes.lower())
     why = f"the names are {what}" + " of numbered targets" * bool(number)
@@ -198,27 +210,33 @@ def _target(table: GuessedTable) -> Iterator[str]:
 def _twist(table: GuessedTable) -> Iterator[str]:
     columns = table.columns
     whole = list(columns)
-    velocity = take_axes(columns, "linear", "linear_velocity")
-    rate = take_axes(columns, "angular", "angular_velocity")
+    velocity = take_axes(columns, "linear", "linear_velocity", usual="m/s")
+    rate = take_axes(columns, "angular", "angular_velocity", usual="rad/s")
     if not (velocity and rate):
         columns[:] = whole
         return
+    speed_unit, speed_why = speed_unit_of(table, velocity)
+    rate_unit, rate_why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     yield from stream_lines(
         f"{table.prefix}/twist",
         "Twist",
         "the names are a linear and an angular velocity along x, y and z",
         f"fields.velocity_mps = {names_of(velocity)}",
         f"fields.turn_rate_radps = {names_of(rate)}",
+        f"units.velocity_mps = {json.dumps(speed_unit)}   # {speed_why}",
+        f"units.turn_rate_radps = {json.dumps(rate_unit)}   # {rate_why}",
     )
 
 
 def _odometry(table: GuessedTable) -> Iterator[str]:
-    both = take(table.columns, _FORWARD_SPEED, _YAW_RATE)
-    if not both:
+    columns = list(table.columns)
+    both = take(columns, _FORWARD_SPEED, usual="m/s") + take(columns, _YAW_RATE, usual="rad/s")
+    if len(both) < 2:
         return
+    table.columns[:] = columns
     speed, rate = both
-    speed_unit, speed_why = speed_unit_of(table, speed)
-    rate_unit, why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
+    speed_unit, speed_why = speed_unit_of(table, [speed])
+    rate_unit, why = unit_by_largest([rate], "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     if rate_unit == "rad/s" and not stated_unit(rate, "rad/s"):
         size = unit(speed_unit).size
         sideways = float(np.nanquantile(np.abs(size * speed.values * rate.values), 0.99))
@@ -233,26 +251,26 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
         f"fields.turn_radps = {name_of(rate)}",
         f"units.forward_mps = {json.dumps(speed_unit)}   # {speed_why}",
         f"units.turn_radps = {json.dumps(rate_unit)}   # {why}",
-        "# Yaw rates are anticlockwise seen from above; if these are clockwise:",
-        "# factors.turn_radps = -1",
+        f"{ASSUMED}{rate.name} is anticlockwise seen from above; factors.turn_radps = -1 if it is "
+        "clockwise",
     )
 
 
 def _pose(table: GuessedTable) -> Iterator[str]:
     """Write positions with and without orientation, and orientations alone."""
     columns = table.columns
-    place, factors = _position(columns)
-    turn = _quaternion(columns)
-    heading = take(columns, _HEADING) if place and not (turn or table.has_truth) else []
+    place, factors, said = _position(columns, table.places)
+    turn = [] if -1 in factors else _quaternion(columns)  # of a body in another frame than ours
+    heading = take(columns, _HEADING, usual="rad") if place and not (turn or table.has_truth) else []
     if not (place or turn):
         return
     if place and heading:
         why = "the names are a position and a heading, without a covariance, as the truth has them"
         yield from stream_lines(
-            f"{table.prefix}/truth", "TruthState", why, *_truth(place, factors, turn, heading)
+            f"{table.prefix}/truth", "TruthState", why, *_truth(place, factors, turn, heading), *said
         )
         return
-    lines = []
+    lines = said
     if place:
         lines.append(f"fields.position_m = {names_of(place)}")
         lines += [f"factors.position_m = {factors}"] * (-1 in factors)
@@ -260,6 +278,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
             lines.append(f'units.position_m = "{length}"   # as its name says')
     if turn:
         lines.append(f"fields.quaternion = {names_of(turn)}")
+        lines += _turned(turn)
     else:
         ones = ", ".join("1" for _ in place)
         lines.append(f"deviations.covariance_m2 = [{ones}]   # fill in the standard deviations")
@@ -276,17 +295,47 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     yield from stream_lines(f"{table.prefix}/{topic}", becomes, why, *lines)
 
 
-def _position(columns: list[GuessedColumn]) -> tuple[list[GuessedColumn], list[int]]:
-    """Find the columns of a position, and what they are multiplied by to be of east, north and up."""
+def _position(
+    columns: list[GuessedColumn], places: Sequence[GuessedColumn]
+) -> tuple[list[GuessedColumn], list[int], list[str]]:
+    """Find the columns of a position, what makes them of east, north and up, and what was assumed."""
     for up, sign in (("up", 1), ("down", -1)):
-        if found := take(columns, _EAST, _NORTH, f"(z_)?{up}|{up[0]}"):
-            return found, [1, 1, sign]
-    found = (
-        take_axes(columns, *_POSITIONS)
-        or take_axes(columns, *_POSITIONS, axes="xy")
-        or take(columns, _EAST, _NORTH)
+        if found := take(columns, _EAST, _NORTH, f"{_AT}({up}|{up[0]})", usual="m"):
+            return found, [1, 1, sign], []
+    if found := take(columns, _EAST, _NORTH, usual="m"):
+        return found, [1, 1], []
+    found = take_axes(columns, *_POSITIONS, usual="m") or take_axes(
+        columns, *_POSITIONS, axes="xy", usual="m"
     )
-    return found, [1] * len(found)
+    return _along_axes(found, [np.diff(each.values, prepend=np.nan) for each in found], places)
+
+
+def _along_axes(
+    found: list[GuessedColumn], steps: Sequence[NDArray], places: Sequence[GuessedColumn]
+) -> tuple[list[GuessedColumn], list[int], list[str]]:
+    """Return x, y and z as east, north and up: by their frame, by how places move, or assumed.
+
+    Args:
+        found: the columns.
+        steps: how far along x and y each row (rows,) is from the one before.
+        places: east and north of the rows, if these are known.
+    """
+    frame = (found[0].frame or frame_of(steps, places)) if found else "enu"
+    if frame == "ned":
+        return [found[1], found[0], *found[2:]], [1, 1, -1][: len(found)], []
+    names = ", ".join(each.name for each in found)
+    return found, [1] * len(found), [] if frame else [f"{ASSUMED}{names} are {_ENU}"]
+
+
+def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
+    """Say what a quaternion is assumed to turn."""
+    if not turn:
+        return []
+    names = ", ".join(each.name for each in turn)
+    return [
+        f"{ASSUMED}{names} turn the body's axes, forward, left and up, to those of the positions, or to "
+        "east, north and up; mounting_deg"
+    ]
 
 
 def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
@@ -328,8 +377,8 @@ def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[Gu
 def truth_lines(table: GuessedTable) -> Iterator[str]:
     """Write the stream of a table's true columns, of which nothing is made that a filter could read."""
     columns = table.columns
-    place, factors = _position(columns)
-    if not place and (geodetic := take(columns, *_GEODETIC)):
+    place, factors, said = _position(columns, table.places)
+    if not place and (geodetic := take(columns, *_GEODETIC, usual="deg")):
         found = places_of(table, geodetic)
         if found.unit not in ("deg", "ddmm.mmmm"):
             raise BadInput(
@@ -337,24 +386,24 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
             )
         table.made.extend(found.lines)
         names = dict(zip(("latitude", "longitude"), geodetic, strict=True))
-        height = take(columns, ALTITUDE)
-        if height and (said := altitude_of(table, height[0], found.unit)):
-            if not all(line.startswith(ASSUMED) for line in said):
+        height = take(columns, ALTITUDE, usual="m")
+        if height and (of_height := altitude_of(table, height[0], found.unit)):
+            if not all(line.startswith(ASSUMED) for line in of_height):
                 raise BadInput(
                     f"{table.path}: its true altitudes, {height[0].name}, are not in m; convert them"
                 )
-            table.made.extend(said)
+            table.made.extend(of_height)
         names.update(zip(("altitude",), height, strict=False))
         parts = ", ".join(f"{key} = {name_of(each)}" for key, each in names.items())
         table.made.append(f"geodetic = {{ {parts} }}")
         axes = zip(("east_m", "north_m", "up_m"), names.values(), strict=False)
         place = [each._replace(name=name, unit="m") for name, each in axes]
         factors = [1] * len(place)
-    turn = _quaternion(columns)
-    heading = [] if turn else take(columns, _HEADING)
+    turn = [] if -1 in factors else _quaternion(columns)
+    heading = [] if turn else take(columns, _HEADING, usual="rad")
     if place or turn or heading:
         why = "the names say that it is the truth"
-        lines = _truth(place, factors, turn, heading)
+        lines = [*_truth(place, factors, turn, heading), *said]
         yield from stream_lines(f"{table.prefix}/truth", "TruthState", why, *lines)
     if columns:
         rest = ", ".join(each.name for each in columns)
@@ -394,12 +443,13 @@ def _truth(
         f'components = "{",".join(names)}"',
         f'kinds = "{",".join(kinds)}"',
         *lines,
+        *_turned(turn),
     ]
 
 
 def _heading(table: GuessedTable) -> Iterator[str]:
     """Write headings beside fixes; a course alone is none, as it has no direction at rest."""
-    if not table.places or not (found := take(table.columns, _HEADING_ALONE)):
+    if not table.places or not (found := take(table.columns, _HEADING_ALONE, usual="rad")):
         return
     is_compass = is_ais(table) or bool(re.search("compass|course|heading|hdg", found[0].plain))
     direction = direction_of(found[0], table.places, usual=is_compass)
@@ -420,17 +470,22 @@ def _heading(table: GuessedTable) -> Iterator[str]:
 
 
 def _velocity(table: GuessedTable) -> Iterator[str]:
-    velocity = take_axes(table.columns, "vel", "velocity", "v") or take(table.columns, "ve", "vn", "vu")
+    stem, columns = "(.*_)?v(el(ocity)?)?_?", table.columns
+    found = take_axes(columns, "vel", "velocity", "v", usual="m/s")
+    velocity, factors, said = _along_axes(found, [each.values for each in found], table.places)
+    for up, sign in (("u(p)?", 1), ("d(own)?", -1)):
+        if not velocity:
+            velocity = take(columns, *(stem + each for each in ("e(ast)?", "n(orth)?", up)), usual="m/s")
+            factors = [1, 1, sign]
     if velocity:
-        speed = np.linalg.norm([each.values for each in velocity[:2]], axis=0)
-        in_unit, why = speed_unit_of(table, velocity[0]._replace(values=speed))
+        in_unit, why = speed_unit_of(table, velocity)
         yield from stream_lines(
             f"{table.prefix}/velocity",
             "VelocityFix",
             "the names are a velocity along three axes",
             f"fields.velocity_mps = {names_of(velocity)}",
-            f"{ASSUMED}{', '.join(each.name for each in velocity)} are along east, north and up, or the "
-            "axes of the positions; the order of fields, factors",
+            *said,
+            *[f"factors.velocity_mps = {factors}"] * (-1 in factors),
             f"units.velocity_mps = {json.dumps(in_unit)}   # {why}",
             "deviations.covariance_m2ps2 = [0.1, 0.1, 0.1]   # fill in the standard deviations",
         )

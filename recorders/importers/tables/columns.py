@@ -12,17 +12,30 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.importers.units import unit
 
+# What stands for a unit in names of columns with times of the day, hhmmss.
+TIME_OF_DAY = "hhmmss"
 # How a line of a guessed mapping begins that says what was assumed.
 ASSUMED = "# Assumed: "
 
 
 class GuessedColumn(NamedTuple):
-    """Holds a column: its name, that without its unit in lower case, the unit, its numbers (rows,)."""
+    """Holds a column of numbers.
+
+    Attributes:
+        name: as the file has it.
+        plain: the name in lower case, without its unit and frame.
+        unit: that its name or a row of units states; empty without one.
+        values: its numbers (rows,).
+        unknown: what the name or a row of units states in place of a unit, and is none that is known.
+        frame: "ned" for axes of north, east, down, "enu" for east, north, up; empty if nothing says it.
+    """
 
     name: str
     plain: str
     unit: str
     values: NDArray
+    unknown: str = ""
+    frame: str = ""
 
 
 class GuessedTable(NamedTuple):
@@ -53,11 +66,22 @@ class GuessedTable(NamedTuple):
     prepared: dict[str, dict[str, Any]]
 
 
-def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
-    """Take the columns whose names fit the patterns, one each, out of the list; none unless all do."""
+def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
+    """Take the columns whose names fit the patterns, one each, out of the list; none unless all do.
+
+    A column whose unit is of another kind than the usual one, such as a speed in rpm, does not fit.
+    """
     found = []
     for pattern in patterns:
-        match = next((each for each in columns if re.fullmatch(pattern, each.plain)), None)
+        match = next(
+            (
+                each
+                for each in columns
+                if re.fullmatch(pattern, each.plain)
+                and (not (usual and each.unit) or stated_unit(each, usual))
+            ),
+            None,
+        )
         if match is None:
             return []
         found.append(match)
@@ -65,11 +89,13 @@ def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
     return found
 
 
-def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> list[GuessedColumn]:
+def take_axes(
+    columns: list[GuessedColumn], *stems: str, axes: str = "xyz", usual: str = ""
+) -> list[GuessedColumn]:
     """Return the columns of the axes of a vector whose name is one of some."""
     for stem in stems:
         before = f"(.*_)?{stem}_?" if stem else ""
-        if found := take(columns, *(before + axis for axis in axes)):
+        if found := take(columns, *(before + axis for axis in axes), usual=usual):
             return found
     return []
 
@@ -80,25 +106,16 @@ def known_of(column: GuessedColumn) -> NDArray:
     return values[np.isfinite(values)]
 
 
-def latitude_metres(latitude_deg: NDArray, longitude_deg: NDArray) -> tuple[NDArray, NDArray]:
-    """Return roughly how many m places are north and east, on a sphere.
-
-    Args:
-        latitude_deg: (rows,), NaN if there is none.
-        longitude_deg: (rows,), NaN if there is none.
-
-    Returns:
-        North and east of latitude and longitude 0 (rows,), scaled by the median latitude.
-    """
-    metres = 111_195.0
-    shrunk = metres * np.cos(np.radians(np.nanmedian(latitude_deg)))
-    return metres * latitude_deg, shrunk * longitude_deg
-
-
 def stated_unit(column: GuessedColumn, usual: str) -> str:
-    """Return the unit that a column's name states, if it is one of the usual one's kind."""
-    is_unit = column.unit and _is_unit(column.unit) and unit(column.unit).powers == unit(usual).powers
-    return column.unit if is_unit else ""
+    """Return the unit that a column's name states, if it is one of the usual one's kind.
+
+    A turn rate in deg is one in deg/s, and a latitude in minutes one in minutes of arc.
+    """
+    meant = {"rad/s": f"{column.unit}/s", "deg": "arcmin" if column.unit == "min" else ""}
+    for stated in (column.unit, meant.get(usual, "")):
+        if column.unit and _is_unit(stated) and unit(stated).powers == unit(usual).powers:
+            return stated
+    return ""
 
 
 def unit_by_size(
@@ -120,11 +137,13 @@ def length_of(columns: Sequence[GuessedColumn]) -> float:
     return float(np.nanmedian(np.linalg.norm([column.values for column in columns], axis=0)))
 
 
-def unit_by_largest(column: GuessedColumn, usual: str, other: str, limit: float) -> tuple[str, str]:
-    """Return the unit of a column: the other one if its numbers go beyond a limit; and the reason."""
-    if stated := stated_unit(column, usual):
+def unit_by_largest(
+    columns: Sequence[GuessedColumn], usual: str, other: str, limit: float
+) -> tuple[str, str]:
+    """Return the unit of columns: the other one if their numbers go beyond a limit; and the reason."""
+    if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
-    largest = largest_of([column])
+    largest = largest_of(columns)
     return (other if largest > limit else usual), f"the largest is {largest:.4g}"
 
 
@@ -164,6 +183,7 @@ _WRITTEN = {
     "msec": "ms", "nsec": "ns", "dps": "deg/s",
     "mdps": "1e-3 deg/s", "radians": "rad", "semicircles": "semicircle",
     "gee": "g",
+    "arcminutes": "arcmin", "minutes": "min",
     "microdegrees": "1e-6 deg", "microdeg": "1e-6 deg", "udeg": "1e-6 deg", "cdeg": "0.01 deg",
     "centidegrees": "0.01 deg", "µs": "us", "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2",
     "m/s²": "m/s^2", "degc": "", "utesla": "uT", "gauss": "G",
@@ -176,17 +196,24 @@ def parted(name: str) -> tuple[str, str]:
     >>> parted("Höhe [ft]"), parted("speed_kmh"), parted("TimeUS")
     (('altitude', 'ft'), ('speed', 'km/h'), ('time', 'us'))
     """
-    match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
-    if match:
+    if match := bracketed(name):
         return underlined(_words(name[: match.start()])), unit_in(match[1])
     plain = underlined(_words(name))
     ending = next((each for each in _ENDINGS if plain.endswith(f"_{each}")), "")
     return plain.removesuffix(f"_{ending}"), _ENDINGS.get(ending, "")
 
 
+def bracketed(name: str) -> re.Match[str] | None:
+    """Find what stands in brackets in a name, unless it is an index or an axis, as in q[0]."""
+    match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
+    return None if match and re.fullmatch(r"(?i)\d+|[wxyz]", match[1]) else match
+
+
 def unit_in(text: str) -> str:
     """Return the unit that a text such as °/s, knots or m/(s^2) means; empty if it means none."""
     bare = text.strip().strip("()[]").replace("°", "deg").replace("(", "").replace(")", "")
+    if re.fullmatch(r"(?i)hh:?mm:?ss(\.s+)?", bare):
+        return TIME_OF_DAY
     if bare.lower().startswith("deg") and (scaled := re.fullmatch(r"(?i)deg_?\*?1?e-?(\d)", bare)):
         return f"1e-{scaled[1]} deg"
     parts = re.split(r"([^\w.-])", bare)
@@ -215,6 +242,8 @@ def underlined(name: str) -> str:
 
 # By how much of the path one direction has to be more like the course than another.
 _CLEAR = 0.4
+# How far from the course directions are, at most, that are along it.
+_ALIKE_RAD = 0.1
 
 
 class Direction(NamedTuple):
@@ -258,6 +287,28 @@ def direction_of(
                 return Direction(*best, "so it goes with the course", is_sure=is_sure)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
+
+
+def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
+    """Tell whether steps along two axes are east and north or north and east, by how places move.
+
+    Args:
+        steps: along the first and the second axis (rows,), NaN if there is none.
+        places: east and north of the rows; none if these are not known.
+
+    Returns:
+        "enu", "ned", or nothing if the steps do not tell clearly.
+    """
+    if not places:
+        return ""
+    moved = [np.diff(each.values, prepend=np.nan) for each in places[:2]]
+    course = moved[0] + 1j * moved[1]
+    off_rad = {}
+    for frame, (east, north) in {"enu": (0, 1), "ned": (1, 0)}.items():
+        product = course * np.conj(steps[east] + 1j * steps[north])
+        off_rad[frame] = float(np.median(np.abs(np.angle(product[np.abs(product) > 0]))))
+    best, other = sorted(off_rad, key=lambda frame: off_rad[frame])
+    return best if off_rad[best] < _ALIKE_RAD < off_rad[other] - off_rad[best] else ""
 
 
 def _angle_units(largest: float) -> list[str]:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, cast
 
@@ -43,16 +44,26 @@ from recorders.importers.tables.npz import columns_of
 from recorders.parsing import DEEPEST
 from recorders.trajectories import NO_END, read_trajectory
 
-Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc"]
+Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc", "vbo"]
 Batch = dict[str, pa.Array]
 # Gives the batches with these columns, and which of them are wanted as text.
 Read = Callable[[Mapping[str, bool]], Iterator[Batch]]
 
 _SUFFIXES: dict[str, Format] = {
     ".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".npz": "npz", ".pos": "rtklib",
+    ".vbo": "vbo",
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 _BLOCK_ROWS = 1 << 17
+# How many lines there are at most before the data of a .vbo file, and what its columns are in.
+_HEADER_LINES = 10_000
+_VBO_UNITS = {
+    "time": "hhmmss",
+    "lat": "arcmin",
+    "long": "-1 arcmin",
+    "velocity": "km/h",
+    "heading": "deg",
+}
 # Arrow takes 10 kB for a column, however few rows there are.
 MOST_COLUMNS = 10_000
 # Of JSON, such as a quotation mark that ends no string.
@@ -147,8 +158,8 @@ def open_table(
     try:
         if format == "csv":
             found = _open_text(path, more, options)
-        elif format == "rtklib":
-            found = _open_rtklib(path)
+        elif format in ("rtklib", "vbo"):
+            found = _open_rtklib(path) if format == "rtklib" else _open_vbo(path)
         else:
             of_trajectory = partial(_open_trajectory, format=None if format == "trajectory" else format)
             found = {"parquet": _open_parquet, "json": _open_json, "npz": _open_npz}.get(
@@ -339,6 +350,35 @@ def _open_rtklib(path: Path) -> Table:
             "RTKLIB writes it"
         )
     return _open_text(path, (), TextOptions(named, has_header=False))
+
+
+def _open_vbo(path: Path) -> Table:
+    """Open a log of Racelogic's VBOX, whose places are in minutes, positive to the north and west."""
+    sections: dict[str, list[str]] = {}
+    section: list[str] = []
+    count = 0
+    with open_decompressed(path) as file:
+        for line in islice(lines_of(file), _HEADER_LINES):
+            count += 1
+            text = line.decode("utf-8", "replace").strip()
+            if text.startswith("["):
+                section = sections.setdefault(text.lower(), [])
+            elif text:
+                section.append(text)
+            if "[data]" in sections:
+                break
+    names = sections.get("[column names]", [""])[0].split()
+    if not (names and "[data]" in sections):
+        raise BadInput(
+            f"{path}: has no sections [column names] and [data]; give the .vbo file as a VBOX writes it"
+        )
+    titles = sections.get("[header]", [])
+    named = titles if len(titles) == len(names) else names
+    table = _open_text(path, (), TextOptions(named, has_header=False, delimiter=" ", skip=count))
+    for name, short in zip(table.columns, names, strict=False):
+        if unit := _VBO_UNITS.get(short.lower()):
+            table.units[name] = unit
+    return table
 
 
 # Binary files, and JSON.

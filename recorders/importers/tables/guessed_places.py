@@ -3,6 +3,7 @@
 By names, sizes, and how far places move for the speed of the rows; what is not certain is refused.
 """
 
+import json
 import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -16,10 +17,11 @@ from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     known_of,
-    latitude_metres,
+    parted,
     stated_unit,
 )
 from recorders.importers.units import unit
+from recorders.models.geodesy import local_metres
 
 # Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
 _AIS = {
@@ -27,6 +29,23 @@ _AIS = {
     r"(.*_)?(sog|speed(_over_ground)?|velocity)": (102.3, 1023.0),
     r"(.*_)?(cog|course(_over_ground)?)": (360.0, 3600.0),
 }
+# By what a column is called, its codes for no fix, and those for one: of NavSatFix, u-blox, PX4 and
+# MAVLink, GGA, and gpsd.
+_FIX_CODES: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...] = (
+    (r"(.*_)?status_status", (-1,), (0, 1, 2)),
+    (r"^(.*[._])?fixType$", (0, 5), (1, 2, 3, 4)),
+    (r"(.*_)?(fix_?type|gps_status)", (0, 1), (2, 3, 4, 5, 6, 7, 8)),
+    (r"(.*_)?(fix_?quality|gps_?qual(ity)?|quality_?indicator|fix)", (0,), (1, 2, 3, 4, 5, 6, 7, 8, 9)),
+    (r"(.*_)?(tpv|gps|fix)_mode", (0, 1), (2, 3)),
+    (
+        r"(.*_)?((has|gps|gnss|position|location)_?fix(_?ok)?|fix_?(ok|valid)|(is_|gps_)?valid)",
+        (0,),
+        (1,),
+    ),
+)
+# What columns of words on fixes are called, and words for none.
+_FIX_WORDS = r"(.*_)?(fix(_?(type|status|mode))?|status|valid(ity)?)"
+_NO_FIX = {"v", "void", "invalid", "none", "no", "no fix", "no_fix", "nofix", "no gps", "false"}
 _NOT_A_PLACE = (91.0, 181.0)
 _NO_ALTITUDE, _LOWEST_M = (-999.0, -9999.0, -32768.0), -450.0
 ALTITUDE = (
@@ -102,6 +121,38 @@ def _is_code(values: NDArray, code: float, largest: float) -> bool:
     return bool(np.any(values == code)) and (not len(others) or float(np.abs(others).max()) <= largest)
 
 
+def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
+    """Return the lines that choose rows with a fix by a receiver's code, and which (rows,) have one."""
+    rows = len(table.whole[0].values)
+    found: list[tuple[str, NDArray[np.bool_], Sequence[float | str]]] = []
+    for column in table.whole:
+        for name, none, valid in _FIX_CODES:
+            known = known_of(column)
+            if re.fullmatch(name, column.name if name[0] == "^" else column.plain) and len(known):
+                if np.isin(known, (*none, *valid)).all():
+                    found.append((column.name, ~np.isin(column.values, none), valid))
+                break
+    for text, cells in table.texts.items():
+        words = {cell.strip() for cell in cells} - {""}
+        lost = {word for word in words if word.lower() in _NO_FIX}
+        if re.fullmatch(_FIX_WORDS, parted(text)[0]) and (lost or words <= {"A"}):
+            has_fix = np.array([cell.strip() not in lost for cell in cells])
+            found.append((text, has_fix, sorted(words - lost)))
+    has_fix = np.all([which for _, which, _ in found], axis=0) if found else np.ones(rows, bool)
+    if not has_fix.any():
+        return [], np.ones(rows, bool)
+    lines = []
+    if found:
+        where = ", ".join(f"{json.dumps(name)} = {_listed(valid)}" for name, _, valid in found)
+        lines.append(f"where = {{ {where} }}")
+    lines += [
+        f"{ASSUMED}{name} says that there is no fix in {_rows(int((~which).sum()))}, left out; where"
+        for name, which, _ in found
+        if not which.all()
+    ]
+    return lines, has_fix
+
+
 def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     """Find what latitudes and longitudes are in; raises BadInput if that is not certain."""
     latitude, longitude = place
@@ -112,8 +163,10 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     names = f"{latitude.name} and {longitude.name}"
     fitting = [name for name in (*_SCALES, _MINUTES, "rad") if _fits(name, *pair)]
     stated = stated_unit(latitude, "deg")
+    own = stated_unit(longitude, "deg") or stated
     if stated and stated not in ("deg", "rad") and stated not in fitting:
-        fitting = [stated] if _fits(stated, *pair) else []
+        largest = [np.nanmax(np.abs(_degrees(*each))) for each in ((stated, pair[0]), (own, pair[1]))]
+        fitting = [stated] if largest[0] <= 90.0 and largest[1] <= 180.0 else []
     if not fitting:
         largest = [np.nanmax(np.abs(values)) for values in pair]
         whole_turn = largest[0] <= 90.0 and largest[1] <= 360.0
@@ -138,13 +191,18 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
             _refuse(table, place, f"they may be {', '.join(fitting)}")
     if chosen not in ("deg", stated):
         comment = f"{ASSUMED}{names} are in {chosen}, {why}"
-    degrees = [_degrees(chosen, values) for values in pair]
+    units = (chosen, own if chosen == stated else chosen)
+    degrees = [_degrees(name, values) for name, values in zip(units, pair, strict=True)]
     lines = [f"{comment}; {_how(chosen)}"] if comment else []
     if chosen == _MINUTES:
         both = table.prepared.setdefault("degrees_minutes", {"": []})
         both[""] += [latitude.name, longitude.name]
-    elif chosen != "deg":
-        lines += [f'units.{field} = "{chosen}"' for field in ("latitude_deg", "longitude_deg")]
+    else:
+        lines += [
+            f'units.{field} = "{name}"' + "   # positive to the west" * name.startswith("-")
+            for field, name in zip(("latitude_deg", "longitude_deg"), units, strict=True)
+            if name != "deg"
+        ]
     zero = (degrees[0] == 0) & (degrees[1] == 0)
     if zero.any() and np.abs(np.nanmedian(degrees[0])) > 0.5:
         missing = table.prepared.setdefault("missing", {})
@@ -262,7 +320,7 @@ def path_ratio(
         longitude_deg: (rows,), NaN if there is none.
         speed: (rows,), in the unknown unit.
     """
-    north, east = latitude_metres(latitude_deg, longitude_deg)
+    east, north = local_metres(latitude_deg, longitude_deg).T
     return plane_ratio(table, east, north, speed)
 
 
@@ -368,19 +426,24 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
     return [said, 'units.covariance_m2 = "mm"']
 
 
-def speed_unit_of(table: GuessedTable, speed: GuessedColumn) -> tuple[str, str]:
-    """Return the unit of a speed, by its name or by how far places move; else m/s, and why."""
+def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tuple[str, str]:
+    """Return the unit of a speed, or of a velocity of east, north and up, and why.
+
+    By its name, or by how far places move; else m/s.
+    """
+    speed = velocity[0]
     if stated := stated_unit(speed, "m/s"):
         return stated, "as its name says"
+    length = np.linalg.norm([each.values for each in velocity[:2]], axis=0)
     if is_ais(table) and re.search("sog|speed", speed.plain):
         return "kn", "as AIS has it"
     if len(table.places) > 1:
-        ratio = plane_ratio(table, table.places[0].values, table.places[1].values, speed.values)
+        ratio = plane_ratio(table, table.places[0].values, table.places[1].values, length)
         if ratio is not None:
             nearest = min(_SPEEDS, key=lambda each: abs(np.log(_SPEEDS[each] / ratio)))
             if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
                 return nearest, "so places move as fast"
-    return "m/s", f"a guess: the largest is {np.nanmax(np.abs(speed.values)):.4g}"
+    return "m/s", f"a guess: the largest is {np.nanmax(length):.4g}"
 
 
 def _column(columns: Sequence[GuessedColumn], pattern: str) -> GuessedColumn | None:

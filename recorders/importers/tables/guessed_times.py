@@ -17,18 +17,20 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.columns import ASSUMED, GuessedColumn, known_of, latitude_metres, parted
+from recorders.importers.tables.columns import ASSUMED, TIME_OF_DAY, GuessedColumn, known_of, parted
 from recorders.importers.tables.files import Batch
 from recorders.importers.tables.order import Order, is_reversed, rollover_of
 from recorders.importers.tables.times import (
     ISO,
     OWN_OFFSET,
     TimeMapping,
+    Undecided,
     formats_of,
     offset_of,
     stamps_ns,
     texts_of,
 )
+from recorders.models.geodesy import local_metres
 
 UNKNOWN_ZERO = "2026-01-01"
 # What times of FIT files count from in s, and where numbers are more likely of 1970.
@@ -44,12 +46,18 @@ _UNIT_WORDS = {
 _NAMED = re.compile(
     r"time|stamp|utc|epoch|clock|zeit|^(s|ms|us|ns)$|"
     r"(^|_)(t|secs?|seconds?|i?tow|millis(econds?)?|micros(econds?)?|msecs?|usecs?|nsecs?|ticks?|elapsed)"
-    r"(_|$|\d)"
+    r"(_|$|\d)|(^|_)(excel|serial_date|date_?num|mjd|julian)(_|$)"
 )
 _COUNTERS = re.compile(
     r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
     r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
 )
+# Names of columns that count days, as Excel and MATLAB do.
+_DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
+# What the column of a message's own stamp is called, and columns without a name of their own.
+_OF_HEADER = r"(^|_)header_?(time_?)?stamp"
+_NAMELESS = r"(value|field|column|col|var|data|unnamed)?_?\d*"
+_LIKE_A_TIME = r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d[ ./-][A-Z][a-z]{2,8}[ ./-]\d{2}"
 # From and below how many seconds steps are, by what a table holds: three decades, so that one unit fits.
 _STEPS_S = {"inertial": 5e-4, "fix": 0.02, "other": 2e-3}
 _VEHICLES = re.compile(
@@ -101,12 +109,15 @@ def guess_time(
     vehicle = _vehicle(batch, columns, texts)
     table = _Table(path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain))
     refusals: list[BadInput] = []
-    for mapping, comments in _candidates(table):
-        found = _tried(table, mapping, comments, refusals)
-        if found is not None:
-            return found
+    try:
+        for mapping, comments in _candidates(table):
+            found = _tried(table, mapping, comments, refusals)
+            if found is not None:
+                return found._replace(comments=[*found.comments, *_passed_over(table, found.used)])
+    except BadInput as error:
+        refusals.append(error)
     if refusals:
-        raise refusals[0]
+        raise next((each for each in refusals if isinstance(each, Undecided)), refusals[0])
     return GuessedTime(
         f'{{ rate_hz = 1, zero = "{UNKNOWN_ZERO}" }}',
         set(),
@@ -182,22 +193,58 @@ def _parts(stamps: Stamps, codes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     """Yield what the time may be, the likeliest first; raises BadInput for what could be several."""
-    yield from _dates(table)
+    dated: set[str] = set()
+    yield from _dates(table, dated)
     yield from _calendars(table)
     yield from _clocks_of_day(table)
     yield from _pairs(table)
     named = [column for column in table.columns if _NAMED.search(column.plain)]
-    named.sort(key=lambda column: _epoch_unit(column) == "")
-    first = [] if named else table.columns[:1]
-    is_clock = all(not _COUNTERS.fullmatch(each.plain) and _rises(each.values) for each in first)
-    for column in (*named, *(first if is_clock else ())):
+    named.sort(key=lambda column: (_epoch_unit(column) == "", not re.search(_OF_HEADER, column.plain)))
+    for column in named:
         yield from _counted(table, column)
+    _check_texts(table, dated)
+    others = [column for column in table.columns if column.name not in {each.name for each in named}]
+    for column in others:
+        if _epoch_unit(column) and (_rises(column.values) or _rises(np.negative(column.values))):
+            yield from _counted(table, column)
+    others = [column for column in others if _rises(column.values)]
+    first = [] if named else [column for column in others if column is table.columns[0]]
+    for column in first:
+        if not _COUNTERS.fullmatch(column.plain):
+            yield from _counted(table, column)
+    for column in others:
+        if re.fullmatch(_NAMELESS, column.plain) and _is_steady(column.values):
+            raise BadInput(
+                f"{table.path}: column {column.name} rises steadily, and could be the time; write a "
+                f'mapping by hand, with time = {{ column = "{column.name}", unit = ... }}, or with '
+                "`rate_hz` in `time`"
+            )
 
 
 def _rises(values: NDArray) -> bool:
     """Tell whether numbers rise nearly always, and to another one than the first."""
     known = values[np.isfinite(values)]
     return len(known) > 1 and float(np.mean(np.diff(known) >= 0)) >= 0.9 and bool(known[-1] > known[0])
+
+
+def _is_steady(values: NDArray) -> bool:
+    """Tell whether numbers go in steps of nearly one size, other than those of a count of rows."""
+    steps = np.diff(values[np.isfinite(values)])
+    return len(steps) > 1 and 0 < steps.max() <= 1.5 * steps.min() and not np.all(steps == 1)
+
+
+def _passed_over(table: _Table, used: set[str]) -> list[str]:
+    """Say which columns with other dates were not taken for the time."""
+    others = [
+        column.name
+        for column in table.columns
+        if column.name not in used and _NAMED.search(column.plain) and _epoch_unit(column)
+    ]
+    if not others:
+        return []
+    names = " and ".join(sorted(used))
+    why = " of the measurement" if any(re.search(_OF_HEADER, parted(each)[0]) for each in used) else ""
+    return [f"{ASSUMED}{names} is the time{why}, and {', '.join(others)} is not; column"]
 
 
 def _tried(
@@ -207,6 +254,8 @@ def _tried(
     columns = mapping.columns
     try:
         stamps = _stamps(table, mapping)
+    except Undecided:
+        raise
     except BadInput as error:
         refusals.append(error)
         return None
@@ -306,26 +355,36 @@ def _toml(mapping: TimeMapping) -> str:
 # Texts.
 
 
-def _dates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield dates and times as texts; raises BadInput for a column of times in no known format."""
+def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield dates and times as texts, and add the names of their columns to `dated`."""
     plain = {name: parted(name)[0] for name in table.texts}
     days = [name for name in plain if re.fullmatch("(.*_)?(date|day)", plain[name])]
+    days += [column.name for column in table.columns if re.fullmatch("(.*_)?date", column.plain)]
     hours = [name for name in plain if re.fullmatch("(.*_)?(time|clock|utc|hour)", plain[name])]
     offsets = [name for name in plain if re.fullmatch("(.*_)?(utc_?of+se?t|utcofst)", plain[name])]
     pairs = [[day, hour, *offsets[:1]] for day in days for hour in hours]
     named = sorted(
         table.texts, key=lambda name: not _NAMED.search(plain[name] + " date" * (name in days))
     )
-    dated: set[str] = set()
     for names in (*pairs, *([name] for name in named)):
         if found := _dated(table, names):
+            if "zero" in found[0].model_fields_set and days and names[0] not in days:
+                cell = _first_cell(table.batch[days[0]])
+                raise Undecided(
+                    f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
+                    f"'{cell}', whose format is not known; write a mapping by hand, with time = "
+                    f'{{ column = ["{days[0]}", "{names[0]}"], unit = "date", format = ... }}'
+                )
             dated |= {*names}
             yield found
+
+
+def _check_texts(table: _Table, dated: set[str]) -> None:
+    """Raise BadInput for a column of times in no known format."""
     for name in table.texts:
-        if name in dated:
-            continue
         cell = _first_cell(table.batch[name])
-        if re.search(r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}", cell):
+        is_named = _NAMED.search(parted(name)[0]) and re.search(r"\d.*\d", cell)
+        if name not in dated and (is_named or re.search(_LIKE_A_TIME, cell)):
             raise BadInput(
                 f"{table.path}: column {name} holds times such as '{cell}', whose format is not known; "
                 "write "
@@ -363,7 +422,9 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     for pattern in formats_of(cell):
         mapping = TimeMapping.model_validate({**given, "format": pattern})
         try:
-            stamps = _stamps(table, mapping.model_copy(update={"zone": None}))
+            stamps = _stamps(table, mapping.model_copy(update={"zone": "UTC"} if zone else {}))
+        except Undecided:
+            raise
         except BadInput:
             continue
         if np.any(stamps != NOT_A_TIME):
@@ -471,7 +532,7 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         day = next((each for each in table.columns if re.fullmatch("(.*_)?date", each.plain)), None)
         next_minute = np.any(np.diff(whole) == 41)  # from 59 to 100
         is_sure = np.ptp(known) >= 60 or next_minute or cell.startswith("0") or day is not None
-        is_sure = is_sure or "utc" in column.plain.split("_")
+        is_sure = is_sure or "utc" in column.plain.split("_") or column.unit == TIME_OF_DAY
         if not (is_of_day and is_sure):
             continue
         clock = "%H%M%S" + ".%f" * ("." in cell)
@@ -511,7 +572,7 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         ),
         None,
     )
-    if week is not None and tow is not None and np.nanmin(week.values) > 500:
+    if week is not None and tow is not None:
         unit = tow.unit if tow.unit in _SIZES else "ms" if np.nanmax(tow.values) > 604_800 else "s"
         mapping = TimeMapping(column=tow.name, week=week.name, unit=unit)  # type: ignore[arg-type]
         yield mapping, [f"{ASSUMED}GPS time is kept as it is; leap_seconds = 18 makes it UTC"]
@@ -579,6 +640,11 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
         return
     step, largest = float(np.median(steps)), float(np.abs(known).max())
     unit, comments, zero = _epoch_unit(column), [], {}
+    if not unit and re.search(_DAYS, column.plain):
+        raise BadInput(
+            f"{table.path}: column {column.name} counts days, by its name; convert them to seconds or "
+            "dates, and state these in `time`"
+        )
     if not unit:
         zero = {"zero": UNKNOWN_ZERO}
         unit, why = _stated_unit(column), ""
@@ -619,8 +685,8 @@ def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[s
     if not 1e-5 < rate_hz < 2e4:
         raise BadInput(
             f"{table.path}: column {column.name} could be the time, and goes in steps of {step:.3g}, "
-            "which are "
-            "those of no unit; write a mapping by hand with the `unit` and `zero` of `time`"
+            "which are those of no unit; write a mapping by hand with the `unit` and `zero` of `time`; "
+            "convert days, as Excel and MATLAB count them, to seconds or dates first"
         )
     return unit, f", {rate_hz:.4g} rows a second,"
 
@@ -642,7 +708,7 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
         latitude, longitude = named["lat"], named["lon"]
         if np.nanmax(np.abs(latitude)) > 90 or np.nanmax(np.abs(latitude)) < 1.6:
             return None
-        north, east = latitude_metres(latitude, longitude)
+        east, north = local_metres(latitude, longitude).T
     elif {"x", "y"} <= named.keys():
         east, north = named["x"], named["y"]
     else:

@@ -22,6 +22,7 @@ from recorders.importers.tables.columns import (
     ASSUMED,
     GuessedColumn,
     GuessedTable,
+    bracketed,
     names_of,
     parted,
     stream_lines,
@@ -45,6 +46,15 @@ _SENSORS = {
     "acc": r"(?i)acc(el\w*)?(?![a-z])|acceleration", "gyr": r"(?i)gyro\w*|gyr(?![a-z])",
     "mag": r"(?i)mag(netometer|netic\w*)?(?![a-z])", "gravity": "(?i)gravity",
 }  # fmt: skip
+# Columns of tables with a message a row, whose fields have their names beside them.
+_FIELDS = {"field_1", "value_1"}
+# Names of files whose axes are north, east, down, as PX4 and MAVLink have them, and of frames in names.
+_NED = r"(?i)vehicle_(local_position|odometry|trajectory)|local_position_ned|(^|[^a-z])ned([^a-z]|$)"
+_FRAME = r"(^|_)(ned|enu)(?=_|$)"
+# Names of columns with latitudes or longitudes.
+_PLACE = r"(^|_)(lat(itude)?|lon|lng|long(itude)?)$"
+# What in place of a unit is none, and needs no word.
+_NO_UNITS = {"", "-", "1", "none", "n/a"}
 # The column of times that have a file of their own.
 _STAMP = "timestamp"
 # How the line of a file begins that is left out.
@@ -128,10 +138,18 @@ def _table(source: Source, *, is_alone: bool) -> str:
             texts.append(column)
         else:
             plain, unit = parted(column)
-            columns.append(
-                GuessedColumn(column, plain, unit_in(table.units.get(column, "")) or unit, values)
-            )
-    columns = _without_denied(_of_sensor(columns, path))
+            below = table.units.get(column, "")
+            unit = unit_in(below) or unit
+            inside = bracketed(column)
+            unknown = "" if unit else below or (inside[1] if inside else "")
+            columns.append(GuessedColumn(column, plain, unit, values, unknown))
+    if {column.plain for column in columns} | {parted(text)[0] for text in texts} >= _FIELDS:
+        raise BadInput(
+            f"{path}: holds messages of several kinds, with names in Field 1 and on and numbers in "
+            "Value 1 and on; give a table with a column for each field, such as the NAME_data.csv that "
+            "FitCSVTool writes with --data record"
+        )
+    columns = _in_frame(_without_denied(_of_sensor(columns, path)), path)
     exported = export_mapping(path, table.columns, batch)
     time = None if exported else _time(source, batch, columns, texts)
     used = time.used if time else set()
@@ -186,22 +204,39 @@ def _table(source: Source, *, is_alone: bool) -> str:
     true = every._replace(columns=of_truth, has_truth=True, places=[], made=[])
     rest = every._replace(has_truth=bool(of_truth))
     streams = [line for guessed in GUESSES for line in guessed(rest)]
+    plain_numbers = [column.name for column in rest.columns]
     streams += [*_rest(rest), *truth_lines(true)]
+    unread = [
+        f"column {text} holds places such as '{found}', which are no numbers; convert them to degrees"
+        for text in texts
+        if re.search(_PLACE, parted(text)[0])
+        and (found := next((cell for cell in cells[text] if re.search(r"\d", cell)), ""))
+    ]
+    rest.made.extend(_unknown_units([each for each in every.whole if each.name not in plain_numbers]))
     if not streams:
-        raise BadInput(
-            f"{path}: has no column of numbers beside its time; write a mapping by hand, as "
-            "docs/your-log.md says"
-        )
+        nothing = "has no column of numbers beside its time; write a mapping by hand"
+        raise BadInput(f"{path}: {unread[0] if unread else nothing}")
     if not any(line.startswith("topic =") for line in streams) and rest.has_truth:
         raise BadInput(
             f"{path}: its name or columns say that it is the truth, and it has no position or heading; "
             "if it was measured, write a mapping by hand"
         )
+    lines += [f"{_NOT_TAKEN}{path}: {each}" for each in unread]
     prepared = list(prepared_lines(rest))
     sides = rest.prepared.get("hemispheres", {}).values()
     if not_taken := [text for text in texts if text not in used and text not in sides]:
         lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
     return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
+
+
+def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
+    """Say which columns state a unit that is not known."""
+    unknown: dict[str, list[str]] = {}
+    for column in columns:
+        if column.unknown.lower() not in _NO_UNITS:
+            unknown.setdefault(column.unknown, []).append(column.name)
+    for text, names in unknown.items():
+        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, and is passed over; units"
 
 
 def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
@@ -213,6 +248,17 @@ def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
         column._replace(plain=f"{sensor}_{column.plain}") if column.plain in ("x", "y", "z") else column
         for column in columns
     ]
+
+
+def _in_frame(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
+    """Return columns with the frames that their names, or that of the file, state."""
+    of_file = "ned" if re.search(_NED, path.stem) else ""
+    found = []
+    for column in columns:
+        own = re.search(_FRAME, column.plain)
+        plain = re.sub(_FRAME, "", column.plain).strip("_")
+        found.append(column._replace(plain=plain, frame=own[2] if own else of_file))
+    return found
 
 
 def _without_denied(columns: list[GuessedColumn]) -> list[GuessedColumn]:

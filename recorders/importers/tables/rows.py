@@ -27,8 +27,9 @@ from recorders.importers.mapping import (
     schema_of,
     with_unit_quaternions,
 )
-from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
+from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
 from recorders.importers.tables.blocks import lines_of
+from recorders.importers.tables.cells import read_ns
 from recorders.importers.tables.files import (
     Batch,
     Table,
@@ -283,7 +284,8 @@ class Rows:
         """Tell whether rows are newest first, by the local times of the first ones."""
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
-        clock = self._time.model_copy(update={"zone": None, "rollover": None})
+        zone = "UTC" if self._time.zone else None
+        clock = self._time.model_copy(update={"zone": zone, "rollover": None})
         batch = {name: cells[:_LOOKED_AT] for name, cells in batch.items()}
         rows = np.arange(_size(batch))
         return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])
@@ -326,19 +328,20 @@ class Rows:
                         places = self._places(batch)
                     else:
                         assert fixes is not None
-                        columns = self._mapped(fixes, batch, lambda _: {}).columns
-                        places = (
-                            columns["latitude_deg"],
-                            columns["longitude_deg"],
-                            columns["altitude_m"],
-                        )
+                        found = self._mapped(fixes, batch, lambda _: {})
+                        left_out = np.any([*found.dropped.values()], axis=0)
+                        names = ("latitude_deg", "longitude_deg", "altitude_m")
+                        columns = [found.columns[name] for name in names]
+                        latitude, longitude, altitude = np.where(left_out, np.nan, columns)
+                        places = latitude, longitude, altitude
                     known = np.flatnonzero(np.isfinite(places[0]) & np.isfinite(places[1]))[:1]
                     if len(known):
                         self._check_place(places[0][known], places[1][known])
-                        latitude, longitude, altitude = (values[known].item() for values in places)
-                        altitude = altitude if np.isfinite(altitude) else 0.0
+                        first = [values[known].item() for values in places]
                         return Origin(
-                            latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude
+                            latitude_deg=first[0],
+                            longitude_deg=first[1],
+                            altitude_m=first[2] if np.isfinite(first[2]) else 0.0,
                         )
             return None
         finally:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps, read_ns, to_ns
+from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
+from recorders.importers.tables.cells import read_ns
 from recorders.parameters import Parameters
 
 CountUnit = Literal["s", "ms", "us", "ns"]
@@ -24,6 +25,7 @@ Unit = Literal["s", "ms", "us", "ns", "date"]
 # How many digits after the second (or what else the unit is) are nanoseconds.
 _DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
+_WEEKS = 1024  # after which receivers with ten bits begin again at 0
 _WEEK_NS = 7 * 86400 * 10**9
 MEND = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
@@ -39,10 +41,15 @@ ZONED = r"\s+([A-Z]{2,5}|[A-Z]\w+/\w+)$"
 OWN_OFFSET = r":\d\d.*?(?:[Zz]|(?P<sign>[-+])(?P<h>[01]\d)(?::?(?P<m>\d\d))?)$"
 _OFFSET = re.compile(r"(?<=\d)( ?)([Zz]|[-+][01]\d:?\d\d)$")
 _SPACED = r"(:[\d.]+) ([-+]\d\d:?\d\d)$"
-_WRITTEN = re.compile(
-    r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?(?:([ T,]*)"
-    r"(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
-)
+_CLOCK = r"(?:([ T,]*)(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
+_WRITTEN = re.compile(r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?" + _CLOCK)
+# With the name of the month in second or first place.
+_DAY_MONTH = re.compile(r"\d{1,2}([-/. ])([A-Z][a-z]{2,8})\1\d{4}" + _CLOCK)
+_MONTH_DAY = re.compile(r"([A-Z][a-z]{2,8}) \d{1,2}(,?) \d{4}" + _CLOCK)
+
+
+class Undecided(BadInput):
+    """Says that times can be read in several ways, and which setting decides."""
 
 
 class TimeMapping(Parameters):
@@ -53,7 +60,7 @@ class TimeMapping(Parameters):
             seconds and nanoseconds.
         unit: unit of numbers; "date" is for dates and times as text. Of several columns of numbers each
             has its own, such as ["s", "ns"], and they are added.
-        zero: date that numbers count from.
+        zero: date that numbers count from; by default 1970-01-01, with `week` 1980-01-06.
         week: column of GPS weeks; `column` then has the seconds of the week.
         rate_hz: rows per second of files without stamps, from `zero` on.
         utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
@@ -121,8 +128,13 @@ class TimeMapping(Parameters):
     @property
     def zero_ns(self) -> int:
         """Return what numbers count from, less leap seconds and the offset from UTC."""
-        since = _date_ns(_GPS_ZERO if self.week else self.zero)
+        since = _date_ns(_GPS_ZERO if self.counts_all_weeks else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
+
+    @property
+    def counts_all_weeks(self) -> bool:
+        """Tell whether there are GPS weeks, and they count from the first one."""
+        return self.week is not None and "zero" not in self.model_fields_set
 
     @property
     def units(self) -> list[CountUnit]:
@@ -155,16 +167,19 @@ def formats_of(cell: str) -> Iterator[str]:
     """
     offset = _OFFSET.search(cell)
     bare = cell[: offset.start()] if offset else cell
+    of_offset = f"{offset[1]}%z" if offset else ""
+    if named := _DAY_MONTH.fullmatch(bare):
+        yield named[1].join(("%d", _month(named[2]), "%Y")) + _of_day(*named.groups()[2:]) + of_offset
+        return
+    if named := _MONTH_DAY.fullmatch(bare):
+        yield f"{_month(named[1])} %d{named[2]} %Y" + _of_day(*named.groups()[2:]) + of_offset
+        return
     found = _WRITTEN.fullmatch(bare) or _WRITTEN.fullmatch(re.sub(ZONED, "", bare))
     if not (bare and found):
         yield ISO
         return
-    first, mark, second, third, between, clock, second_of, point, half = found.groups()
-    of_day = ""
-    if clock:
-        of_day = ("%I" if half else "%H") + ":%M" + ":%S" * bool(second_of)
-        of_day += f"{point}%f" * bool(point) + (" %p" if half and half[0] == " " else "%p" * bool(half))
-    of_day += f"{offset[1]}%z" if offset else ""
+    first, mark, second, third = found.groups()[:4]
+    of_day = _of_day(*found.groups()[4:]) + of_offset
     if not first:
         yield of_day
         return
@@ -179,7 +194,22 @@ def formats_of(cell: str) -> Iterator[str]:
         if year == "%y" and len(first) == len(second) == 2:
             dates.append(("%y", "%m", "%d"))
     for parts in dates:
-        yield mark.join(parts) + (between or "") + of_day
+        yield mark.join(parts) + of_day
+
+
+def _month(name: str) -> str:
+    return "%b" if len(name) == 3 else "%B"
+
+
+def _of_day(
+    between: str | None, clock: str | None, second: str | None, point: str | None, half: str | None
+) -> str:
+    """Return the format of a time of day as `_CLOCK` takes it apart."""
+    if not clock:
+        return ""
+    of_day = (between or "") + ("%I" if half else "%H") + ":%M" + ":%S" * bool(second)
+    of_day += f"{point}%f" * bool(point)
+    return of_day + (" %p" if half and half[0] == " " else "%p" * bool(half))
 
 
 def _date_ns(text: str) -> int:
@@ -258,6 +288,13 @@ def stamps_ns(
             found = read_ns(each, _DIGITS[unit], found, where=label, mend=MEND)
         if mapping.week:
             weeks = read_ns(cells[-1], 0, where=label, mend=MEND)
+            known = weeks[weeks != NOT_A_TIME]
+            if mapping.counts_all_weeks and len(known) and known.min() < _WEEKS:
+                raise Undecided(
+                    f"{label}: GPS week {known.min()} is before 22 August 1999, or counts to 1023 only; "
+                    'state in `zero` of `time` the date of week 0: "2019-04-07" for recordings after '
+                    'that day, "1999-08-22" or "1980-01-06" for earlier ones'
+                )
             found = to_ns(weeks, _WEEK_NS, found, where=label, mend=MEND)
         if mapping.rollover is not None:
             rollover_ns = round(mapping.rollover * 10 ** _DIGITS[units[0]])
@@ -289,12 +326,11 @@ def _dates_ns(
     zones = np.zeros(len(joined), dtype=object)
     names: dict[str, float | ZoneInfo] = {}
     if "%p" not in mapping.format and pc.any(pc.match_substring_regex(joined, ZONED)).as_py():
-        zones = joined.to_pandas().str.extract(ZONED, expand=False).fillna(0).to_numpy()
+        written = joined.to_pandas().str.extract(ZONED, expand=False)
+        zones = np.where(written.isna(), 0, written.to_numpy(object))
         joined = pc.replace_substring_regex(joined, ZONED, "")
-    own = np.zeros(len(joined), bool)
-    if zone:
-        found = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False)
-        own = found.to_numpy(zero_copy_only=False)
+    found = pc.fill_null(pc.match_substring_regex(joined, OWN_OFFSET), False)
+    own = found.to_numpy(zero_copy_only=False)
     try:
         names = {str(name): offset_of(str(name)) for name in set(zones.tolist()) - {0}}
         dates = pd.to_datetime(joined.to_pandas(), format=mapping.format, utc=True)
@@ -310,7 +346,16 @@ def _dates_ns(
     for name, own_zone in names.items():
         which = zones == name
         since_ns[which] = _from_zone(since_ns[which], own_zone, rows[which], label, reading)
-    if own.any():
+    if zone == 0.0 and mapping.zone is None:
+        local = ~own & (zones == 0) & (since_ns != NOT_A_TIME)
+        if (stated := own | (zones != 0)).any() and local.any():
+            first, other = int(np.argmax(local)), int(np.argmax(stated))
+            raise Undecided(
+                f"{label}: row {rows[first] + 1} holds '{joined[first]}' without a zone, and row "
+                f"{rows[other] + 1} states one; state the zone of rows without, such as "
+                'zone = "UTC", in `time`'
+            )
+    elif zone and own.any():
         _check_offsets(since_ns[own], joined.filter(pa.array(own)), zone, rows[own], label)
     if zone:
         local = ~own & (zones == 0)
