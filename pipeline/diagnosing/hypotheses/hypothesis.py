@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -208,12 +209,18 @@ def noise_gain_over(
     The mean and the standard deviation over logs, see `pipeline.tuning.control_noise`. Of noises and
     outliers it is zero: their likelihood is meant to have that noise.
     """
-    trials = [now, *(now._replace(source=each) for each in likelihood.disturbed(now))]
     most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, all of it this noise
-    before = _lost(likelihood, trials)
+
+    @cache
+    def disturbed() -> tuple[list[Trial], NDArray[np.float64]]:
+        trials = [now, *(now._replace(source=each) for each in likelihood.disturbed(now))]
+        return trials, _lost(likelihood, trials)
 
     def gain(of: Hypothesis, value: Number) -> tuple[float, float]:
         if of.kind in NOISES or of.kind == "outliers":
+            return 0.0, 0.0
+        trials, before = disturbed()
+        if len(trials) < 2:
             return 0.0, 0.0
         gained = before - _lost(likelihood, [of.without(each, value) for each in trials])
         gained = gained[np.isfinite(gained)]  # a filter may fail with more noise
