@@ -32,10 +32,11 @@ def _with(stream: Stream, **columns: NDArray) -> Stream:
 
 def shifted(field: str, entry: int | None = None) -> Alteration:
     """Add a bias to a field, or to one entry of it where that is a vector."""
-    return partial(_shifted, field, entry)
+    return partial(added, field, entry)
 
 
-def _shifted(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.float64]) -> Stream:
+def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.float64]) -> Stream:
+    """Add a number to a field or to one entry of it: the same to n messages, or (n,)."""
     column = stream[field].copy()
     if entry is None:
         column += by if column.ndim == 1 or np.ndim(by) == 0 else np.reshape(by, (-1, 1))
@@ -132,7 +133,7 @@ def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
 
 
 def _ramped(first_ns: int, field: str, entry: int | None, stream: Stream, rate: float) -> Stream:
-    return _shifted(field, entry, stream, rate * _since_s(stream, first_ns))
+    return added(field, entry, stream, rate * _since_s(stream, first_ns))
 
 
 def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     gains_over,
     inflation_over,
     is_spike,
+    noise_gain_over,
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
@@ -27,6 +28,7 @@ FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
+SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
 LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
@@ -168,6 +170,7 @@ def _likeliest(
     Multimodel Inference, 2nd ed. 2002, section 2.5, divide all by one factor too.
     """
     gains_of, inflation_of = gains_over(likelihood, now), inflation_over(likelihood, now)
+    noise_gain_of = noise_gain_over(likelihood, now)
     doubtful, inflation = list[tuple[Peak, Hypothesis]](), 1.0
 
     def is_sure(pair: tuple[Peak, Hypothesis]) -> bool:
@@ -176,6 +179,9 @@ def _likeliest(
         if _is_at_end(gains_of, at, of) or (
             not at.is_special and is_spike(likelihood, now, of, at.value, at.gain)
         ):
+            return False
+        by_noise, spread = noise_gain_of(of, at.value)
+        if at.gain < least_gain(count, of.size) + by_noise + SPREADS * spread:
             return False
         inflation = max(inflation, inflation_of(of, at.value, at.gain))
         if at.gain > least_gain(count, of.size) * inflation:

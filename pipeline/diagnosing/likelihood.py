@@ -26,6 +26,7 @@ from pipeline.tuning.broad_starts import (
     mean_likelihood,
     part_count,
 )
+from pipeline.tuning.control_noise import disturbed
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
@@ -154,6 +155,10 @@ class Likelihood:
             for place, part, of_run in zip(places, scored, outputs, strict=True):
                 found[place] = self._totals(part, of_run, count)
         return found
+
+    def disturbed(self, trial: Trial) -> list[MemorySource]:
+        """Return copies of a trial's log with noise added to what drives."""
+        return disturbed(trial.source, self._bound_to(trial))
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
         """Divide trials into portions that memory holds."""

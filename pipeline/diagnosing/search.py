@@ -160,7 +160,10 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
 
 
 def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search:
-    """Search for several numbers: by the paraboloid about the best, again and again."""
+    """Search for several numbers: by the paraboloid about the best, again and again.
+
+    Where a filter diverges the gain is none: the best of the points that it is told by is taken then.
+    """
     size, steps = of.size, np.array(of.tried[0])
     at, gain = np.zeros(size), 0.0
     for number in range(ROUNDS):
@@ -180,6 +183,9 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
         share = np.where(values < 0.0, along / np.maximum(-values, 1e-12), np.sign(along) * 4.0)
         move = vectors @ np.clip(share, -100.0, 100.0) * steps
         [found] = yield [tuple(map(float, at + move))]
+        best = int(np.argmax(gains))
+        if found < gain + gains[best]:
+            found, move = gain + gains[best], np.subtract(asked[best], at)
         if found <= gain:
             break
         improved, at, gain = found - gain, at + move, found

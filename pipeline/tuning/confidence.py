@@ -57,7 +57,8 @@ class SearchOutcome(NamedTuple):
             stopped, or ended at bounds alone.
         evaluations: how many values were tried.
         has_converged, was_stopped: how it ended.
-        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
+        is_spike: whether a search from a second start does not find this least cost.
+        at_edge: parameters beside whose values a run fails, or uses fewer measurements.
         begins_alike: whether filters begin with the optimum where they began in the search.
         held: parameters of a calibration that the motion does not determine; they stay at their start.
         lacks: the sentence that says so.
@@ -69,7 +70,8 @@ class SearchOutcome(NamedTuple):
     confidence: Confidence | None = None
     has_converged: bool = True
     was_stopped: bool = False
-    is_at_edge: bool = False
+    is_spike: bool = False
+    at_edge: Sequence[str] = ()
     begins_alike: bool = True
     held: Sequence[str] = ()
     lacks: str = ""

@@ -25,10 +25,11 @@ from pipeline.tuning.broad_starts import (
     part_count,
     with_find,
 )
+from pipeline.tuning.control_noise import disturbed
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas, topics_of
 from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, Initialized, bind
+from replay.engine.replaying.estimator import Bound, Initialized, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.ensembles import Ensemble
@@ -40,6 +41,7 @@ from replay.judging.metrics.measuring import Sums, plus
 
 Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]
+NOISE = "noise"  # what a log's controls cost by their noise, beside the topics of what is estimated
 INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
@@ -52,6 +54,7 @@ class Run(NamedTuple):
         begun: how what is estimated begins, by its name, where the log does not say so; see `begin`.
         starts: from where likelihoods are compared, in place of `begun`.
         parts: the log once for each part of `starts`.
+        disturbed: copies with noise added to what drives, if the cost is corrected for that noise.
     """
 
     ensemble: Ensemble[MemorySource]
@@ -59,6 +62,7 @@ class Run(NamedTuple):
     begun: Mapping[str, Initialized] = {}
     starts: Starts = {}
     parts: Ensemble[MemorySource] = Ensemble([])
+    disturbed: Sequence[MemorySource] = ()
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
@@ -188,6 +192,8 @@ class Objective:
         on_best: is told of the best point after every batch.
         pool: who replays; without one threads of this process.
         best: of all points until now.
+        held: by the places of noises among the names, the values (k,) that these keep where the cost is
+            corrected; see `correct`.
     """
 
     label: str
@@ -199,6 +205,7 @@ class Objective:
     on_best: Callable[[Best], None] = silent
     pool: WorkerPool | None = None
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
+    held: Mapping[int, float] = field(default_factory=dict)
     _counts: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
@@ -275,6 +282,65 @@ class Objective:
                 )
             self._counts.append(count)
 
+    def correct(self, values: Floats) -> None:
+        """Correct the cost for the noise of the controls, see `pipeline.tuning.control_noise`.
+
+        Of noises that are searched for, the correction keeps the values (k,): else it would take that
+        noise out of the likelihood that they are found by.
+        """
+        noises: set[str] = set()
+        runs = []
+        for number, run in enumerate(self.runs):
+            bound = self._bound(values, run)
+            runs.append(run._replace(disturbed=disturbed(run.ensemble[0], bound, number)))
+            readings = [each.reading for each in bound if isinstance(each, Recursive) and each.reading]
+            noises |= {name for reading in readings for name in reading().noises}
+        self.runs = runs
+        self.held = {
+            place: float(values[place]) for place, name in enumerate(self.names) if name in noises
+        }
+
+    def leave_noise(self) -> None:
+        """Take the correction back."""
+        self.runs, self.held = [run._replace(disturbed=()) for run in self.runs], {}
+
+    def nis(self, values: Floats) -> float:
+        """Compute the mean NIS per component of all logs with these values (k,)."""
+        found = [stream for run in self.runs for _, stream in innovations_in(self.outputs(values, run))]
+        components = sum(int(np.isfinite(stream["innovation"]).sum()) for stream in found)
+        squares = sum(float(np.nansum(stream["normalised_innovation_squared"])) for stream in found)
+        return squares / max(components, 1)
+
+    @property
+    def is_corrected(self) -> bool:
+        """Tell whether the cost is corrected for the noise of the controls."""
+        return any(run.disturbed for run in self.runs)
+
+    def lost_by_noise(self, points: Floats) -> Floats:
+        """Compute what pairs of opposite noises cost the logs at points (n, k): (n, pairs, 2)."""
+        return np.array([
+            np.sum([self._lost(point, run, count) for run, count in self._corrected_runs], axis=0)
+            for point in points
+        ])  # fmt: skip
+
+    @property
+    def _corrected_runs(self) -> list[tuple[Run, int]]:
+        return [pair for pair in zip(self.runs, self._counts, strict=True) if pair[0].disturbed]
+
+    def _lost(self, values: Floats, run: Run, count: int) -> Floats:
+        """Compute what pairs of opposite noises cost a log (pairs, 2); NaN where a replay fails."""
+        values = values.copy()
+        values[list(self.held)] = list(self.held.values())
+        size = part_count(run.starts)
+        runs = Ensemble([each for each in (*run.ensemble, *run.disturbed) for _ in range(size)])
+        outputs = self._outputs_of_parts(values, run, runs)
+        totals = [
+            self._total(outputs[first : first + size], run, count)
+            for first in range(0, len(outputs), size)
+        ]
+        without, *having = [np.nan if each is None else sum(each.values()) for each in totals]
+        return without - np.reshape(having, (-1, 2))
+
     def begins_alike(self, values: Floats) -> bool:
         """Tell whether filters would begin at the same stamps with these values (k,)."""
         return self.by == "likelihood" or all(
@@ -315,17 +381,25 @@ class Objective:
             parts = self._parts(values, run)
         except BadInput:  # as of a batch that does not converge
             return None
-        return self._total(parts, run, count)
+        total = self._total(parts, run, count)
+        if total is None or not run.disturbed:
+            return total
+        return {**total, NOISE: float(np.mean(self._lost(values, run, count)))}
 
     def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
         """Return the outputs that are compared: of each part of broad starts, where the log has none."""
         if not run.starts:
             return [self.outputs(values, run)]
+        return self._outputs_of_parts(values, run, run.parts)
+
+    def _outputs_of_parts(
+        self, values: Floats, run: Run, parts: Ensemble[MemorySource]
+    ) -> list[dict[str, Ragged]]:
+        """Return the outputs of logs which stand there once for each part of the log's starts."""
         bound = [begun_at(each, run.starts) for each in self._bound(values, run)]
-        outputs = collect(replay(run.parts, bound)).items()
+        outputs = collect(replay(parts, bound)).items()
         return [
-            {topic: gather([rows.of_run(part)]) for topic, rows in outputs}
-            for part in range(len(run.parts))
+            {topic: gather([rows.of_run(part)]) for topic, rows in outputs} for part in range(len(parts))
         ]
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:

@@ -238,11 +238,23 @@ class Tuning:
                 "with these values the filter begins elsewhere than in the search that found them, and "
                 "with those found from there elsewhere again; give every log a prior"
             )
-        if found.is_at_edge:
+        if found.at_edge:
             yield (
-                "there are no intervals: beside these values a run fails or uses fewer measurements, so "
-                "that likelihoods cannot be compared; give every log a prior, a narrower --bound, or "
-                "other values to start from"
+                f"{', '.join(found.at_edge)}: no interval, since beside the value a run fails or uses "
+                "fewer measurements, so that likelihoods cannot be compared; give every log a prior, a "
+                "narrower --bound, or other values to start from"
+            )
+        if found.is_spike:
+            yield (
+                "there are no intervals: innovations are too large with these values, and a search from "
+                "a second start ends at others that explain the logs less: the filter diverges nearby; "
+                "start from other values with --set, or from a --grid"
+            )
+        if self.objective.is_corrected:
+            yield (
+                "the noise of the control, such as the odometry, would move these values: shifted "
+                "stamps average it, and a factor below 1 attenuates it; the search leaves out what "
+                "that gains, and the intervals include it"
             )
         if found.confidence is not None:
             yield from doubts(found.confidence, found.coordinates)

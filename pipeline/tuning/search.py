@@ -23,6 +23,7 @@ STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
 DESCENTS = 20  # each of which ends where another parameter's change costs less
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
+MOVES = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # of a calibration's parameter, in useful units
 LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
 FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches
@@ -98,27 +99,27 @@ class Coordinates:
         return np.array([each.low for each in self.free]), np.array([each.high for each in self.free])
 
 
-def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
-    """Return the coordinates to search in.
+def coordinates_of(cost: Cost, free: Sequence[Free], about: Floats) -> Coordinates:
+    """Return the coordinates to search in, with units as the cost bends about values (k,).
 
     Raises BadInput where the cost does not change with a parameter.
     """
-    start = np.array([each.start for each in free])
     units = np.ones(len(free))
     for place, each in enumerate(free):
         if each.is_kept:
             continue
+        value = float(about[place])
 
         def near(steps: Sequence[float], place: int = place, each: Free = each) -> Floats:
-            """Return what it costs so far from the start along this parameter."""
-            points = np.tile(start, (len(steps), 1))
-            points[:, place] = np.clip(each.start + np.array(steps), each.low, each.high)
+            """Return what it costs so far from the values along this parameter."""
+            points = np.tile(about, (len(steps), 1))
+            points[:, place] = np.clip(about[place] + np.array(steps), each.low, each.high)
             return cost(points)
 
         if each.is_positive:
-            below, middle, above = near([-0.3 * each.start, 0.0, 0.3 * each.start])
+            below, middle, above = near([-0.3 * value, 0.0, 0.3 * value])
         else:
-            units[place], (below, middle, above) = _unit(near, each)
+            units[place], (below, middle, above) = _unit(near, value)
         if below == middle == above:
             raise BadInput(
                 f"{each.name}: nothing in the logs depends on it, so that they cannot determine its "
@@ -128,9 +129,9 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
     return Coordinates(free, units)
 
 
-def _unit(near: Callable[[Sequence[float]], Floats], each: Free) -> tuple[float, Floats]:
-    """Find UNIT standard errors of one parameter alone, by the curvature about the start, and costs."""
-    step = 1e-3 * max(abs(each.start), 1.0)
+def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
+    """Find UNIT standard errors of one parameter alone, by the curvature about a value, and costs."""
+    step = 1e-3 * max(abs(value), 1.0)
     for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
         costs = near([-step, 0.0, step])
         bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
@@ -167,8 +168,8 @@ def least(
     """Find where the cost is least.
 
     A descent from far off can end in another minimum than the least, such as one in which two modes have
-    changed their parts. So it begins, and ends, where no change of a single parameter by one of
-    `FACTORS` costs less.
+    changed their parts, or the spike of a filter that diverges. So it begins, and ends, where no change
+    of a single parameter by one of `FACTORS`, or of a calibration's by one of `MOVES`, costs less.
 
     Args:
         cost: what values (n, k) cost.
@@ -179,26 +180,28 @@ def least(
     Returns:
         Where the cost is least (k,), in coordinates, and whether the search came to its end.
     """
-    point = _scanned(cost, coordinates, start)
+    point = scanned(cost, coordinates, start)
     for _ in range(DESCENTS):
         ended, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
-        point = _scanned(cost, coordinates, ended)
+        point = scanned(cost, coordinates, ended)
         if point is ended or not has_converged:
             return ended, has_converged
     return point, False
 
 
-def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """Find a point (k,) from which no change of one positive parameter costs less.
+def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
+    """Find a point (k,) from which no change of one parameter costs less, see `least`.
 
     Ends after `ITERATIONS` changes where the cost falls without an end.
     """
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
-            np.log(FACTORS)[:, None] * along
-            for along, each in zip(np.eye(len(start)), coordinates.free, strict=True)
-            if each.is_positive
+            (np.log(FACTORS) if each.is_positive else MOVES * each.useful / unit)[:, None] * along
+            for along, unit, each in zip(
+                np.eye(len(start)), coordinates.units, coordinates.free, strict=True
+            )
+            if not each.is_kept and (each.is_positive or each.useful)
         ]
         or [np.empty((0, len(start)))]
     )
@@ -231,12 +234,17 @@ def _minimum(
         return np.fmin(cost(coordinates.values(points)), wall)
 
     def with_gradient(point: Floats) -> tuple[float, Floats]:
+        """Return the cost and its slopes; none towards a side that cannot be used, as at a bound."""
         steps = STEP * np.eye(len(point))
         points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
-        (here, *_), ahead, behind = np.split(costs(points), [1, 1 + len(point)])
+        here, ahead, behind = np.split(costs(points), [1, 1 + len(point)])
         above, below = np.split(points[1:], 2)
-        width = np.diagonal(above - below)
-        return float(here), np.divide(ahead - behind, width, np.zeros_like(width), where=width > 0.0)
+        is_ahead, is_behind = ahead < wall, behind < wall
+        rise = np.where(is_ahead, ahead, here) - np.where(is_behind, behind, here)
+        ends = np.where(is_ahead, above.diagonal(), point) - np.where(is_behind, below.diagonal(), point)
+        slopes = np.divide(rise, ends, np.zeros_like(rise), where=ends > 0.0)
+        is_blocked = np.where(slopes < 0.0, ~is_ahead, ~is_behind)
+        return float(here[0]), np.where(is_blocked, 0.0, slopes)
 
     bounds = list(zip(low, high, strict=True))
     if is_smooth:
@@ -264,7 +272,13 @@ def _minimum(
     return found.x, bool(found.success)
 
 
-def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
+def curvature(
+    cost: Cost,
+    coordinates: Coordinates,
+    point: Floats,
+    places: Sequence[int],
+    steps: float | Floats = CURVATURE_STEP,
+) -> Floats:
     """Compute the second derivatives of the cost at a point.
 
     Args:
@@ -272,12 +286,13 @@ def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Seque
         coordinates: what is searched over.
         point: (k,), in coordinates.
         places: by which m of the k coordinates.
+        steps: of the differences, of all coordinates or (m,).
 
     Returns:
         (m, m), by coordinates; not finite where the cost beside the point is not.
     """
-    m, h = len(places), CURVATURE_STEP
-    along = h * np.eye(len(point))[list(places)]
+    m, h = len(places), np.broadcast_to(steps, len(places))
+    along = h[:, None] * np.eye(len(point))[list(places)]
     pairs = list(combinations(range(m), 2))
     corners = [
         point + first * along[i] + second * along[j]
@@ -289,7 +304,7 @@ def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Seque
     both, plus, minus, neither = crossed.reshape(-1, 4).T
     with np.errstate(invalid="ignore"):
         found = np.diag((ahead - 2.0 * costs[0] + behind) / h**2)
-        mixed = (both - plus - minus + neither) / (4.0 * h**2)
+        mixed = (both - plus - minus + neither) / 4.0
     for (i, j), value in zip(pairs, mixed, strict=True):
-        found[i, j] = found[j, i] = value
+        found[i, j] = found[j, i] = value / (h[i] * h[j])
     return found

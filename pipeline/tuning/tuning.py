@@ -34,12 +34,14 @@ from pipeline.tuning.objective import (
 )
 from pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from pipeline.tuning.search import (
+    CURVATURE_STEP,
     Coordinates,
     Free,
     coordinates_of,
     curvature,
     least,
     least_of_grid,
+    scanned,
 )
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, field_of, merge
@@ -51,6 +53,9 @@ from replay.foreign.naming import allowed
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
 OPEN = {"gate_probability": 1.0}
+MOVED = 0.5  # of log-likelihood, by which the noise of the controls may change within a standard error
+NOISY_STEP = 0.2  # of the differences where they are corrected, in coordinates: two standard errors
+DIVERGED = 2.0  # NIS per component: twice what it should be
 ROUNDS = 4  # of searches, each from where filters begin with the values of the one before
 ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
 
@@ -138,7 +143,7 @@ def tune(
             return made
 
         whole, beyond = objective(runs), objective(others) if others else None
-        found = _settled(whole, searched, grid)
+        found = _found(whole, searched, grid)
         compared = np.array([start, found.optimum])
         costs, held_out_costs = whole(compared), beyond(compared) if beyond else None
         rows = []
@@ -265,6 +270,37 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
     return stated(read, own, kind), False
 
 
+def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
+    """Find the values of least cost, corrected if the noise of the controls moves it; and no spike."""
+    found = _settled(objective, free, grid)
+    if _is_moved_by_noise(objective, found):
+        objective.begin(np.array([each.start for each in free]))
+        found = _settled(objective, free, grid)
+    return _confirmed(objective, found)
+
+
+def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
+    """Correct the cost for the noise of the controls, if that changes it beside the optimum.
+
+    If it changes by MOVED or more within a standard error of a parameter, the noise may decide where the
+    cost is least.
+    """
+    if found.confidence is None:
+        return False
+    places, point = list(found.confidence.places), found.coordinates.of(found.optimum)
+    objective.correct(found.optimum)
+    moves = [place not in objective.held for place in places]
+    if objective.is_corrected and any(moves):
+        errors = np.nan_to_num(found.confidence.errors, posinf=0.0)
+        steps = (errors[:, None] * np.eye(len(point))[places])[moves]
+        points = found.coordinates.values(np.array([point, *(point + steps), *(point - steps)]))
+        lost = objective.lost_by_noise(points).mean(axis=(1, 2))
+        if np.max(np.abs(lost - lost[0])) > MOVED:
+            return True
+    objective.leave_noise()
+    return False
+
+
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
     """Find the values of least cost with which filters begin where they began in the search.
 
@@ -322,15 +358,20 @@ def _search(
     A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
     change with one of them.
     """
-    coordinates = coordinates_of(objective, free)
+    start = np.array([each.start for each in free])
+    coordinates = coordinates_of(objective, free, start)
     try:
         if point is None:
-            point = coordinates.of(np.array([each.start for each in free]))
+            point = coordinates.of(start)
         if grid > 1:
             point = least_of_grid(objective, coordinates, grid)
+        begin = coordinates.values(scanned(objective, coordinates, point))
+        if not np.array_equal(begin, start):  # where a filter diverges, no unit can be told
+            coordinates = coordinates_of(objective, free, begin)
+            point = coordinates.of(begin)
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
-        known, is_at_edge = _confidence_at(objective, coordinates, point)
+        known, at_edge = _confidence_at(objective, coordinates, point)
         if known is not None and (places := unknown(known, coordinates)):
             kept = [each.kept if place in places else each for place, each in enumerate(free)]
             nearer = replace(coordinates, free=kept)
@@ -339,10 +380,10 @@ def _search(
             best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
             if cost - best < ENOUGH:
                 coordinates, point = nearer, ended
-                known, is_at_edge = _confidence_at(objective, coordinates, point)
+                known, at_edge = _confidence_at(objective, coordinates, point)
         optimum, evaluations = coordinates.values(point), objective.best.evaluations
         return SearchOutcome(
-            coordinates, optimum, evaluations, known, has_converged=has_converged, is_at_edge=is_at_edge
+            coordinates, optimum, evaluations, known, has_converged=has_converged, at_edge=at_edge
         )
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
@@ -353,21 +394,78 @@ def _search(
 
 def _confidence_at(
     objective: Objective, coordinates: Coordinates, point: Floats
-) -> tuple[Confidence | None, bool]:
-    """Compute how well a search tells what lies at no bound, and whether runs fail beside it."""
-    inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
-    if objective.by != "likelihood" or not inner:
-        return None, False
-    bent = curvature(objective, coordinates, point, inner)
-    is_at_edge = not np.isfinite(bent).all()
-    return None if is_at_edge else confidence(inner, bent), is_at_edge
+) -> tuple[Confidence | None, list[str]]:
+    """Compute how well a search tells what lies at no bound, and name that beside which runs fail."""
+    inner = np.flatnonzero(~coordinates.at_bounds(point))
+    if objective.by != "likelihood" or not len(inner):
+        return None, []
+    steps = np.full(len(inner), CURVATURE_STEP)
+    if objective.is_corrected:
+        steps[[not coordinates.free[place].is_positive for place in inner.tolist()]] = NOISY_STEP
+    bent = curvature(objective, coordinates, point, inner.tolist(), steps)
+    is_known = np.isfinite(np.diagonal(bent))
+    if not np.isfinite(bent[np.ix_(is_known, is_known)]).all():
+        is_known[:] = False
+    at_edge = [coordinates.free[place].name for place in inner[~is_known].tolist()]
+    if not is_known.any():
+        return None, at_edge
+    places, steps, bent = inner[is_known].tolist(), steps[is_known], bent[np.ix_(is_known, is_known)]
+    if objective.is_corrected:
+        bent = _with_noise(objective, coordinates, point, places, bent, steps)
+    return confidence(places, bent), at_edge
+
+
+def _with_noise(
+    objective: Objective,
+    coordinates: Coordinates,
+    point: Floats,
+    places: Sequence[int],
+    bent: Floats,
+    steps: Floats,
+) -> Floats:
+    """Reduce a curvature (m, m) by what the noise of the controls adds to the slopes of the cost.
+
+    The estimates' covariance is that of the slopes between two inverse curvatures. White, Maximum
+    likelihood estimation of misspecified models, Econometrica 50, 1982.
+    """
+    along = steps[:, None] * np.eye(len(point))[list(places)]
+    points = coordinates.values(np.concatenate([point + along, point - along]))
+    lost = objective.lost_by_noise(points)
+    ahead, behind = np.split(0.5 * (lost[:, :, 0] - lost[:, :, 1]), 2)
+    of_slopes = bent + np.atleast_2d(np.cov((ahead - behind) / (2.0 * steps[:, None])))
+    return bent @ np.linalg.pinv(of_slopes) @ bent
+
+
+def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
+    """Search from a second start, if innovations are too large with the values that were found.
+
+    If that does not find them again but values that explain the logs less, the optimum is a spike of
+    the likelihood of a filter that diverges, and has no interval.
+    """
+    if found.confidence is None or found.was_stopped or objective.nis(found.optimum) < DIVERGED:
+        return found
+    coordinates = found.coordinates
+    moves = [
+        0.0 if each.is_kept else np.log(2.0) if each.is_positive else (each.useful or unit) / unit
+        for each, unit in zip(coordinates.free, coordinates.units, strict=True)
+    ]
+    low, high = coordinates.bounds
+    second = np.clip(coordinates.of(found.optimum) + moves, low, high)
+    ended, _ = least(objective, coordinates, second, is_smooth=True)
+    best, cost = objective(np.array([found.optimum, coordinates.values(ended)]))
+    if abs(cost - best) < ENOUGH:
+        return found
+    if cost < best:
+        better = _search(objective, coordinates.free, 1, ended)
+        return better._replace(held=found.held, lacks=found.lacks, begins_alike=found.begins_alike)
+    return found._replace(confidence=None, is_spike=True)
 
 
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
 ) -> dict[str, Any]:
     """Return what all other logs give, and what the logs of a fold cost with that."""
-    found = _settled(rest, free, grid)
+    found = _found(rest, free, grid)
     start = np.array([each.start for each in free])
     costs = left_out(np.array([start, found.optimum]))
     return {

@@ -1,6 +1,7 @@
 """Checks angles: turn rates, courses and headings, and how an inertial unit is mounted."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -34,6 +35,8 @@ def signs(motion: Motion) -> Iterator[Finding]:
     beside = motion.heading_course(orientation) if orientation else None
     headed = beside.sign if beside else 0
     for source in motion.body.turns:
+        if hangs(motion, source.topic):
+            continue  # which `gravity` says
         ratio = motion.turn(source)
         course = ratio.sign if ratio else 0
         heading = motion.heading_turn(orientation, source).sign if orientation else 0
@@ -213,21 +216,40 @@ def gravity(motion: Motion) -> Iterator[Finding]:
                 f'units.{force.field} = "{given}" in the mapping',
             )
         moves = motion.places is not None or motion.courses is not None
-        if moves and mean[2] < -LARGEST_SHARE * norm and np.median(force.values[:, 2]) < 0.0:
-            turns = next((each for each in motion.body.turns if each.topic == force.topic), None)
-            ratio = motion.turn(turns) if turns else None
-            is_down = ratio is not None and ratio.sign < 0
-            yield Finding(
-                "gravity",
-                force.topic,
-                force.field,
-                -1.0,
-                f"{force.topic}: its z axis is down, or its forces have the wrong sign: at rest the "
-                f"force along z is {mean[2]:.4g}, where specific force points up",
-                "" if is_down else f"{force.topic}.specific_force_z_scale",
-                "" if is_down else -1,
-                "mounting_deg = [180, 0, 0] in the mapping, if its axes are forward, right, down",
-            )
+        if not moves or not _is_z_down(force):
+            continue
+        is_down = hangs(motion, force.topic)
+        either = "" if is_down else ", or its forces have the wrong sign"
+        also = ", and its turn rate goes the other way round than the course" if is_down else ""
+        what, of = ("turn_rate", " too") if is_down else ("specific_force", "")
+        yield Finding(
+            "gravity",
+            force.topic,
+            force.field,
+            -1.0,
+            f"{force.topic}: its z axis is down{either}: at rest the force along z is {mean[2]:.4g}, "
+            f"where specific force points up{also}",
+            f"{force.topic}.{what}_z_scale",
+            -1,
+            f"mounting_deg = [180, 0, 0] in the mapping, which turns the forces{of}, if its axes are "
+            "forward, right, down",
+        )
+
+
+def hangs(motion: Motion, topic: str) -> bool:
+    """Tell whether a unit is upside down: by its force, and by its turn rate beside the course."""
+    turns = next((each for each in motion.body.turns if each.topic == topic), None)
+    if turns is None or not any(_is_z_down(each) for each in motion.body.forces if each.topic == topic):
+        return False
+    ratio = motion.turn(turns)
+    return ratio is not None and ratio.sign < 0
+
+
+def _is_z_down(force: Series) -> bool:
+    mean = quietest(force)
+    if mean is None or np.median(force.values[:, 2]) >= 0.0:
+        return False
+    return bool(mean[2] < -LARGEST_SHARE * np.linalg.norm(mean))
 
 
 def quietest(force: Series) -> Floats | None:
@@ -270,8 +292,12 @@ def quaternions(motion: Motion) -> Iterator[Finding]:
         errors = rate_errors(orientation, rates)
         if not errors:
             continue
-        best = min(errors, key=lambda each: errors[each])
         stated = next(iter(ORDERS))
+        if any(_is_z_down(each) for each in motion.body.forces if each.topic == rates.topic):
+            for half_turn in ([1, -1, -1], [-1, 1, -1]):  # of the unit, not of the orientations
+                turned = replace(rates, values=rates.values * half_turn)
+                errors[stated] = min(errors[stated], rate_errors(orientation, turned)[stated])
+        best = min(errors, key=lambda each: errors[each])
         if BETTER * errors[best] < errors[stated]:
             yield Finding(
                 "quaternion",

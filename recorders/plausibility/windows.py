@@ -15,6 +15,7 @@ WANDERS = 3.0  # standard deviations that places state, within which a body is n
 JUMP = 5.0  # times the noise of a place, and so many times what nearly all steps are long
 JUMP_STEPS = 2.0
 JUMPS = 0.05  # of the steps; more are how the body moves
+ASTRAY_S = 10.0  # before and after a jump
 NEAR = 4  # steps to either side, whose median velocity a step is compared with
 MOST = 2000  # windows; of more every second, third, ... is taken
 
@@ -89,11 +90,20 @@ def jumps(fixes: Series) -> NDArray[np.bool_]:
 
 
 def chords(fixes: Series, span_s: float) -> Windows:
-    """Return how places move (k, 2) in windows of a span, without those in which they jump."""
+    """Return how places move (k, 2) in windows of a span, without those that are near a jump.
+
+    A receiver that jumps back may have gone astray slowly, and one that jumped away may come back so.
+    Of one that jumps so often that this leaves less than half, windows without a jump are taken.
+    """
     first, second = pairs(fixes.times_s, span_s)
-    jumped = np.concatenate([[0], np.cumsum(jumps(fixes))])
-    is_whole = jumped[first] == jumped[second]
-    first, second = first[is_whole], second[is_whole]
+    at_s = fixes.times_s[1:][jumps(fixes)]
+    is_sound = np.ones(len(first), bool)
+    for astray_s in (ASTRAY_S, 0.0):
+        begin_s, end_s = fixes.times_s[first] - astray_s, fixes.times_s[second] + astray_s
+        is_sound = np.searchsorted(at_s, begin_s, "right") == np.searchsorted(at_s, end_s, "right")
+        if is_sound.mean() >= 0.5:
+            break
+    first, second = first[is_sound], second[is_sound]
     return Windows(
         fixes.times_s[first], fixes.times_s[second], fixes.values[second] - fixes.values[first]
     )

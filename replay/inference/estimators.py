@@ -309,7 +309,7 @@ def bind_model(
             assumed=assumed,
             offers=offers_of(model, found, topics),
             is_random=is_random,
-            reading=partial(reading_of, own, found),
+            reading=partial(reading_of, own, found, numbers),
             truth=found.truth,
             is_bound=filtering.is_bound,
         )

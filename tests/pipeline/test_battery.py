@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import fuselog as fl
 from pipeline.altering.sources import alter
 from pipeline.diagnosing import portion
-from pipeline.diagnosing.battery import battery
+from pipeline.diagnosing.battery import battery, consistent
 from pipeline.diagnosing.battery import car as battery_car
 from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from pipeline.diagnosing.battery.car import (
@@ -76,6 +76,23 @@ def test_the_fault_is_named_first(cell: battery.Cell) -> None:
     innovations = fl.replay(log, {"ekf": OPEN}, set=settings).innovations
     low, high = chi_square_interval(int(innovations["degrees"].sum()), 1, CONSISTENT)
     assert low < innovations["nis"].sum() < high, found["setting"]
+
+
+NOISIEST = [each for each in consistent.all_ratios() if each.to_compass in (1.0, 10.0)]
+
+
+@pytest.mark.parametrize("ratios", NOISIEST, ids=str)
+def test_the_noise_of_the_wheels_is_no_cause(ratios: consistent.Ratios) -> None:
+    """It is as large as what the compass errs by, or ten times: shifted stamps would average it."""
+    assert not consistent.tried(ratios, 1003)["cause"]
+
+
+def test_a_delay_beside_noisy_wheels_is_found() -> None:
+    noise = consistent.Ratios(10.0, 10.0).noise
+    log = recorded(late(0.3)(drive(SEED, noise=noise)), has_prior=True)
+    cause = seek(log, "ekf", OPEN, 1).causes[0]
+    assert (cause.hypothesis.kind, cause.hypothesis.topic) == ("delay", FIX)
+    assert cause.value == pytest.approx(0.3, abs=0.02)
 
 
 @pytest.mark.parametrize("faults", battery.PAIRS[:1], ids=" + ".join)

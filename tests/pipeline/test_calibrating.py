@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 import fuselog as fl
+from pipeline.altering.alterations import delayed
 from pipeline.calibrating import study
 from pipeline.calibrating.car import (
     NAMES,
@@ -26,10 +27,15 @@ from pipeline.calibrating.car import (
 )
 from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import _simulated, advice, gain
+from pipeline.diagnosing.battery.car import arcs
 from pipeline.tuning.information import information
 from pipeline.tuning.objective import Best, in_memory
+from recorders.common_streams import fix_stream, prior_stream
+from recorders.log import RunMetadata
 from recorders.models.inertial import from_mounting
+from recorders.recording import Recording
 from replay.engine.replaying.estimator import bind
+from replay.engine.streams.sources import memory_source
 from tests.goldens import keeping
 
 A_V, A_W, B_W = TRUTH[:3]
@@ -213,3 +219,67 @@ def test_the_study_counts_what_intervals_hold_and_what_motions_leave_open(
     assert found["ekf.spread.0-lever_x_m"] == pytest.approx(0.1 / (0.3 / 3.919928))
     is_open = [found[f"ekf.left_open.changing-speed-{name}"] for name in NAMES]
     assert is_open == [0, 0, 0, 1, 1, 0, 0]
+
+
+def driven(
+    seed: int,
+    speed: Floats,
+    turn: Floats,
+    step_s: float,
+    densities: tuple[float, float],
+    sigma_m: float,
+    lever_m: float = 0.0,
+    every: int = 2,
+) -> fl.MemorySource:
+    """A robot drives for so many steps; fixes from the sixth on, one in so many, are of its antenna."""
+    rng, count = np.random.default_rng(seed), len(speed)
+    moved = arcs(np.cumsum(turn * step_s) - turn * step_s, speed, turn, np.full(count, step_s))
+    pose = np.cumsum(moved, axis=0) - moved
+    x, y, heading = pose[5::every].T
+    antenna = np.stack([x + lever_m * np.cos(heading), y + lever_m * np.sin(heading)], axis=1)
+    stamps_ns = np.rint(1e9 * step_s * np.arange(count)).astype(np.int64)
+    noise = rng.standard_normal((count, 2)) * densities / step_s**0.5
+    wheels = fl.make_stream(
+        "/robot1/odometry",
+        fl.schemas.ODOMETRY,
+        stamps_ns,
+        metadata=dict(
+            zip(("forward_noise_density", "turn_noise_density"), map(repr, densities), strict=True)
+        ),
+        forward_mps=speed + noise[:, 0],
+        turn_radps=turn + noise[:, 1],
+    )
+    fixes = antenna + sigma_m * rng.standard_normal(antenna.shape)
+    start = np.diag([0.1, 0.1, 0.1])
+    prior = prior_stream("/robot1/prior", 0, ("x_m", "y_m", "heading_rad"), np.zeros(3), start)
+    streams = [wheels, fix_stream("/robot1/fix", stamps_ns[5::every], fixes, sigma_m**2), prior]
+    return memory_source(Recording(streams), RunMetadata("driven", epoch_ns=0))
+
+
+def test_a_lever_arm_is_found_from_a_start_at_which_the_filter_diverges() -> None:
+    """It turns on the spot for 20 s, then drives; without the lever arm NIS is above 100."""
+    time_s = 0.05 * np.arange(2400)
+    speed = np.where(time_s < 20.0, 0.0, 0.8)
+    turn = np.where(time_s < 20.0, 0.4, 0.25 * np.sin(0.2 * time_s))
+    log = driven(1, speed, turn, 0.05, (0.01, 0.005), 0.02, lever_m=0.3, every=20)
+    for found in (fl.tune(log, "ekf", "lever_x_m"), fl.calibrate(log, "ekf")):
+        lever = found.parameters.set_index("parameter").loc["lever_x_m"]
+        assert lever["low"] < 0.3 < lever["high"]
+        assert lever["high"] - lever["low"] < 0.05
+    first = fl.diagnose(log, "ekf").sentences[0]
+    assert (first.kind, first.topic) == ("parameter", "lever_x_m")
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.15])
+def test_a_delay_is_in_its_interval_beside_noisy_wheels(delay_s: float) -> None:
+    """Fixes are at stamps of the wheels: by half a step later they average the noise of two."""
+    time_s = 0.1 * np.arange(1200)
+    speed, turn = 1.5 + 0.8 * np.sin(0.4 * time_s), 0.3 * np.sin(0.25 * time_s) + 0.05
+    log = driven(1, speed, turn, 0.1, (0.05, 0.003), 0.01)
+    late = delayed(log.streams["/robot1/fix"], delay_s)
+    log = replace(log, streams={**log.streams, "/robot1/fix": late})
+    found = fl.tune(log, "ekf", "fix_delay_s")
+    row = found.parameters.iloc[0]
+    assert row["low"] < delay_s < row["high"]
+    assert row["high"] - row["low"] < 0.08
+    assert any(each.startswith("the noise of the control") for each in found.notes_of_search)

@@ -1,6 +1,6 @@
 """Diagnosing and tuning on a log without a prior: the sheet of sensors, section 3, principle 1."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -107,10 +107,15 @@ class Parabolas(NamedTuple):
 
     apart: float
     less: float = np.inf
+    count: Mapping[str, int] = {}
 
     def __call__(self, trials: Sequence[float]) -> list[float]:
         """The gains over all parts."""
         return [float(each) for [each] in self.over_parts(trials, 1)]
+
+    def disturbed(self, _: float) -> list[Any]:
+        """No control has noise."""
+        return []
 
     def over_parts(self, trials: Sequence[float], count: int) -> np.ndarray:
         """The gains over so many parts."""

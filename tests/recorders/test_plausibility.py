@@ -14,6 +14,7 @@ from pipeline.diagnosing.battery.car import (
     FAULTS,
     UNIT_FAULTS,
     Unit,
+    arcs,
     faulty,
     recorded,
     recorded_unit,
@@ -302,3 +303,58 @@ def test_the_bias_of_forces_is_what_they_say_at_rest() -> None:
     assert found is not None
     assert found.fit > 0.99
     assert abs(found.angle_rad) < 0.1
+
+
+def test_a_unit_upside_down_is_one_finding() -> None:
+    """Its turn rate goes the other way round; right orientations and the wheels are not accused."""
+    rng, step_s, count = np.random.default_rng(4), 0.05, 2400
+    time_s = step_s * np.arange(count)
+    turn = 0.35 * np.sin(0.3 * time_s) + 0.15
+    heading = np.cumsum(turn * step_s) - turn * step_s
+    moved = arcs(heading, np.full(count, 0.8), turn, np.full(count, step_s))
+    stamps_ns, zero = np.rint(1e9 * time_s).astype(np.int64), np.zeros(count)
+    at = slice(0, None, 20)
+    half = 0.5 * heading[at] + 0.01 * rng.standard_normal(count // 20)
+    place = np.cumsum(moved, axis=0) - moved
+    force = np.stack([zero, 0.8 * turn, 9.81 + zero], axis=1) + 0.05 * rng.standard_normal((count, 3))
+    rate = np.stack([zero, zero, turn + 0.01 * rng.standard_normal(count)], axis=1)
+    streams = [
+        make_stream(
+            "/pose",
+            schemas.POSE,
+            stamps_ns[at],
+            position_m=np.column_stack(
+                [place[at, :2] + 0.05 * rng.standard_normal((count // 20, 2)), zero[at]]
+            ),
+            quaternion=np.stack([np.cos(half), zero[at], zero[at], np.sin(half)], axis=1),
+            covariance=np.tile(np.diag([0.0025, 0.0025, 1, 1, 1, 0.0004]).ravel(), (count // 20, 1)),
+        ),
+        make_stream(
+            "/imu",
+            schemas.INERTIAL_SAMPLE,
+            stamps_ns,
+            specific_force_mps2=force * [1, -1, -1],
+            turn_rate_radps=rate * [1, -1, -1],
+            magnetic_field_ut=np.empty((count, 0)),
+        ),
+        make_stream("/odometry", schemas.ODOMETRY, stamps_ns, forward_mps=0.8 + zero, turn_radps=turn),
+    ]
+    [found] = findings({each.topic: each for each in streams})
+    assert (found.cause, found.topic, found.key) == ("gravity", "/imu", "/imu.turn_rate_z_scale")
+    streams[1] = replace(streams[1], columns={**streams[1].columns, "turn_rate_radps": rate})
+    [alone] = findings({each.topic: each for each in streams})
+    assert (alone.cause, alone.key) == ("gravity", "/imu.specific_force_z_scale")
+
+
+def test_fixes_that_go_astray_slowly_and_jump_back_tell_no_delay() -> None:
+    sensors = {"fix": {"rate_hz": 5.0, "sigma_m": 0.3}, "range_bearing": {"rate_hz": 0.0}}
+    recording, _ = record_run("landmarks", {"duration_s": 60.0, **sensors}, 3, 0)
+    streams = {each.topic: each for each in recording.streams}
+    fix = streams["/robot1/fix"]
+    since_s = 1e-9 * (fix.publish_time_ns - fix.publish_time_ns[0])
+    place = fix["position_m"].copy()
+    place[:, :2] += np.outer(
+        np.where(since_s < 33.0, np.clip((since_s - 25.0) / 8.0, 0.0, 1.0), 0.0), [12, 5]
+    )
+    streams["/robot1/fix"] = replace(fix, columns={**fix.columns, "position_m": place})
+    assert [each.cause for each in findings(streams)] == ["place"]

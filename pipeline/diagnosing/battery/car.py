@@ -18,6 +18,7 @@ from replay.engine.streams.sources import MemorySource
 Floats = NDArray[np.floating]
 DURATION_S, REST_S, RAMP_S = 100.0, 10.0, 5.0
 FIX_SIGMA_M, COMPASS_SIGMA_RAD = 0.5, 0.03
+FIX_STEP_S, COMPASS_STEP_S = 0.5, 0.2
 FORWARD_DENSITY, TURN_DENSITY = 0.05, 0.01
 GRAVITY_MPS2 = 9.81
 START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
@@ -40,6 +41,18 @@ class Truth(NamedTuple):
         )
 
 
+class Noise(NamedTuple):
+    """States the noise of the sensors: densities of the wheels, standard deviations of the others."""
+
+    forward_density: float = FORWARD_DENSITY
+    turn_density: float = TURN_DENSITY
+    fix_sigma_m: float = FIX_SIGMA_M
+    compass_sigma_rad: float = COMPASS_SIGMA_RAD
+
+
+NOISE = Noise()
+
+
 class Car(NamedTuple):
     """Holds what a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
 
@@ -54,6 +67,8 @@ class Car(NamedTuple):
     compass_rad: Floats
     fix_variance_m2: float = FIX_SIGMA_M**2
     turn_density: float = TURN_DENSITY
+    forward_density: float = FORWARD_DENSITY
+    compass_sigma_rad: float = COMPASS_SIGMA_RAD
 
 
 def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
@@ -79,7 +94,7 @@ def philox(key: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key))
 
 
-def drive(seed: int, step_s: float = 0.1) -> Car:
+def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE) -> Car:
     """Return the car without a fault."""
     rng, n = philox(seed), round(DURATION_S / step_s)
     start_rad = 2.0 * np.pi * rng.uniform()
@@ -93,18 +108,22 @@ def drive(seed: int, step_s: float = 0.1) -> Car:
     steps = arcs(before_rad[:-1], speed, turn, np.full(n, step_s))
     start = np.array([[0.0, 0.0, start_rad]])
     truth = Truth(step_s, speed, turn, start + np.concatenate([0.0 * start, np.cumsum(steps, axis=0)]))
-    noise = np.array([FORWARD_DENSITY, TURN_DENSITY]) / step_s**0.5 * odometry
-    fix_s, compass_s = np.arange(201) * 0.5, np.arange(501) * 0.2
+    of_wheels = np.array([noise.forward_density, noise.turn_density]) / step_s**0.5 * odometry
+    fix_s, compass_s = np.arange(201) * FIX_STEP_S, np.arange(501) * COMPASS_STEP_S
     return Car(
         seed,
         truth,
         np.arange(n) * step_s,
-        speed + noise[:, 0],
-        turn + noise[:, 1],
+        speed + of_wheels[:, 0],
+        turn + of_wheels[:, 1],
         fix_s,
-        truth.at(fix_s)[:, :2] + FIX_SIGMA_M * fixes,
+        truth.at(fix_s)[:, :2] + noise.fix_sigma_m * fixes,
         compass_s,
-        truth.at(compass_s)[:, 2] + COMPASS_SIGMA_RAD * compass,
+        truth.at(compass_s)[:, 2] + noise.compass_sigma_rad * compass,
+        noise.fix_sigma_m**2,
+        noise.turn_density,
+        noise.forward_density,
+        noise.compass_sigma_rad,
     )
 
 
@@ -185,7 +204,7 @@ def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> 
         schemas.ODOMETRY,
         stamps_ns(car.odometry_s),
         metadata={
-            "forward_noise_density": repr(FORWARD_DENSITY),
+            "forward_noise_density": repr(car.forward_density),
             "turn_noise_density": repr(car.turn_density),
         },
         forward_mps=car.speed_mps,
@@ -196,7 +215,7 @@ def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> 
         "/car/heading",
         schemas.ORIENTATION,
         stamps_ns(car.compass_s),
-        metadata={"covariance_rad2": ",".join(3 * [repr(COMPASS_SIGMA_RAD**2)])},
+        metadata={"covariance_rad2": ",".join(3 * [repr(car.compass_sigma_rad**2)])},
         quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
     )
     pose = ("x_m", "y_m", "heading_rad")

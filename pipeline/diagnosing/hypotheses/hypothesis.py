@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number
@@ -198,6 +200,46 @@ def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, g
         return False
     apart = (2.0 * COMPONENTS * sum(likelihood.count.values())) ** -0.5
     return min(gains_over(likelihood, now)([(of, value - apart), (of, value + apart)])) < gain - SPIKE
+
+
+def noise_gain_over(
+    likelihood: Likelihood, now: Trial
+) -> Callable[[Hypothesis, Number], tuple[float, float]]:
+    """Return a function that says what undoing a fault gains by the noise of the controls alone.
+
+    The mean and the standard deviation over logs, see `pipeline.tuning.control_noise`. Of noises and
+    outliers it is zero: their likelihood is meant to have that noise.
+    """
+    most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, all of it this noise
+
+    @cache
+    def disturbed() -> tuple[list[Trial], NDArray[np.float64]]:
+        trials = [now, *(now._replace(source=each) for each in likelihood.disturbed(now))]
+        return trials, _lost(likelihood, trials)
+
+    def gain(of: Hypothesis, value: Number) -> tuple[float, float]:
+        if of.kind in NOISES or of.kind == "outliers":
+            return 0.0, 0.0
+        trials, before = disturbed()
+        if len(trials) < 2:
+            return 0.0, 0.0
+        gained = before - _lost(likelihood, [of.without(each, value) for each in trials])
+        gained = gained[np.isfinite(gained)]  # a filter may fail with more noise
+        if len(gained) < 2:
+            return 0.0, 0.0
+        mean = float(np.clip(np.mean(gained), -most, most))  # more where a filter diverges
+        variance = min(float(np.var(gained, ddof=1)) * (1.0 + 1.0 / len(gained)), most)
+        # and together with the noise of the measurements: a likelihood ratio varies by twice its mean
+        return mean, (variance + 2.0 * max(mean, 0.0)) ** 0.5
+
+    return gain
+
+
+def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
+    """Compute what each pair of opposite noises costs the first trial in log-likelihood (pairs,)."""
+    without, *having = likelihood(trials)
+    with np.errstate(invalid="ignore"):
+        return without - np.mean(np.reshape(having, (-1, 2)), axis=1)
 
 
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:

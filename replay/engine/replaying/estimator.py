@@ -76,6 +76,8 @@ class Reading:
         delays: by topic, the parameter that says how late its messages are.
         calibration: parameters that say how its sensors are mounted, scaled, biased and delayed, each
             with a useful standard deviation.
+        control_noise: how long a message of a control holds, in s -> by topic and the place of a number,
+            the variance that the model states of it; nothing if it states none.
     """
 
     controls: tuple[str, ...]
@@ -88,6 +90,7 @@ class Reading:
     factors: Mapping[tuple[str, int], str]
     delays: Mapping[str, str]
     calibration: Mapping[str, float]
+    control_noise: Callable[[float], Mapping[tuple[str, int], float]]
 
 
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")

@@ -14,7 +14,7 @@ from replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
 from replay.inference.model.binding import Found
 from replay.inference.model.model import Control, Sensor
 from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.settings import TracedParameters
+from replay.inference.model.settings import TracedParameters, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.model.validation import trial_state
 from replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
@@ -22,12 +22,13 @@ from replay.inference.run.events import control_numbers, with_covariance, withou
 STEP = 1e-3  # of parameters and controls, by which their effects are compared
 
 
-def reading_of(stage: Stage, found: Found) -> Reading:
+def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
     """Describe what an estimator reads.
 
     Args:
         stage: the model with the sensors at hand, its functions as they were written.
         found: its topics.
+        settings: (1 + sensors, fields), the numbers of motion and sensors.
     """
     model = stage.model
     drives: dict[str, Control] = {}
@@ -66,6 +67,7 @@ def reading_of(stage: Stage, found: Found) -> Reading:
         {place: key(name) for place, name in factors.items()},
         {topic.name: key(sensor.delay) for sensor, topic in found.sensors if sensor.delay},
         {key(name): sigma for name, sigma in _calibration(stage, found).items()},
+        partial(_control_noise, stage, found, settings),
     )
 
 
@@ -199,6 +201,17 @@ def _own_errors(
                 if len(places) == 1 and np.allclose([each[places[0]] for each in added], 1.0, atol=1e-6):
                     biases[topic.name, before + int(places[0])] = name
     return biases, factors
+
+
+def _control_noise(
+    stage: Stage, found: Found, settings: Floats, step_s: float
+) -> dict[tuple[str, int], float]:
+    """Return the variances of the control's numbers, of messages that hold for so long."""
+    variances = stage.motion.control_noise
+    if variances is None:
+        return {}
+    parameters = reading_settings(number_fields(stage.model.parameters))(settings, 0)
+    return dict(zip(_driving(stage, found), map(float, variances(step_s, parameters)), strict=True))
 
 
 def _driving(stage: Stage, found: Found) -> list[tuple[str, int]]:

@@ -43,7 +43,7 @@ def search() -> Iterator[str]:
     yield from _notes("with a gate", gate=0.99)
     yield from _notes("by nees", by="nees")
     yield from _notes("elsewhere", begins_alike=False)
-    yield from _notes("at an edge", is_at_edge=True)
+    yield from _notes("at an edge", at_edge=["sigma_range_m"])
     for value in (0.01, 100.0):
         yield from _notes(f"at {value:g}", optimum=np.array([value, 1.0, 1.0]))
     yield from _notes("assumed", free=[FREE[0]._replace(is_assumed=True), *FREE[1:]])

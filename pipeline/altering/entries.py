@@ -1,0 +1,90 @@
+"""Finds which numbers of a topic's messages an estimator reads."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.altering.changes import AXES, names_in
+from recorders.log import Stream
+from replay.engine.replaying.estimator import Reading
+
+PROBED = 64  # messages, by which is found what is read
+
+
+class Entry(NamedTuple):
+    """Describes one number of a topic's messages that is read.
+
+    Attributes:
+        field, place: where it stands; a heading is of the field `quaternion`.
+        name: as a setting names it, with its unit.
+        is_angle: whether it is an angle that is measured.
+        number: which of the numbers that are read it is; None where it is several.
+        varies: its standard deviation over the log.
+    """
+
+    field: str
+    place: int | None
+    name: str
+    is_angle: bool
+    number: int | None
+    varies: float
+
+    @property
+    def is_heading(self) -> bool:
+        """Tell whether it is the heading of orientations."""
+        return self.field == "quaternion"
+
+
+def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
+    """Return the numbers of a topic that are read: those whose change changes what is read.
+
+    Where it is not known what is read, all numbers, and the entries of positions and velocities.
+    """
+    some = stream.take(slice(0, PROBED))
+    found = []
+    for field, place, name in _columns(stream):
+        column = stream[field] if place is None else stream[field][:, place]
+        known = column[np.isfinite(column)]
+        if not len(known):
+            continue
+        varies = float(np.std(known)) or 1.0
+        if reading is None:
+            if place is None or field in ("position_m", "velocity_mps"):
+                found.append(Entry(field, place, name, field == "bearing_rad", None, varies))
+            continue
+        moved = alter.shifted(field, place)(some, varies)
+        places = _changed(reading, some, moved)
+        if len(places):
+            kinds = reading.kinds[stream.topic]
+            is_angle = stream.topic not in reading.controls and kinds[places[0]] == "angle"
+            one = int(places[0]) if len(places) == 1 else None
+            found.append(Entry(field, place, name, is_angle, one, varies))
+    if reading is not None and "quaternion" in stream.columns:
+        places = _changed(reading, some, alter.heading_turned(some, 0.1))
+        places = [each for each in places if reading.kinds[stream.topic][each] == "angle"]
+        if places:
+            found.append(Entry("quaternion", None, "heading_rad", True, places[0], 1.0))
+    return found
+
+
+def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
+    """Yield the numbers of a topic, but for covariances and orientations."""
+    for entry in stream.schema:
+        column = stream.columns.get(entry.name)
+        if column is None or entry.name.startswith(("covariance", "quaternion")):
+            continue
+        if entry.kind == "real":
+            yield entry.name, None, entry.name
+        elif entry.kind == "vector" and column.shape[1] <= len(AXES):
+            for place, name in zip(range(column.shape[1]), names_in(stream, entry.name), strict=False):
+                yield entry.name, place, name
+
+
+def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
+    """Return which of the numbers that are read change."""
+    same = np.isclose(
+        reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
+    )
+    return np.flatnonzero(~same.all(axis=0)).tolist()

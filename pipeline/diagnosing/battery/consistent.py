@@ -1,0 +1,53 @@
+"""Counts the causes that are named in logs of the car with nothing wrong, whatever noise is the largest.
+
+The wheels have the noise of `car`. What they err by between two fixes is RATIOS times the error of a
+fix, and between two headings as many times that of a heading.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from pipeline.diagnosing.battery.car import (
+    COMPASS_STEP_S,
+    FIX_STEP_S,
+    FORWARD_DENSITY,
+    TURN_DENSITY,
+    Noise,
+    drive,
+    recorded,
+)
+from pipeline.diagnosing.causes import seek
+
+TO_FIX = (0.1, 0.3, 1.0, 3.0, 10.0)
+TO_COMPASS = (None, 0.1, 1.0, 10.0)
+
+
+class Ratios(NamedTuple):
+    """States how many times larger the wheels' error between two messages is than a message's own."""
+
+    to_fix: float
+    to_compass: float | None  # None: there is no compass
+
+    @property
+    def noise(self) -> Noise:
+        """Return the noise of the car's sensors."""
+        fix_sigma_m = FORWARD_DENSITY * FIX_STEP_S**0.5 / self.to_fix
+        compass_sigma_rad = TURN_DENSITY * COMPASS_STEP_S**0.5 / (self.to_compass or 1.0)
+        return Noise(fix_sigma_m=fix_sigma_m, compass_sigma_rad=compass_sigma_rad)
+
+
+def all_ratios() -> Iterator[Ratios]:
+    """Yield the settings of the car."""
+    for to_compass in TO_COMPASS:
+        for to_fix in TO_FIX:
+            yield Ratios(to_fix, to_compass)
+
+
+def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
+    """Look for causes in a log in which nothing is wrong."""
+    log = recorded(
+        drive(seed, noise=ratios.noise), has_compass=ratios.to_compass is not None, has_prior=True
+    )
+    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, 1)
+    named = [cause.hypothesis.name for cause in found.causes]
+    return {**ratios._asdict(), "seed": seed, "cause": named[0] if named else ""}
