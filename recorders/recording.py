@@ -176,9 +176,20 @@ def import_run(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Reco
 
 
 def import_log(
-    source: str, path: Path, values: Mapping[str, Any], target: Path
+    source: str,
+    path: Path,
+    values: Mapping[str, Any],
+    target: Path,
+    stated: Mapping[str, Any] | None = None,
 ) -> tuple[RunMetadata, int]:
     """Import real data into a log, block by block where they come so; errors as `import_run`.
+
+    Args:
+        source: the importer's name.
+        path: the data.
+        values: the importer's parameters.
+        target: the log.
+        stated: parameters that the log states in place of those values.
 
     Returns what the run is, and how many messages the log has.
     """
@@ -190,6 +201,7 @@ def import_log(
             log.write(block)
             messages += sum(map(len, block))
         run = _metadata(source, parameters, None, 0, found)
+        run.parameters.update(stated or {})
         log.describe(run)
     return run, messages
 

@@ -1,5 +1,6 @@
 """Runs the command line as a process: its exit code, what stops it, what it says of errors."""
 
+import atexit
 import io
 import logging
 import math
@@ -12,7 +13,7 @@ import time
 import warnings
 from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 import click
@@ -28,7 +29,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
 
     FUSELOG_TRACEBACK=1 shows where an error comes from, for who writes an estimator.
+
+    Args:
+        arguments: of the command; by default those that this process was started with, and then the
+            process ends here if threads are still at work.
     """
+    code = _code_of(arguments)
+    if arguments is None and threading.active_count() > 1:
+        _end(code)
+    return code
+
+
+def _end(code: int) -> None:
+    """End the process as Python does, but leave threads alone.
+
+    Python up to 3.13 breaks off those that still work. That aborts the process if one is in NumPy's C++
+    or holds the lock of standard error.
+    """
+    for act in (atexit._run_exitfuncs, sys.stdout.flush):
+        with suppress(KeyboardInterrupt, OSError):
+            act()
+    os._exit(code)
+
+
+def _code_of(arguments: Sequence[str] | None) -> int:
+    """Run the command line; returns the exit code, after the sentence that belongs to it."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding

@@ -123,13 +123,18 @@ def import_(
         if source != "table":
             raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
         if out is None or out.suffix != ".mcap":
-            _write_guess(paths, out or Path("mapping.toml"))
+            place = out or Path("mapping.toml")
+            with _guessed(paths, place):
+                pass
+            again = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(place)])
+            click.echo(printable(f"{place}: read it, then: {again}"))
             return
         check_files([(out, imported(source))], {"data": paths})
-        mapping = str(out.with_suffix(".toml"))
-        with _kept_if_used(Path(mapping)):
-            _write_guess(paths, Path(mapping), is_used=True)
-            _import(source, paths, out, {"mapping": mapping, "origin": origin}, settings)
+        place = out.with_suffix(".toml")
+        with _guessed(paths, place) as new:
+            click.echo(printable(f"{place}: what was guessed and is imported by; read it"))
+            chosen = {"mapping": str(new), "origin": origin}
+            _import(source, paths, out, chosen, settings, stated={"mapping": str(place)})
         return
     chosen = {"clock": clock, "mapping": mapping, "origin": origin}
     _import(source, paths, out, chosen, settings)
@@ -141,8 +146,10 @@ def _import(
     out: Path | None,
     chosen: Mapping[str, object],
     settings: tuple[str, ...],
+    *,
+    stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write their log."""
+    """Import data and write their log, which states its parameters with those that are `stated`."""
     from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
     from recorders.linting.lint import lint_log
@@ -158,7 +165,7 @@ def _import(
     given = {
         name: value for name, value in {**chosen, "more": more or None}.items() if value is not None
     }
-    metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
+    metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target, stated)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
@@ -167,34 +174,22 @@ def _import(
 
 
 @contextmanager
-def _kept_if_used(mapping: Path) -> Iterator[None]:
-    """Remove a mapping that is made meanwhile unless the import by it is whole."""
-    was_there = mapping.exists()
-    try:
-        yield
-    except BaseException:
-        if not was_there:
-            mapping.unlink(missing_ok=True)
-        raise
+def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
+    """Write a mapping of tables to start from, and say what it assumes.
 
-
-def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = False) -> None:
-    """Write a mapping of tables to start from, and say how to go on; or that it is used as it is."""
+    Yields where it lies until all went well; only then is it in its place.
+    """
     from pipeline.output.outputs import MAPPING, check_files
     from recorders.atomic import whole_file
     from recorders.importers.tables.guessing import assumptions, guess
 
     check_files([(mapping, MAPPING)], {"data": paths})
     text = guess(paths)
-    with whole_file(mapping) as file:
-        file.write_text(text, encoding="utf-8")
-    for sentence in assumptions(text):
-        click.echo(printable(sentence))
-    if is_used:
-        click.echo(printable(f"{mapping}: what was guessed and is imported by; read it"))
-        return
-    command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
-    click.echo(printable(f"{mapping}: read it, then: {command}"))
+    with whole_file(mapping) as new:
+        new.write_text(text, encoding="utf-8")
+        for sentence in assumptions(text):
+            click.echo(printable(sentence))
+        yield new
 
 
 def say_written(path: Path, messages: int) -> None:

@@ -27,7 +27,4 @@ def explore_log(
     source = LogSource(open_log(log, recover=recover))
     explorer = explore(source, chosen, set=alterations, gap_limit_s=gap_limit_s, show=not no_browser)
     say(f"exploring {log} at {explorer.url}; close the page or press Ctrl-C to end")
-    try:
-        explorer.wait()
-    finally:
-        explorer.close()
+    explorer.wait()

@@ -1,50 +1,42 @@
-"""Works off what is asked for in the background: only the newest of what waits is done."""
+"""Does in the background what is asked for: only the newest of what waits."""
 
 from collections.abc import Callable
-from threading import Condition, Thread
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 Work = Callable[[Callable[[], bool]], None]
 
 
 class NewestFirst:
-    """Runs a thread that does the newest work it is given; what was waiting before that is forgotten.
+    """Does the newest work it is given in a thread; what was waiting before that is forgotten.
 
-    Work is handed a function that tells whether newer work waits, so that it can give up.
+    Work is handed a function that tells whether newer work waits, so that it can give up. One thread
+    calls `ask` and `end`. At its end, Python waits for the work at hand, because a thread that is
+    broken off in NumPy's C++ aborts the process.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
-        self._condition = Condition()
-        self._waiting: Work | None = None
-        self._is_ended = False
+        self._pool = ThreadPoolExecutor(1, "fuselog explore")
+        self._newest = 0
         self._on_error = on_error
-        self._thread = Thread(target=self._run, name="fuselog explore", daemon=True)
-        self._thread.start()
 
     def ask(self, work: Work) -> None:
-        """Do this next, in place of what waits."""
-        with self._condition:
-            self._waiting = work
-            self._condition.notify()
+        """Do this next, in place of what waits; nothing after the end."""
+        self._newest += 1
+        with suppress(RuntimeError):  # it has ended, or Python ends
+            self._pool.submit(self._do, work, self._newest)
 
     def end(self) -> None:
         """Do nothing any more; the work at hand is told that newer work waits."""
-        with self._condition:
-            self._is_ended = True
-            self._waiting = None
-            self._condition.notify()
+        self._newest += 1
+        self._pool.shutdown(wait=False)
 
-    def _is_newer(self) -> bool:
-        with self._condition:
-            return self._is_ended or self._waiting is not None
+    def _do(self, work: Work, number: int) -> None:
+        def is_newer() -> bool:
+            return self._newest > number
 
-    def _run(self) -> None:
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._is_ended or self._waiting is not None)
-                work, self._waiting = self._waiting, None
-            if self._is_ended or work is None:
-                return
+        if not is_newer():
             try:
-                work(self._is_newer)
+                work(is_newer)
             except Exception as error:
                 self._on_error(error)

@@ -78,8 +78,11 @@ class Explorer:
         self._thread.join(timeout=5.0)
 
     def wait(self) -> None:
-        """Wait until the last page is closed."""
-        self._is_ended.wait()
+        """Wait until the last page is closed; an interrupt closes all."""
+        try:
+            self._is_ended.wait()
+        finally:
+            self.close()
 
     def _repr_html_(self) -> str:
         """Return the page within a notebook's cell."""

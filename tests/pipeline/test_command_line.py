@@ -357,6 +357,48 @@ def test_help_imports_nothing_heavy() -> None:
     assert said.splitlines()[-1] == "0"
 
 
+THREAD_AT_WORK = """
+import atexit, io, sys, threading, time
+
+begun, goes_on = threading.Event(), threading.Event()
+
+class Slow(io.RawIOBase):
+    def writable(self):
+        return True
+
+    def write(self, data):
+        begun.set()
+        time.sleep(60.0)
+        return len(data)
+
+def work():
+    goes_on.wait()
+    print("said as the process ends", file=sys.stderr, flush=True)
+
+def clear():
+    goes_on.set()
+    begun.wait()
+    print("cleared away")
+
+sys.stderr = io.TextIOWrapper(io.BufferedWriter(Slow()))
+atexit.register(clear)  # before logging's own, so that it is called after that
+threading.Thread(target=work, daemon=DAEMON).start()
+
+from pipeline.command_line import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("is_daemon", [True, False])
+def test_a_thread_at_work_does_not_spoil_the_end(is_daemon: bool) -> None:
+    """It holds the lock of standard error, at which Python's own end aborts, or waits for the thread."""
+    code = THREAD_AT_WORK.replace("DAEMON", str(is_daemon))
+    command = [sys.executable, "-c", code, "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30.0)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.endswith("\ncleared away\n")
+
+
 # What takes long to import, and is for drawing, for tables or for one family alone.
 HEAVY = (
     *("matplotlib", "rerun", "pandas", "pyarrow", "sklearn", "h5py", "rosbags.typesys", "rich.progress"),

@@ -1,6 +1,8 @@
 """Tables from the command line and from Python: guessed, imported, replayed."""
 
 import re
+import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,6 +68,28 @@ def test_a_guess_whose_import_fails_leaves_nothing(fuselog: Callable[..., Any], 
         said = fuselog("import", "table", str(table), "--guess", "-o", str(out))
         assert said.code == code, said.err
         assert (out.exists(), out.with_suffix(".toml").exists()) == 2 * (code == 0,)
+
+
+def test_a_guess_whose_import_is_killed_leaves_no_mapping(
+    fuselog: Callable[..., Any], start_fuselog: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    """The mapping appears after the log, so that the same command goes through next time."""
+    table, out = tmp_path / "drive.csv", tmp_path / "drive.mcap"
+    rows = [f"{number},1.5,0.1" for number in range(300_000)]
+    table.write_text("\n".join(["time,speed,yaw_rate", *rows, ""]))
+    command = "import", "table", str(table), "--guess", "-o", str(out)
+    with start_fuselog(*command) as running:
+        while not list(tmp_path.glob(".drive.mcap.*.part")):
+            assert running.poll() is None
+            time.sleep(0.001)
+        running.kill()
+    assert {each.name for each in tmp_path.iterdir() if not each.name.startswith(".")} == {"drive.csv"}
+    assert fuselog(*command).code == 0
+    mapping = out.with_suffix(".toml")
+    assert {*tmp_path.iterdir()} == {table, out, mapping}
+    run = fl.open(out).run
+    assert run is not None
+    assert run.parameters["mapping"] == str(mapping)
 
 
 def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path, tmp_path: Path) -> None:
