@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from pipeline.output.claims import Claim, StatedClaim, _combinations, _named, decide
+from pipeline.output.claims import Claim, StatedClaim, _combinations, _decided, _named
+from pipeline.output.expressions import Values
+from pipeline.output.numbers import exactly
 from pipeline.output.results import MetricValue, split_metric
 from pipeline.runs.experiment import Study, load_experiment, numbers_of
 from pipeline.runs.inputs import shipped
@@ -21,7 +23,7 @@ from tests.claims import pages
 MOVES = (-3.0, 0.0, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0)
 NEAR = (0.99, 1.01)  # of what it may equal
 MOST = 6  # groups of metrics that are moved
-HALVINGS = 20
+HALVINGS = 14
 _WORDS = ("sentence", "paper", "ours", "why", "unless")
 WIDTH = 0.05  # of a moved metric's interval, where a claim needs one
 # Groups of metrics, from the smallest on: an estimator's quantity, a quantity, and all.
@@ -68,7 +70,8 @@ class Made:
     ) -> None:
         seen = _Seen(metrics)
         seen.read = {}
-        self.experiment, self.claim, self.numbers = experiment, claim, numbers
+        self.experiment, self.claim = experiment, claim
+        self._numbers = {name: exactly(number) for name, number in numbers.items()}
         self._bare = claim.model_copy(update=dict.fromkeys(_WORDS, ""))
         self.metrics: Mapping[str, MetricValue] = seen
         self.decided(seen)
@@ -78,7 +81,7 @@ class Made:
         self, metrics: Mapping[str, Any], intervals: Mapping[str, Sequence[float | None]] | None = None
     ) -> Claim | None:
         """The claim by these metrics and intervals; None where it is left out."""
-        return next(iter(decide([self.claim], metrics, intervals or {}, self.numbers)), None)
+        return _decided(self.claim, Values(metrics, intervals or {}, self._numbers))
 
     @property
     def read(self) -> list[str]:
@@ -95,8 +98,7 @@ class Made:
             for key, at in moved.items()
             if width and isinstance(at, int | float)
         }
-        stated = [claim or self.claim]
-        return next(iter(decide(stated, {**self.metrics, **moved}, ends, self.numbers)), None)
+        return _decided(claim or self.claim, Values({**self.metrics, **moved}, ends, self._numbers))
 
     def limits(self, width: float = 0.0) -> list[Limit]:
         """All limits, by the smallest groups of metrics that have one."""
