@@ -82,6 +82,7 @@ def test_no_rate_is_made_up_beside_a_column_that_could_be_a_time(tmp_path: Path)
         Got(tiny)
     free = Got(text_of(tmp_path, "speed,yaw_rate", lambda row: f"1,{row}"))
     assert "one row a second" in free.said
+    assert "one row a second" in Got(text_of(tmp_path, PLACE, _place)).said
 
 
 # Order.
@@ -374,6 +375,8 @@ def test_iso_dates_are_certain(tmp_path: Path) -> None:
         ("year,month,day,hour,min,sec", lambda k: f"2025,6,1,9,5,{k}.25", "2025-06-01 09:05:00.250000"),
         ("date,utc_time", lambda k: f"010625,0905{k:02d}.50", "2025-06-01 09:05:00.500000"),
         ("week,tow", lambda k: f"2300,{3600 + k}", "2024-02-04 01:00:00"),
+        ("week,iTOW", lambda k: f"2300,{3000 + k * 1000}", "2024-02-04 00:00:03"),
+        ("GMS,GWk", lambda k: f"{3600000 + k * 1000},2300", "2024-02-04 01:00:00"),
         (
             "Lcl Date,Lcl Time,UTCOfst",
             lambda k: f"2025-06-01,09:05:{k:02d},-07:00",
@@ -570,6 +573,11 @@ def test_times_of_fit_count_from_1989(tmp_path: Path) -> None:
         lambda row: f"{1069034400 + row},{566697074 + 100 * row},{101408950 + 200 * row}",
     )
     assert Got(path).times("/fix")[0] == "2023-11-16 02:00:00"
+    text = path.read_text(encoding="utf-8").replace(
+        "timestamp,position_lat", "r.timestamp[s],r.position_lat"
+    )
+    path.write_text(text, encoding="utf-8")
+    assert Got(path).times("/fix")[0] == "2023-11-16 02:00:00"
 
 
 def test_an_orientation_that_its_covariance_denies_is_none(tmp_path: Path) -> None:
@@ -656,9 +664,13 @@ def test_places_of_a_vbo_are_minutes_to_the_north_and_west(tmp_path: Path) -> No
 
 def test_a_table_of_messages_of_several_kinds_is_refused(tmp_path: Path) -> None:
     head = "Type,Local Number,Message,Field 1,Value 1,Units 1,Field 2,Value 2,Units 2"
-    row = "Data,0,record,timestamp,{},s,position_lat,598290819,semicircles".format
-    with pytest.raises(BadInput, match=r"holds messages of several kinds.*--data record"):
-        Got(text_of(tmp_path, head, row))
+    for names, row in (
+        (head, "Data,0,record,timestamp,{},s,position_lat,598290819,semicircles".format),
+        ("time,name,value", lambda k: f"{EPOCH + k},{'speed' if k % 2 else 'yaw_rate'},0.1"),
+        ("time,sensor,x,y,z", lambda k: f"{EPOCH + k},{'acc' if k % 2 else 'gyro'},1,2,3"),
+    ):
+        with pytest.raises(BadInput, match=r"holds messages of several kinds.*--data record"):
+            Got(text_of(tmp_path, names, row))
 
 
 @pytest.mark.parametrize(
@@ -701,6 +713,32 @@ def test_axes_of_north_east_down_are_told_by_their_names(file: str, head: str, t
     assert "along east" not in got.said
 
 
+def test_velocities_without_a_fix_are_left_out(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},{3 * (k > 2)},{_place(k)},2,1,-3"  # noqa: E731
+    assert (
+        len(Got(text_of(tmp_path, f"t,gpsFix,{PLACE},velN,velE,velD", row)).streams["/velocity"]) == 37
+    )
+
+
+def test_a_yaw_along_the_course_is_clockwise_from_north(tmp_path: Path) -> None:
+    """Both ways are near the course of 53 deg, and one of them is it."""
+    row = lambda k: f"{EPOCH + k},{_place(k)},53.4"  # noqa: E731
+    assert "Yaw: clockwise from north" in Got(text_of(tmp_path, f"t,{PLACE},Yaw", row)).said
+
+
+def test_columns_of_a_track_are_no_targets_and_no_hemispheres(tmp_path: Path) -> None:
+    row = lambda k: f"{EPOCH + k},{_place(k)},{2 * k},53,S"  # noqa: E731
+    got = Got(text_of(tmp_path, f"t,{PLACE},distance,bearing,study", row))
+    assert set(got.streams) == {"/fix", "/values"}
+    assert got.streams["/fix"]["latitude_deg"][0] == pytest.approx(47.5)
+
+
+def test_a_date_without_a_name_is_of_the_time_beside_it(tmp_path: Path) -> None:
+    row = lambda k: f"MSG,{k % 4},2025/06/01,10:00:{k:02d}.123,50.5"  # noqa: E731
+    path = text_of(tmp_path, row(0), row, ROWS[1:])
+    assert Got(path).times("/values")[0] == "2025-06-01 10:00:00.123000"
+
+
 def test_axes_that_nothing_names_are_assumed(tmp_path: Path) -> None:
     row = lambda k: f"{EPOCH + k},{2 * k},{k},{-3 * k}"  # noqa: E731
     for head in ("t,x,y,z", "t,gt_x,gt_y,gt_z"):
@@ -728,6 +766,8 @@ def test_places_of_an_origin_are_no_fixes(tmp_path: Path) -> None:
         ("gps_qual", "0", "1"),
         ("gnssFixOK", "0", "1"),
         ("gps_mode", "1", "3"),
+        ("class,mode", "TPV,1", "TPV,3"),
+        ("NSats,Status", "9,1", "9,4"),
         ("status", "V", "A"),
         ("fix", "none", "3d"),
     ],

@@ -180,7 +180,8 @@ def _target(table: GuessedTable) -> Iterator[str]:
     number = take(columns, _TARGET)
     distance = take(columns, r"(.*_)?(range|distance|dist)|r", usual="m")
     direction = take(columns, r"(.*_)?(bearing|azimuth)|angle|phi", usual="rad")
-    if not (distance and direction) and not (number and (distance or direction)):
+    is_travelled = bool(table.places) and not number  # along a path, and where it leads
+    if is_travelled or not ((distance and direction) or (number and (distance or direction))):
         columns[:] = whole
         return
     becomes = "Range" * bool(distance) + "Bearing" * bool(direction)
@@ -483,6 +484,7 @@ def _velocity(table: GuessedTable) -> Iterator[str]:
             f"{table.prefix}/velocity",
             "VelocityFix",
             "the names are a velocity along three axes",
+            *(fixes_of(table)[0] if table.places else []),
             f"fields.velocity_mps = {names_of(velocity)}",
             *said,
             *[f"factors.velocity_mps = {factors}"] * (-1 in factors),

@@ -242,6 +242,8 @@ def underlined(name: str) -> str:
 
 # By how much of the path one direction has to be more like the course than another.
 _CLEAR = 0.4
+# Of a direction that is the course, and of one that is not.
+_CLOSE, _APART = 0.995, 0.98
 # How far from the course directions are, at most, that are along it.
 _ALIKE_RAD = 0.1
 
@@ -279,7 +281,8 @@ def direction_of(
             best = max(likeness, key=lambda each: likeness[each])
             whole = np.sum(length)
             alike = best[0], best[1] if usual is None else usual
-            if likeness[best] - likeness[alike] < _CLEAR * whole < likeness[alike]:
+            is_close = likeness[best] > _CLOSE * whole and likeness[alike] < _APART * whole
+            if not is_close and likeness[best] - likeness[alike] < _CLEAR * whole < likeness[alike]:
                 best = alike
             if likeness[best] > 0.5 * whole:
                 other = likeness[best[0], not best[1]]
@@ -306,7 +309,10 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
     off_rad = {}
     for frame, (east, north) in {"enu": (0, 1), "ned": (1, 0)}.items():
         product = course * np.conj(steps[east] + 1j * steps[north])
-        off_rad[frame] = float(np.median(np.abs(np.angle(product[np.abs(product) > 0]))))
+        moving = product[np.abs(product) > 0]
+        if not len(moving):
+            return ""
+        off_rad[frame] = float(np.median(np.abs(np.angle(moving))))
     best, other = sorted(off_rad, key=lambda frame: off_rad[frame])
     return best if off_rad[best] < _ALIKE_RAD < off_rad[other] - off_rad[best] else ""
 

@@ -58,6 +58,8 @@ _SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "kn": 1852 / 3600, "mi/h": 0.44704, "ft/
 _SPEEDS |= {"cm/s": 0.01, "mm/s": 0.001}
 _NEAR = 0.03  # of a ratio of the path to the speed
 _HIGHEST_M = 12_000.0  # that anything with a receiver mostly is
+# What columns of hemispheres are called, if they have a name.
+_SIDE = r"(^|_)(lat|lon|lng|ns|ew|n_s|e_w|hemi|dir|ref|side|north|south|east|west|ind|sign)|^\d+$"
 _SOUTH_WEST = {"N", "S", "E", "W", "NORTH", "SOUTH", "EAST", "WEST"}
 
 
@@ -125,10 +127,14 @@ def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
     """Return the lines that choose rows with a fix by a receiver's code, and which (rows,) have one."""
     rows = len(table.whole[0].values)
     found: list[tuple[str, NDArray[np.bool_], Sequence[float | str]]] = []
+    is_of_satellites = any(column.plain == "nsats" for column in table.whole)
     for column in table.whole:
+        plain = column.plain
+        if (plain == "status" and is_of_satellites) or (plain == "mode" and "class" in table.texts):
+            plain = f"gps_{plain}"  # of ArduPilot, and of gpsd
         for name, none, valid in _FIX_CODES:
             known = known_of(column)
-            if re.fullmatch(name, column.name if name[0] == "^" else column.plain) and len(known):
+            if re.fullmatch(name, column.name if name[0] == "^" else plain) and len(known):
                 if np.isin(known, (*none, *valid)).all():
                     found.append((column.name, ~np.isin(column.values, none), valid))
                 break
@@ -139,8 +145,6 @@ def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
             has_fix = np.array([cell.strip() not in lost for cell in cells])
             found.append((text, has_fix, sorted(words - lost)))
     has_fix = np.all([which for _, which, _ in found], axis=0) if found else np.ones(rows, bool)
-    if not has_fix.any():
-        return [], np.ones(rows, bool)
     lines = []
     if found:
         where = ", ".join(f"{json.dumps(name)} = {_listed(valid)}" for name, _, valid in found)
@@ -150,7 +154,7 @@ def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
         for name, which, _ in found
         if not which.all()
     ]
-    return lines, has_fix
+    return lines, has_fix if has_fix.any() else np.ones(rows, bool)
 
 
 def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
@@ -235,7 +239,8 @@ def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray
     sides = [
         name
         for name, cells in table.texts.items()
-        if (known := {cell.strip().upper() for cell in cells if cell.strip()})
+        if re.search(_SIDE, parted(name)[0])
+        and (known := {cell.strip().upper() for cell in cells if cell.strip()})
         and known <= _SOUTH_WEST
         and {cell[0] for cell in known} <= set(letters)
     ]
@@ -371,7 +376,8 @@ def _by_name(
     if _MINUTES in fitting and "hemispheres" in table.prepared:
         return _MINUTES, "degrees and minutes as NMEA has them, with hemispheres"
     plain = [column.plain for column in place]
-    if "semicircle" in fitting and plain == ["position_lat", "position_long"]:
+    is_fit = all(re.fullmatch("(.*_)?position_(lat|long)", name) for name in plain)
+    if "semicircle" in fitting and is_fit:
         return "semicircle", "as files of FIT have them"
     if (
         "1e-7 deg" in fitting

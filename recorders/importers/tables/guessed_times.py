@@ -57,6 +57,7 @@ _DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
 # What the column of a message's own stamp is called, and columns without a name of their own.
 _OF_HEADER = r"(^|_)header_?(time_?)?stamp"
 _NAMELESS = r"(value|field|column|col|var|data|unnamed)?_?\d*"
+_PLACE = r"(.*_)?(lat(itude)?|lon|lng|long(itude)?|x|y|z|east(ing)?|north(ing)?|alt(itude)?|height)"
 _LIKE_A_TIME = r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d[ ./-][A-Z][a-z]{2,8}[ ./-]\d{2}"
 # From and below how many seconds steps are, by what a table holds: three decades, so that one unit fits.
 _STEPS_S = {"inertial": 5e-4, "fix": 0.02, "other": 2e-3}
@@ -210,7 +211,7 @@ def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     others = [column for column in others if _rises(column.values)]
     first = [] if named else [column for column in others if column is table.columns[0]]
     for column in first:
-        if not _COUNTERS.fullmatch(column.plain):
+        if not (_COUNTERS.fullmatch(column.plain) or re.fullmatch(_PLACE, column.plain)):
             yield from _counted(table, column)
     for column in others:
         if re.fullmatch(_NAMELESS, column.plain) and _is_steady(column.values):
@@ -361,6 +362,10 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
     days = [name for name in plain if re.fullmatch("(.*_)?(date|day)", plain[name])]
     days += [column.name for column in table.columns if re.fullmatch("(.*_)?date", column.plain)]
     hours = [name for name in plain if re.fullmatch("(.*_)?(time|clock|utc|hour)", plain[name])]
+    for name in filter(str.isdecimal, table.texts):
+        cell = _first_cell(table.batch[name])
+        days += [name] * bool(re.fullmatch(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}", cell))
+        hours += [name] * bool(re.match(r"\d{1,2}:\d{2}", cell))
     offsets = [name for name in plain if re.fullmatch("(.*_)?(utc_?of+se?t|utcofst)", plain[name])]
     pairs = [[day, hour, *offsets[:1]] for day in days for hour in hours]
     named = sorted(
@@ -410,7 +415,11 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     comments = []
     if zone := _zone(names):
         given["zone"] = zone
-    elif not re.search(OWN_OFFSET, cell) and not _has_zone(table.batch[names[0]].type):
+    elif not (
+        any("utc" in parted(name)[0].split("_") for name in names)
+        or re.search(OWN_OFFSET, cell)
+        or _has_zone(table.batch[names[0]].type)
+    ):
         comments = [
             f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
             'zone = "Europe/Berlin" or utc_offset_h'
@@ -560,7 +569,7 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         (
             by_plain[name]
             for name in by_plain
-            if re.fullmatch(r"(gps_?|gnss_?)?(week|wn)(_?(no|nr|num|number))?", name)
+            if re.fullmatch(r"(gps_?|gnss_?)?(week|wn)(_?(no|nr|num|number))?|gwk", name)
         ),
         None,
     )
@@ -568,12 +577,13 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         (
             by_plain[name]
             for name in by_plain
-            if re.fullmatch(r"(gps_?)?(i?tow|time_of_week|seconds_of_week|sow)", name)
+            if re.fullmatch(r"(gps_?)?((i_?)?tow|time_of_week|seconds_of_week|sow)|gms", name)
         ),
         None,
     )
     if week is not None and tow is not None:
-        unit = tow.unit if tow.unit in _SIZES else "ms" if np.nanmax(tow.values) > 604_800 else "s"
+        is_ms = re.fullmatch("i_?tow|gms", tow.plain) or np.nanmax(tow.values) > 604_800
+        unit = tow.unit if tow.unit in _SIZES else "ms" if is_ms else "s"
         mapping = TimeMapping(column=tow.name, week=week.name, unit=unit)  # type: ignore[arg-type]
         yield mapping, [f"{ASSUMED}GPS time is kept as it is; leap_seconds = 18 makes it UTC"]
     for whole in table.columns:
@@ -669,7 +679,7 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
 
 
 def _is_fit(table: _Table) -> bool:
-    return {"position_lat", "position_long"} <= {column.plain for column in table.columns}
+    return any(re.fullmatch("(.*_)?position_lat", column.plain) for column in table.columns)
 
 
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:

@@ -46,8 +46,12 @@ _SENSORS = {
     "acc": r"(?i)acc(el\w*)?(?![a-z])|acceleration", "gyr": r"(?i)gyro\w*|gyr(?![a-z])",
     "mag": r"(?i)mag(netometer|netic\w*)?(?![a-z])", "gravity": "(?i)gravity",
 }  # fmt: skip
-# Columns of tables with a message a row, whose fields have their names beside them.
-_FIELDS = {"field_1", "value_1"}
+# Columns of numbers whose name says nothing, and columns that say in each row what these are of.
+_KINDS = {
+    r"_?(value|val|reading)(_1)?": r"_?(field|name|signal|variable|parameter|metric|key|topic)(_1)?"
+    r"|(.*_)?(sensor|channel|measurement)(_?(name|type))?",
+    "x": r"(.*_)?sensor(_?(name|type))?",
+}
 # Names of files whose axes are north, east, down, as PX4 and MAVLink have them, and of frames in names.
 _NED = r"(?i)vehicle_(local_position|odometry|trajectory)|local_position_ned|(^|[^a-z])ned([^a-z]|$)"
 _FRAME = r"(^|_)(ned|enu)(?=_|$)"
@@ -143,12 +147,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
             inside = bracketed(column)
             unknown = "" if unit else below or (inside[1] if inside else "")
             columns.append(GuessedColumn(column, plain, unit, values, unknown))
-    if {column.plain for column in columns} | {parted(text)[0] for text in texts} >= _FIELDS:
-        raise BadInput(
-            f"{path}: holds messages of several kinds, with names in Field 1 and on and numbers in "
-            "Value 1 and on; give a table with a column for each field, such as the NAME_data.csv that "
-            "FitCSVTool writes with --data record"
-        )
+    _check_kinds(path, table.columns, batch)
     columns = _in_frame(_without_denied(_of_sensor(columns, path)), path)
     exported = export_mapping(path, table.columns, batch)
     time = None if exported else _time(source, batch, columns, texts)
@@ -227,6 +226,23 @@ def _table(source: Source, *, is_alone: bool) -> str:
     if not_taken := [text for text in texts if text not in used and text not in sides]:
         lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
     return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
+
+
+def _check_kinds(path: Path, columns: Sequence[str], batch: Batch) -> None:
+    """Raise BadInput for a table whose rows are of several kinds, with the kind in a column of texts."""
+    plain = {name: parted(name)[0] for name in columns}
+    for of_value, of_kind in _KINDS.items():
+        value = next((name for name in columns if re.fullmatch(of_value, plain[name])), "")
+        for name in columns if value else ():
+            cells = batch[name]
+            if not (re.fullmatch(of_kind, plain[name]) and pa.types.is_string(cells.type)):
+                continue
+            if name == "Field 1" or (_numbers(cells) is None and pc.count_distinct(cells).as_py() > 1):
+                raise BadInput(
+                    f"{path}: holds messages of several kinds, as column {name} says, with numbers in "
+                    f"{value}; give a table with a column for each, such as the NAME_data.csv that "
+                    "FitCSVTool writes with --data record"
+                )
 
 
 def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
