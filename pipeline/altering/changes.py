@@ -183,7 +183,7 @@ def _parameters() -> set[str]:
     kinds: list[type[ModelParameters]] = [ModelParameters]
     for kind in kinds:
         kinds += kind.__subclasses__()
-    return {name for kind in kinds for name in kind.model_fields}
+    return {name for kind in kinds if not kind.OWNED for name in kind.model_fields}
 
 
 def bare(name: str) -> str:

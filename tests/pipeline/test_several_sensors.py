@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,10 @@ def test_commands_and_c_have_the_same_names(
             {"/gps2/fix.lever_z_m": 1.0},
             "/gps2/fix.lever_z_m: its sensor reads no such parameter; did you",
         ),
-        ({"/gps3/fix.lever_x_m": 1.0}, "/gps3/fix is no topic of a sensor that it takes; did you mean"),
+        (
+            {"/gps3/fix.lever_x_m": 1.0},
+            "/gps3/fix has parameters of its own, but no sensor takes this topic; did you",
+        ),
         ({"/gps2/fix.lever_x_m": "far"}, "parameter '/gps2/fix.lever_x_m' is 'far'"),
         ({"/gps2/fix.sigma_fix_m": -1.0}, "/gps2/fix: parameter 'sigma_fix_m' is -1.0"),
         (
@@ -202,3 +206,12 @@ def test_no_name_is_a_parameter_and_an_alteration() -> None:
                 assert is_parameter(key), (name, key)
                 with pytest.raises(BadInput):
                     changes_of(source, {key: 1.0})
+
+
+def test_topics_whose_names_differ_in_their_marks_alone_are_refused(drive: fl.MemorySource) -> None:
+    """In C and as components of the state, their parameters would have one name."""
+    alike = {"/a/b_c": drive.streams["/gps1/fix"], "/a_b/c": drive.streams["/gps2/fix"]}
+    streams = {topic: replace(stream, topic=topic) for topic, stream in alike.items()}
+    source = replace(drive, streams={**drive.streams, **streams})
+    with pytest.raises(BadInput, match="would have the same names; rename one of the topics"):
+        fl.replay(source, "ekf", set={"topics": {"fix": list(alike), "heading": ""}})

@@ -671,6 +671,23 @@ components = "left_mps,right_mps"
     assert_array_equal(read["value"], wanted)
 
 
+def test_an_estimate_states_the_axes_of_its_rotations(imported: Callable[..., Any]) -> None:
+    mapping = """[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/estimates/theirs/state"
+becomes = "GaussianEstimate"
+fields = { mean = [1, 0, 0, 0], covariance = [1, 0, 0, 0, 1, 0, 0, 0, 1] }
+components = "q_w,q_x,q_y,q_z"
+kinds = "quaternion,quaternion,quaternion,quaternion"
+rotation_axes = "world"
+"""
+    streams, _ = imported("t\n1\n2\n", mapping)
+    assert streams["/estimates/theirs/state"].metadata["rotation_axes"] == "world"
+    without, _ = imported("t\n1\n2\n", mapping.replace('rotation_axes = "world"', ""))
+    assert "rotation_axes" not in without["/estimates/theirs/state"].metadata
+
+
 def test_quaternions_not_of_unit_length_are_scaled_or_left_out(imported: Callable[..., Any]) -> None:
     """Of an orientation and of a state, each counted."""
     fields = 'fields = { quaternion = ["w", "x", "y", "z"] }'

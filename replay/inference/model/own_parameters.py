@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import create_model
 
 from recorders.errors import BadInput, choices
@@ -65,7 +66,7 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
         if not sensors:
             taken = dict.fromkeys(own.name for each in found for _, own in each.sensors)
             raise BadInput(
-                f"estimator {label}: {topic} is no topic of a sensor that it takes; "
+                f"estimator {label}: {topic} has parameters of its own, but no sensor takes this topic; "
                 f"{choices(topic, taken)}; --set topics.KIND=TOPIC,TOPIC takes several of a kind"
             )
         known = dict.fromkeys(name for sensor in sensors for name in read_by(model, sensor))
@@ -78,21 +79,21 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
         build(model.parameters, table, f"estimator {label}: {topic}")
 
 
-def read_by(model: Model, sensor: Sensor) -> list[str]:
+@lru_cache(maxsize=256)
+def read_by(model: Model, sensor: Sensor) -> tuple[str, ...]:
     """List the parameters that a sensor reads, and the motion does not."""
-    names = number_fields(model.parameters)
-    traced = TracedParameters(dict.fromkeys(names))
-    state = trial_state(model.kinds)
-    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    sensor.measure(state, *entering, (1.0,) * sensor.reference_size, traced)
-    if sensor.noise is not None:
-        sensor.noise(traced)
-    moving = TracedParameters(dict.fromkeys(names))
-    for motion in (model.motion, *(model.modes or {}).values()):
-        entering = ((0.0,) * motion.noises,) if motion.noises else ()
-        motion.move(state, (0.0,) * model.controls, *entering, 1.0, moving)
-    read = traced.read | {sensor.delay}
-    return [name for name in names if name in read - moving.read]
+    names, state = number_fields(model.parameters), trial_state(model.kinds)
+    read, moving = (TracedParameters(dict.fromkeys(names)) for _ in range(2))
+    with np.errstate(all="ignore"):
+        entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+        sensor.measure(state, *entering, (1.0,) * sensor.reference_size, read)
+        if sensor.noise is not None:
+            sensor.noise(read)
+        for motion in (model.motion, *(model.modes or {}).values()):
+            entering = ((0.0,) * motion.noises,) if motion.noises else ()
+            motion.move(state, (0.0,) * model.controls, *entering, 1.0, moving)
+    own = (read.read | {sensor.delay}) - moving.read
+    return tuple(name for name in names if name in own)
 
 
 def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
@@ -114,7 +115,8 @@ def _transformed(
         for name, field in names[number].items():
             if owned.setdefault(field, (topic, name)) != (topic, name):
                 raise BadInput(
-                    f"{topic} and {owned[field][0]}: name one of them otherwise: merge --rename"
+                    f"the parameters of {topic} and {owned[field][0]} would have the same names; rename "
+                    "one of the topics, as fuselog relabel does"
                 )
     made = replace(
         model,
