@@ -162,11 +162,13 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
 def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search:
     """Search for several numbers: by the paraboloid about the best, again and again.
 
-    Where a filter diverges the gain is none: the best of the points that it is told by is taken then.
+    Where a filter diverges the gain is rough, and has no paraboloid: the best of the points that it is
+    told by is taken then, and smaller steps about that.
     """
     size, steps = of.size, np.array(of.tried[0])
     at, gain = np.zeros(size), 0.0
-    for number in range(ROUNDS):
+    is_rough, is_scaled = False, False
+    for _ in range(ROUNDS):
         pairs = [(row, column) for row in range(size) for column in range(row)]
         units = np.diag(steps)
         asked = [*(at + each for each in units), *(at - each for each in units)]
@@ -185,13 +187,17 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
         [found] = yield [tuple(map(float, at + move))]
         best = int(np.argmax(gains))
         if found < gain + gains[best]:
-            found, move = gain + gains[best], np.subtract(asked[best], at)
+            found, move, is_rough = gain + gains[best], np.subtract(asked[best], at), True
+        if found <= gain and is_rough:  # no parabola as wide as this
+            steps, is_rough = 0.2 * steps, False
+            continue
         if found <= gain:
             break
         improved, at, gain = found - gain, at + move, found
         if gain < 0.5 * floor or improved < max(CLEAR, FAR * (greatest() - gain)):
             break
-        if number == 0:
+        if not (is_rough or is_scaled):
+            is_scaled = True
             with np.errstate(divide="ignore"):
                 wide = np.sqrt(2.0 / np.maximum(-np.diag(bend), 1e-12)) * steps
             steps = np.minimum(steps, np.where(np.isfinite(wide), wide, steps))
