@@ -83,6 +83,8 @@ def test_what_is_left_out_is_said_and_spoils_no_figure(
     ):
         assert words.split(": ", 1)[0] in losses
         assert words.split(": ", 1)[1] in losses
+    drawn = fuselog("view", tmp_path / "bad.mcap", "--save", tmp_path / "bad.rrd").out
+    assert "/robot1/range_bearing: 1 message is left out: range_m is infinite" in " ".join(drawn.split())
     told = fuselog("diagnose", tmp_path / "bad.mcap", "-e", "ekf", "--json").json["notes"]
     assert "/robot1/range_bearing: 1 message is left out: range_m is infinite" in told
     metrics, whole = said["bad"]["metrics"], said["whole"]["metrics"]
