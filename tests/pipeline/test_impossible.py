@@ -44,6 +44,7 @@ def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
         (Planted("crossing", "/radar/detection", "position_m", "inf"), "view LOG --save NEW.rrd"),
         (Planted("vehicles", "/vehicle1/truth", "", "one"), "view LOG --save NEW.rrd"),
         (Planted("manoeuvres", "/vehicle1/truth", "", "none"), "diagnose LOG -e ekf"),
+        (Planted("vehicles", "/network/detection", "", "one"), "diagnose LOG -e ESTIMATOR"),
         (Planted("landmarks", "/robot1/odometry", "", "years"), "diagnose LOG -e ekf"),
         (Planted("landmarks", "/robot1/truth", "state", "1e200"), "run LOG -e ekf --out NEW/result"),
     ],
