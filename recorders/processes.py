@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from recorders.errors import BadInput
 _ROOT = str(Path(__file__).parents[1])  # where our packages are, whatever the current folder is
 # Python's variable that keeps the current folder off the path, and the value that says it is ours.
 _SAFE_PATH, _OURS = "PYTHONSAFEPATH", "fuselog"
-# Libraries read these in the current folder; numba loads code from a cache that its file names, and
-# matplotlib's file runs LaTeX.
-_SETTINGS = {".numba_config.yaml": "numba", "matplotlibrc": "matplotlib"}
+# Libraries read these in the current folder. Numba loads code from a cache that its file names, and
+# matplotlib's file can have LaTeX run.
+_OF_NUMBA, _OF_MATPLOTLIB = ".numba_config.yaml", "matplotlibrc"
 
 
 def start_module(
@@ -60,11 +60,18 @@ def users_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if (name, value) != (_SAFE_PATH, _OURS)}
 
 
-def refuse_settings_here() -> None:
-    """Raise BadInput if the current folder holds a file of settings that a library would follow."""
-    for name, library in _SETTINGS.items():
-        if os.path.lexists(name):
-            raise BadInput(
-                f"{name}: {library} would take its settings from this file of the current folder, and "
-                "they can run programs; move it away, or run fuselog in another folder"
-            )
+def keep_off_settings_here() -> None:
+    """Keep libraries from the settings in the current folder.
+
+    Matplotlib reads its file once, as it is imported: that is done from another folder.
+
+    Raises BadInput if the folder holds a file that numba would follow.
+    """
+    if os.path.lexists(_OF_NUMBA):
+        raise BadInput(
+            f"{_OF_NUMBA}: numba would take its settings from this file of the current folder, and "
+            "they can run programs; move it away, or run fuselog in another folder"
+        )
+    if os.path.lexists(_OF_MATPLOTLIB):
+        with chdir(Path(__file__).parent):
+            import matplotlib  # noqa: F401

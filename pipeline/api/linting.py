@@ -1,6 +1,6 @@
 """Lints a log: finds what is wrong with it as it is written, before any filter."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,8 @@ from pipeline.output.terminal import print_json, say, warn
 from pipeline.runs.settings import split_texts
 from recorders.errors import BadInput
 from recorders.linting.lint import lint as lint_blocks
-from recorders.log import open_log
+from recorders.log import Stream, open_log
+from recorders.log.impossible import main_span_of
 from recorders.plausibility.checks import BLOCK
 from recorders.plausibility.finding import Finding
 from replay.engine.streams.sources import LogSource, is_sensed
@@ -35,7 +36,13 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     """
     source = sources_of([log], set)[0].as_written()
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
-    return lint_blocks(source.blocks(topics, "publish_time", BLOCK) if topics else ())
+    if not topics:
+        return []
+
+    def blocks() -> Iterator[Mapping[str, Stream]]:
+        return source.blocks(topics, "publish_time", BLOCK)
+
+    return lint_blocks(blocks(), span_ns=main_span_of(source.extent("publish_time"), blocks))
 
 
 def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:

@@ -366,4 +366,6 @@ def _draw_log(
         )
     for sentence in judge.components_without_truth:
         warn(sentence)
+    for topic in source.rejections:
+        say(f"{topic}: {source.rejections.sentence(topic)}")
     _state_losses([log, source.log])

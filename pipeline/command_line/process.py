@@ -21,7 +21,7 @@ import click
 from pipeline.command_line.group import fuselog
 from recorders import environment
 from recorders.errors import BadInput, ignore_warnings_of_numbers, printable
-from recorders.processes import refuse_settings_here
+from recorders.processes import keep_off_settings_here
 from replay.engine.compiling.trial import require_processor
 
 
@@ -63,7 +63,7 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     try:
         with _stopped_by_signals(), warnings.catch_warnings():
             ignore_warnings_of_numbers()
-            refuse_settings_here()
+            keep_off_settings_here()
             environment.check()
             require_processor()
             code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)

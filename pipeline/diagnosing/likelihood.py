@@ -366,8 +366,7 @@ def _extents(stream: Stream) -> Floats:
     """Return how far the innovations (m,) of each component range; an angle may have any value."""
     kinds = stream.metadata["kinds"].split(",")
     known = np.where(np.isfinite(stream["innovation"]), stream["innovation"], np.nan)
-    is_there = np.isfinite(known).any(axis=0)
-    extents = np.ones(known.shape[1])
-    extents[is_there] = np.nanmax(known[:, is_there], axis=0) - np.nanmin(known[:, is_there], axis=0)
+    highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # that of no number
+    extents = highest - np.fmin.reduce(known, axis=0, initial=np.inf)
     extents = np.where(np.array(kinds) == "angle", 2.0 * np.pi, extents)
     return np.where(extents > 0.0, extents, 1.0)

@@ -20,6 +20,7 @@ from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine.compiling.cache import cache_folder, kept_files
 from replay.engine.replaying.estimator import Bound, Estimator, bound_to
+from replay.engine.streams.sources import LogSource
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
@@ -59,15 +60,22 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     if as_json:
         print_json(_as_json(log))
         return
-    first_ns, last_ns = read_span(log, "log_time")
+    main_ns = _main_span(log)
+    first_ns, last_ns = main_ns or read_span(log, "log_time")
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
     span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
-    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}")
+    others = "; other messages are years from these" if main_ns else ""
+    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}{others}")
     if log.run:
         _say_run(log.run)
     rows = [
-        [topic.name, topic.schema_name, topic.messages, _rate(topic.messages, duration_s)]
+        [
+            topic.name,
+            topic.schema_name,
+            topic.messages,
+            None if main_ns else _rate(topic.messages, duration_s),
+        ]
         for topic in log.topics.values()
     ]
     print_table(["topic", "schema", "messages", "per second"], rows)
@@ -84,6 +92,14 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
         _say_what_fits(path, log, is_all=is_all)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+def _main_span(log: Log) -> tuple[int, int] | None:
+    """Find the first and last stamp of most messages if others are years from them; None if damaged."""
+    try:
+        return LogSource(log).main_span
+    except BadInput:
+        return None
 
 
 def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput, ignore_warnings_of_numbers
-from recorders.processes import safe_spawning
+from recorders.processes import keep_off_settings_here, safe_spawning
 from replay.engine.compiling.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
@@ -138,6 +138,7 @@ def _begin_worker() -> None:
     use_cores(1)
     threadpool_limits(1)
     ignore_warnings_of_numbers()
+    keep_off_settings_here()
     parent = parent_process()
     assert parent is not None
 
@@ -178,6 +179,8 @@ def dask(scheduler: str) -> PoolFactory:
                     "give another address"
                 ) from None
             _check_code(scheduler, client)
+            if scheduler.startswith("local:"):
+                client.run(keep_off_settings_here)
             workers = sum(client.nthreads().values())
             sees = None if scheduler.startswith("local:") else partial(_all_see, client)
             stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))

@@ -16,8 +16,8 @@ from recorders.linting import (
     places,
     stamps,
 )
-from recorders.log import Log, Stream, read_blocks, read_empty
-from recorders.log.impossible import main_span, possible
+from recorders.log import Log, Stream, read_blocks, read_empty, read_span
+from recorders.log.impossible import main_span, main_span_of, possible
 from recorders.log.streams import concatenate
 from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
 from recorders.plausibility.finding import Finding
@@ -58,7 +58,12 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None) -> list[Finding]:
+def lint(
+    blocks: Iterable[Mapping[str, Stream]],
+    *,
+    span_ns: tuple[int, int] | None = None,
+    portions: int | None = None,
+) -> list[Finding]:
     """Return what is wrong with a log, of blocks that follow one another in time; hints stand last.
 
     Every portion of some `MOST` messages is checked by itself, and what is found in several is said
@@ -66,6 +71,8 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
 
     Args:
         blocks: streams by topic; estimates are not looked at.
+        span_ns: of most messages of the log, if others are years from them; see `main_span_of`. Without
+            it, of most of each portion.
         portions: how many portions to look at; all without it.
 
     Returns:
@@ -73,8 +80,8 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
     for index, whole in enumerate(islice(_portions(blocks), portions)):
-        span_ns = main_span(stream.publish_time_ns for stream in whole.values())
-        cleared = {topic: possible(stream, span_ns)[0] for topic, stream in whole.items()}
+        most_ns = span_ns or main_span(stream.publish_time_ns for stream in whole.values())
+        cleared = {topic: possible(stream, most_ns)[0] for topic, stream in whole.items()}
         streams = {topic: stream for topic, stream in cleared.items() if len(stream)}
         of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
         # what is left out for its values is not lost
@@ -85,7 +92,7 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
             or len(streams[each.topic]) == len(whole[each.topic])
             or any(losses(whole[each.topic], whole))
         ]
-        of_impossible = _asked((partial(impossible.years, span_ns), *OF_IMPOSSIBLE), whole)
+        of_impossible = _asked((partial(impossible.years, most_ns), *OF_IMPOSSIBLE), whole)
         for each in (*of_impossible, *of_stamps, *_asked(CHECKS, streams)):
             others = found.setdefault((each.cause, each.topic, each.field), [])
             if not others or (each in of_stamps and not index):
@@ -97,8 +104,11 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
 def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
     """Return the findings of a log file, see `lint`; raises BadInput where it is damaged."""
     topics = [topic for topic in log.topics if _is_sensed(log, topic)]
-    blocks = read_blocks(log, topics, block_messages=BLOCK) if topics else ()
-    return lint(blocks, portions=portions)
+    if not topics:
+        return []
+    span_ns = main_span_of(read_span(log, "publish_time"), lambda: read_blocks(log, topics))
+    blocks = read_blocks(log, topics, block_messages=BLOCK)
+    return lint(blocks, span_ns=span_ns, portions=portions)
 
 
 def _asked(checks: Iterable[Check], streams: Mapping[str, Stream]) -> Iterator[Finding]:

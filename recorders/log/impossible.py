@@ -1,7 +1,7 @@
 """Finds values that no sensor can give: infinite ones, and ones beyond what their unit can be."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -116,6 +116,15 @@ def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
     if 2 * (edges[most + 1] - edges[most]) <= len(together):  # the stamps have another unit
         return None
     return int(together[edges[most]]), int(together[edges[most + 1] - 1])
+
+
+def main_span_of(
+    extent_ns: tuple[int, int], blocks: Callable[[], Iterable[Mapping[str, Stream]]]
+) -> tuple[int, int] | None:
+    """Find `main_span` of a log; its blocks are read only if its ends are years apart."""
+    if extent_ns[1] - extent_ns[0] <= YEAR_NS:
+        return None
+    return main_span(each.publish_time_ns for block in blocks() for each in block.values())
 
 
 class Rejections(dict[str, Counter[str]]):

@@ -44,6 +44,7 @@ def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
         (Planted("crossing", "/radar/detection", "position_m", "inf"), "view LOG --save NEW.rrd"),
         (Planted("vehicles", "/vehicle1/truth", "", "one"), "view LOG --save NEW.rrd"),
         (Planted("manoeuvres", "/vehicle1/truth", "", "none"), "diagnose LOG -e ekf"),
+        (Planted("vehicles", "/network/detection", "", "one"), "diagnose LOG -e ESTIMATOR"),
         (Planted("landmarks", "/robot1/odometry", "", "years"), "diagnose LOG -e ekf"),
         (Planted("landmarks", "/robot1/truth", "state", "1e200"), "run LOG -e ekf --out NEW/result"),
     ],
@@ -83,6 +84,8 @@ def test_what_is_left_out_is_said_and_spoils_no_figure(
     ):
         assert words.split(": ", 1)[0] in losses
         assert words.split(": ", 1)[1] in losses
+    drawn = fuselog("view", tmp_path / "bad.mcap", "--save", tmp_path / "bad.rrd").out
+    assert "/robot1/range_bearing: 1 message is left out: range_m is infinite" in " ".join(drawn.split())
     told = fuselog("diagnose", tmp_path / "bad.mcap", "-e", "ekf", "--json").json["notes"]
     assert "/robot1/range_bearing: 1 message is left out: range_m is infinite" in told
     metrics, whole = said["bad"]["metrics"], said["whole"]["metrics"]

@@ -449,7 +449,29 @@ def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path:
     assert not told.exists(), told.read_text()
 
 
-@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
-def test_settings_of_libraries_in_the_current_folder_are_refused(name: str, here: Path) -> None:
-    (here / name).write_text("cache_dir: mine")
-    _check_refusal(run_here("lint", "run.mcap"), here, _state(here), f"{name}: ")
+def test_settings_of_numba_in_the_current_folder_are_refused(here: Path) -> None:
+    (here / ".numba_config.yaml").write_text("cache_dir: mine")
+    _check_refusal(run_here("lint", "run.mcap"), here, _state(here), ".numba_config.yaml: ")
+
+
+MATPLOTLIB_SETTINGS = """
+import sys
+from pipeline.command_line import main
+from pipeline.runs.executors import processes
+
+if __name__ == "__main__":
+    assert main(["--version"]) == 0
+    asked = "__import__('matplotlib').rcParams['text.usetex']"
+    with processes(1)() as pool:
+        print(eval(asked), pool.executor.submit(eval, asked).result())
+"""
+
+
+def test_settings_of_matplotlib_in_the_current_folder_are_not_read(tmp_path: Path) -> None:
+    """Neither by a command nor by its workers, though Matplotlib itself would read them."""
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True")
+    (tmp_path / "asks.py").write_text(MATPLOTLIB_SETTINGS)
+    asked = subprocess.run(
+        [sys.executable, "-P", "asks.py"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert asked.stdout.splitlines()[-1] == "False False"

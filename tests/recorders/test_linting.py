@@ -17,10 +17,11 @@ import pytest
 
 import fuselog as fl
 from pipeline.command_line import main
-from recorders.linting.lint import lint
+from recorders.linting.lint import lint, lint_log
 from recorders.linting.magnetic import FIELD, units
 from recorders.linting.names import frames
-from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
+from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas, write_log
+from recorders.log.impossible import YEAR_NS
 from recorders.plausibility.finding import Finding
 from recorders.recording import import_run
 
@@ -341,6 +342,30 @@ def test_clean_logs_have_no_finding() -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found(name: str) -> None:
     assert missed(name, 1) == ""
+
+
+def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The gap is between two portions; what `info` says of the log leaves it out."""
+    [imu] = stamps(IMU, lambda t: t + (np.arange(6000) >= 5000) * 20 * YEAR_NS)(
+        {IMU: clean(1)[IMU]}
+    ).values()
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        for part in (slice(0, 5000), slice(5000, None)):  # a chunk each
+            writer.write([imu.take(part)])
+        writer.describe(RunMetadata("test"))
+    for module in ("recorders.linting.lint", "pipeline.api.linting"):
+        monkeypatch.setattr(f"{module}.BLOCK", 1000)
+    monkeypatch.setattr("recorders.linting.lint.MOST", 0)
+    for found in (fl.lint(tmp_path / "log.mcap"), lint_log(open_log(tmp_path / "log.mcap"))):
+        [words] = [each.words for each in found if "years" in each.words]
+        assert words.startswith(
+            f"{IMU}: 1000 of its 1000 stamps are years from most messages of the log"
+        )
+    assert main(["info", str(tmp_path / "log.mcap")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years from these" in said
 
 
 def test_rows_that_are_there_twice_are_counted() -> None:

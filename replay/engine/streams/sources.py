@@ -20,7 +20,7 @@ from recorders.log import (
     read_span,
     read_streams,
 )
-from recorders.log.impossible import YEAR_NS, Rejections, main_span, possible
+from recorders.log.impossible import Rejections, main_span, main_span_of, possible
 from recorders.recording import Recording
 from replay.engine.streams.blocks import gather, is_in_order
 
@@ -149,8 +149,13 @@ class LogSource(_Readable):
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
-        """Return what times in s count from: the log's epoch, without one the first of `clock`."""
-        return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
+        """Return what times in s count from: the log's epoch, without one the first of `clock`.
+
+        A first stamp that is years from those of most messages does not count.
+        """
+        if self.log.run:
+            return self.log.run.epoch_ns
+        return (self.main_span or self.extent(clock))[0]
 
     def extent(self, clock: Clock) -> tuple[int, int]:
         """Find the first and the last stamp in ns by `clock`; zeros where there are none."""
@@ -200,12 +205,10 @@ class LogSource(_Readable):
     @cached_property
     def main_span(self) -> tuple[int, int] | None:
         """Find the first and last stamp of most messages if others are years from them."""
-        first_ns, last_ns = self.extent("publish_time")
         topics = [topic for topic in self.topics if is_sensed(self, topic)]
-        if last_ns - first_ns < YEAR_NS or not topics:
+        if not topics:
             return None
-        blocks = read_blocks(self.log, topics)
-        return main_span(each.publish_time_ns for block in blocks for each in block.values())
+        return main_span_of(self.extent("publish_time"), lambda: read_blocks(self.log, topics))
 
     def whole(self) -> "LogSource":
         """Return the whole log."""
