@@ -382,6 +382,9 @@ def test_iso_dates_are_certain(tmp_path: Path) -> None:
             lambda k: f"2025-06-01,09:05:{k:02d},-07:00",
             "2025-06-01 16:05:00",
         ),
+        ("time,utc_offset", lambda k: f"2025-06-01 09:05:{k:02d},-0700", "2025-06-01 16:05:00"),
+        ("time,tz", lambda k: f"2025-06-01T09:05:{k:02d}Z,+02:00", "2025-06-01 09:05:00"),
+        ("elapsed", lambda k: f"05:{k:02d}.5", "2026-01-01 00:05:00.500000"),
     ],
 )
 def test_times_in_several_columns_are_together(
@@ -874,6 +877,9 @@ def test_a_date_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> None:
     path = text_of(tmp_path, "date,time,lat,lon", lambda k: f"7. Sept. 19,12:00:{k:02d},48.1,11.5")
     with pytest.raises(BadInput, match=r"date dates such as '7. Sept. 19', whose format is not known"):
         Got(path)
+    offsets = text_of(tmp_path, "time,utc_offset,lat", lambda k: f"2025-06-01 12:00:{k:02d},2h,48.1")
+    with pytest.raises(BadInput, match="column utc_offset states offsets from UTC such as '2h'"):
+        Got(offsets)
     degrees = text_of(tmp_path, "time,lat,lon", lambda k: f"{EPOCH + k},52°12'{k}\"N,11°24'{k}\"E")
     with pytest.raises(BadInput, match="column lat holds places such as '52°12'0\"N'"):
         Got(degrees)
