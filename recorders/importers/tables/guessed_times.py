@@ -436,12 +436,12 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
         or ("%p" not in next(formats_of(cell)) and re.search(ZONED, cell))
         or _has_zone(table.batch[names[0]].type)
     ):
-        if others := _offsets(table).keys() - {*names}:
-            name = min(others)
+        if unread := _offsets(table).keys() - {*names}:
+            name = min(unread)
             raise Undecided(
                 f"{table.path}: column {name} states offsets from UTC such as "
-                f"'{_first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; write "
-                "a mapping by hand, with `utc_offset_h` or `zone` in `time`"
+                f"'{_first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
+                "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
             f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
