@@ -114,6 +114,12 @@ def test_counters_are_continued_beyond_their_rollover(
         Got(path, by_hand)
 
 
+def test_a_clock_with_a_date_that_restarts_is_refused_as_such(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "Date,Time,lat,lon", lambda k: f"2025-06-01,10:00:{k % 20:02d},48.1,11.5")
+    with pytest.raises(BadInput, match="column Date and Time: at row 21 the time falls"):
+        Got(path)
+
+
 @pytest.mark.parametrize("restart", [20, 33, 38])
 def test_a_clock_that_restarts_is_refused(restart: int, tmp_path: Path) -> None:
     path = text_of(tmp_path, "t,speed,yaw_rate", lambda row: f"{0.5 * (row % restart):.1f},1,0.1")

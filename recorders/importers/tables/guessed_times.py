@@ -379,6 +379,8 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
     for names in (*pairs, *singles):
         if found := _dated(table, names):
             if "zero" in found[0].model_fields_set and days and names[0] not in days:
+                if dated & {*days}:
+                    continue
                 cell = _first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
