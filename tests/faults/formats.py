@@ -251,7 +251,8 @@ def _mapped(mapping: str, name: str, line: str) -> Format:
         (folder / name).write_text("\n".join([*filter(None, [head]), *rows, ""]))
 
     place = "in" if "/" in name else f"in/{name}"
-    return Format(write, (f"import table {place} --mapping {mapping} -o new.mcap",))
+    how = f"--mapping {mapping}" if mapping else "--guess"
+    return Format(write, (f"import table {place} {how} -o new.mcap",))
 
 
 def _bag(form: str) -> Format:
@@ -330,6 +331,10 @@ POS = (
     "age(s) ratio\n"
     "2025/08/28 17:00:{k:02d}.000 48.5 9.25 410.5 1 9 0.01 0.01 0.02 0.0 0.0 0.0 0.0 9.9"
 )
+VBO = (
+    "[header]\ntime\nlatitude\nlongitude\nvelocity kmh\n\n[column names]\ntime lat long velocity\n\n"
+    "[data]\n1245{k:02d}.00 +03119.09730 +00058.49280 040.2"
+)
 FORMATS = {
     "log": Format(
         _fuselog(RECORD),
@@ -353,6 +358,7 @@ FORMATS = {
     "tum": _mapped("tum", "line.tum", POSE),
     "kitti": _mapped("kitti", "line.txt", "1 0 0 {t} 0 1 0 2 0 0 1 3"),
     "rtklib": _mapped("rtklib", "solution.pos", POS),
+    "vbo": _mapped("", "lap.vbo", VBO),
     "euroc": _mapped("euroc", "mav0/imu0/data.csv", EUROC),
     "trajectories": Format(_line, ("evaluate in/line.tum --truth in/truth.tum",)),
     "rosbag1": _bag("bag"),

@@ -12,13 +12,13 @@ from tests.recorders.strange_tables import draw, judge
 MOST = 2000
 
 
-def run(seconds: float, rng: np.random.Generator) -> Tally:
-    """Draw tables until the time is over, or there are `MOST`; the share that is read right is noted."""
-    end = time.monotonic() + seconds
+def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Tally:
+    """Draw tables until the time is over, or there are `most`; the share that is read right is noted."""
+    end, most = time.monotonic() + seconds, most or MOST
     tried = right = 0
     notes = []
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder:
-        while time.monotonic() < end and tried < MOST:
+        while time.monotonic() < end and tried < most:
             drawn = draw(Path(folder), rng)
             verdict, why = judge(drawn)
             drawn.path.unlink()

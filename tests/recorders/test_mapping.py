@@ -20,6 +20,7 @@ SOURCES = {
 # In metres, seconds, radians and teslas, by the definitions of the units.
 SIZES = {
     "m": 1.0,
+    "arcmin": np.pi / 10800,
     "mm": 1e-3,
     "cm": 1e-2,
     "km": 1e3,

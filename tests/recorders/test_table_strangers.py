@@ -114,6 +114,12 @@ def test_counters_are_continued_beyond_their_rollover(
         Got(path, by_hand)
 
 
+def test_a_clock_with_a_date_that_restarts_is_refused_as_such(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "Date,Time,lat,lon", lambda k: f"2025-06-01,10:00:{k % 20:02d},48.1,11.5")
+    with pytest.raises(BadInput, match="column Date and Time: at row 21 the time falls"):
+        Got(path)
+
+
 @pytest.mark.parametrize("restart", [20, 33, 38])
 def test_a_clock_that_restarts_is_refused(restart: int, tmp_path: Path) -> None:
     path = text_of(tmp_path, "t,speed,yaw_rate", lambda row: f"{0.5 * (row % restart):.1f},1,0.1")
@@ -382,6 +388,9 @@ def test_iso_dates_are_certain(tmp_path: Path) -> None:
             lambda k: f"2025-06-01,09:05:{k:02d},-07:00",
             "2025-06-01 16:05:00",
         ),
+        ("time,utc_offset", lambda k: f"2025-06-01 09:05:{k:02d},-0700", "2025-06-01 16:05:00"),
+        ("time,tz", lambda k: f"2025-06-01T09:05:{k:02d}Z,+02:00", "2025-06-01 09:05:00"),
+        ("elapsed", lambda k: f"05:{k:02d}.5", "2026-01-01 00:05:00.500000"),
     ],
 )
 def test_times_in_several_columns_are_together(
@@ -874,6 +883,9 @@ def test_a_date_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> None:
     path = text_of(tmp_path, "date,time,lat,lon", lambda k: f"7. Sept. 19,12:00:{k:02d},48.1,11.5")
     with pytest.raises(BadInput, match=r"date dates such as '7. Sept. 19', whose format is not known"):
         Got(path)
+    offsets = text_of(tmp_path, "time,utc_offset,lat", lambda k: f"2025-06-01 12:00:{k:02d},2h,48.1")
+    with pytest.raises(BadInput, match="column utc_offset states offsets from UTC such as '2h'"):
+        Got(offsets)
     degrees = text_of(tmp_path, "time,lat,lon", lambda k: f"{EPOCH + k},52°12'{k}\"N,11°24'{k}\"E")
     with pytest.raises(BadInput, match="column lat holds places such as '52°12'0\"N'"):
         Got(degrees)

@@ -1,7 +1,8 @@
 """Opens files that hold tables, one like another: the names of columns, and batches of rows.
 
-CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), and the trajectories of
-benchmarks. A batch has an Arrow array for each column that is asked for; memory holds one at a time.
+CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), logs of a VBOX (.vbo),
+and the trajectories of benchmarks. A batch has an Arrow array for each column that is asked for; memory
+holds one at a time.
 """
 
 import bz2

@@ -23,6 +23,7 @@ from recorders.importers.tables.order import Order, is_reversed, rollover_of
 from recorders.importers.tables.times import (
     ISO,
     OWN_OFFSET,
+    ZONED,
     TimeMapping,
     Undecided,
     formats_of,
@@ -58,6 +59,7 @@ _DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
 _OF_HEADER = r"(^|_)header_?(time_?)?stamp"
 _NAMELESS = r"(value|field|column|col|var|data|unnamed)?_?\d*"
 _PLACE = r"(.*_)?(lat(itude)?|lon|lng|long(itude)?|x|y|z|east(ing)?|north(ing)?|alt(itude)?|height)"
+_OFFSETS = r"(.*_)?((utc|gmt)_?of+se?t|utcofst|tz_?offset|time_?zone_?offset)|tz"
 _LIKE_A_TIME = r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d[ ./-][A-Z][a-z]{2,8}[ ./-]\d{2}"
 # From and below how many seconds steps are, by what a table holds: three decades, so that one unit fits.
 _STEPS_S = {"inertial": 5e-4, "fix": 0.02, "other": 2e-3}
@@ -366,14 +368,19 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
         cell = _first_cell(table.batch[name])
         days += [name] * bool(re.fullmatch(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}", cell))
         hours += [name] * bool(re.match(r"\d{1,2}:\d{2}", cell))
-    offsets = [name for name in plain if re.fullmatch("(.*_)?(utc_?of+se?t|utcofst)", plain[name])]
-    pairs = [[day, hour, *offsets[:1]] for day in days for hour in hours]
+    offsets = [
+        name for name, cell in _offsets(table).items() if re.fullmatch(r"[Zz]|[-+]\d\d:?\d\d", cell)
+    ][:1]
+    pairs = [[day, hour, *offsets] for day in days for hour in hours]
     named = sorted(
         table.texts, key=lambda name: not _NAMED.search(plain[name] + " date" * (name in days))
     )
-    for names in (*pairs, *([name] for name in named)):
+    singles = [[name, *more] for name in named for more in ([offsets] * bool(offsets) + [[]])]
+    for names in (*pairs, *singles):
         if found := _dated(table, names):
             if "zero" in found[0].model_fields_set and days and names[0] not in days:
+                if dated & {*days}:
+                    continue
                 cell = _first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
@@ -382,6 +389,16 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
                 )
             dated |= {*names}
             yield found
+
+
+def _offsets(table: _Table) -> dict[str, str]:
+    """Return the columns that are called offsets from UTC, with their first cells."""
+    found = {
+        name: _first_cell(table.batch[name])
+        for name in table.batch
+        if re.fullmatch(_OFFSETS, parted(name)[0])
+    }
+    return {name: cell for name, cell in found.items() if cell}
 
 
 def _check_texts(table: _Table, dated: set[str]) -> None:
@@ -418,8 +435,16 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     elif not (
         any("utc" in parted(name)[0].split("_") for name in names)
         or re.search(OWN_OFFSET, cell)
+        or ("%p" not in next(formats_of(cell)) and re.search(ZONED, cell))
         or _has_zone(table.batch[names[0]].type)
     ):
+        if unread := _offsets(table).keys() - {*names}:
+            name = min(unread)
+            raise Undecided(
+                f"{table.path}: column {name} states offsets from UTC such as "
+                f"'{_first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
+                "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
+            )
         comments = [
             f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
             'zone = "Europe/Berlin" or utc_offset_h'

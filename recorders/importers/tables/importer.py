@@ -170,7 +170,7 @@ def _notes(sources: list[Rows], plane: Plane | None, mapping: LogMapping) -> dic
 
 
 TABLE = Importer(
-    "tables by a mapping: CSV, TSV, Parquet, JSON lines, .npz, RTKLIB .pos, TUM, KITTI, EuRoC",
+    "tables by a mapping: CSV, TSV, Parquet, JSON lines, .npz, RTKLIB .pos, .vbo, TUM, KITTI, EuRoC",
     TableParameters,
     read,
 )

@@ -207,8 +207,10 @@ def _of_day(
     """Return the format of a time of day as `_CLOCK` takes it apart."""
     if not clock:
         return ""
-    of_day = (between or "") + ("%I" if half else "%H") + ":%M" + ":%S" * bool(second)
-    of_day += f"{point}%f" * bool(point)
+    parts = ["%I" if half else "%H", "%M", "%S"][: 2 + bool(second)]
+    if point and not second:  # of minutes nobody writes fractions
+        parts = ["%M", "%S"]
+    of_day = (between or "") + ":".join(parts) + f"{point}%f" * bool(point)
     return of_day + (" %p" if half and half[0] == " " else "%p" * bool(half))
 
 
