@@ -46,7 +46,8 @@ class Tuning:
         settings: of the estimator with the values it started from, and with those that were found.
         objective: what was minimised.
         found: where the search ended.
-        costs: (2,) of the logs with either values; minus the log-likelihood where that is what was best.
+        costs: (2,) of the logs with either values; minus the log-likelihood where that is what was best,
+            corrected for the noise of the controls if a note says so.
         held_out_costs: (2,) the same of the logs held out, if any.
         folds: a row per fold: the values by all other logs, and what its own logs cost with them.
         gate: the probability of the gate that was open in the search.

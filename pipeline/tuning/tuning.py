@@ -445,8 +445,8 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
     if found.confidence is None or found.was_stopped or objective.nis(found.optimum) < DIVERGED:
         return found
     coordinates = found.coordinates
-    moves = [
-        0.0 if each.is_kept else np.log(2.0) if each.is_positive else (each.useful or unit) / unit
+    moves = [  # none that the scan makes up for
+        0.0 if each.is_kept else np.log(2.0) if each.is_positive else 2.0 * (each.useful or unit) / unit
         for each, unit in zip(coordinates.free, coordinates.units, strict=True)
     ]
     low, high = coordinates.bounds

@@ -221,7 +221,7 @@ def gravity(motion: Motion) -> Iterator[Finding]:
         is_down = hangs(motion, force.topic)
         either = "" if is_down else ", or its forces have the wrong sign"
         also = ", and its turn rate goes the other way round than the course" if is_down else ""
-        what, of = ("turn_rate", " too") if is_down else ("specific_force", "")
+        what, more = ("turn_rate", ", which turns the forces too") if is_down else ("specific_force", "")
         yield Finding(
             "gravity",
             force.topic,
@@ -231,8 +231,7 @@ def gravity(motion: Motion) -> Iterator[Finding]:
             f"where specific force points up{also}",
             f"{force.topic}.{what}_z_scale",
             -1,
-            f"mounting_deg = [180, 0, 0] in the mapping, which turns the forces{of}, if its axes are "
-            "forward, right, down",
+            f"mounting_deg = [180, 0, 0] in the mapping{more}, if its axes are forward, right, down",
         )
 
 

@@ -101,7 +101,7 @@ def chords(fixes: Series, span_s: float) -> Windows:
     for astray_s in (ASTRAY_S, 0.0):
         begin_s, end_s = fixes.times_s[first] - astray_s, fixes.times_s[second] + astray_s
         is_sound = np.searchsorted(at_s, begin_s, "right") == np.searchsorted(at_s, end_s, "right")
-        if is_sound.mean() >= 0.5:
+        if 2 * is_sound.sum() >= len(is_sound):
             break
     first, second = first[is_sound], second[is_sound]
     return Windows(

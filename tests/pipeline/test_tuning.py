@@ -19,9 +19,10 @@ import pytest
 import fuselog as fl
 from pipeline.output.results import read_result
 from pipeline.runs.executors import InlineExecutor
+from pipeline.tuning.confidence import SearchOutcome, confidence
 from pipeline.tuning.objective import Best, Objective
 from pipeline.tuning.search import Coordinates, Cost, Free, curvature, least, scanned
-from pipeline.tuning.tuning import ENOUGH
+from pipeline.tuning.tuning import ENOUGH, _confirmed
 from recorders.log import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import memory_source
@@ -286,6 +287,30 @@ def test_at_an_edge_there_is_no_interval(
     found = fl.tune(short, "ekf", ["sigma_range_m", "sigma_bearing_rad"], set=given)
     assert found.parameters[["low", "high"]].isna().to_numpy().tolist() == [[True] * 2, [False] * 2]
     assert any(note.startswith("sigma_range_m: no interval, since beside") for note in found.notes)
+
+
+@pytest.mark.parametrize(("nis", "is_spike"), [(5.0, True), (1.0, False)])
+def test_a_spike_that_a_second_start_does_not_find_has_no_interval(
+    nis: float, *, is_spike: bool
+) -> None:
+    """A valley at 5.3, and a narrow one at 0 that is deeper; innovations are too large, or right."""
+
+    class Valleys:
+        by, is_corrected, best = "likelihood", False, Best(0, np.zeros(1), 0.0)
+
+        def nis(self, _: np.ndarray) -> float:
+            return nis
+
+        def __call__(self, points: np.ndarray) -> np.ndarray:
+            x = points[:, 0]
+            return np.minimum(0.5 * (x - 5.3) ** 2, 1e6 * x**2 - 50.0)
+
+    free = [Free("x", 0.0, -100.0, 100.0, is_positive=False, useful=1.0)]
+    known = confidence([0], np.ones((1, 1)))
+    found = SearchOutcome(Coordinates(free, np.ones(1)), np.zeros(1), 0, known)
+    ended = _confirmed(Valleys(), found)  # type: ignore[arg-type]
+    assert ended.is_spike == is_spike
+    assert (ended.confidence is None) == is_spike
 
 
 def test_ctrl_c_ends_with_the_best_so_far(short: fl.MemorySource) -> None:

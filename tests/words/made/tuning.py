@@ -44,6 +44,8 @@ def search() -> Iterator[str]:
     yield from _notes("by nees", by="nees")
     yield from _notes("elsewhere", begins_alike=False)
     yield from _notes("at an edge", at_edge=["sigma_range_m"])
+    yield from _notes("a spike", is_spike=True)
+    yield from _notes("corrected", is_corrected=True)
     for value in (0.01, 100.0):
         yield from _notes(f"at {value:g}", optimum=np.array([value, 1.0, 1.0]))
     yield from _notes("assumed", free=[FREE[0]._replace(is_assumed=True), *FREE[1:]])
@@ -100,9 +102,8 @@ def _made(**how: Any) -> Any:
     free, gate, by = how.pop("free", FREE), how.pop("gate", 1.0), how.pop("by", "likelihood")
     values = {"optimum": np.ones(len(free)), "evaluations": 17, **ended}
     outcome = SearchOutcome(coordinates=Coordinates(free, np.ones(len(free))), **values)
-    made = SimpleNamespace(
-        found=outcome, gate=gate, objective=SimpleNamespace(by=by), held_out_costs=None, folds=[]
-    )
+    objective = SimpleNamespace(by=by, is_corrected=how.pop("is_corrected", False))
+    made = SimpleNamespace(found=outcome, gate=gate, objective=objective, held_out_costs=None, folds=[])
     vars(made).update({"held_out_logs": [], **how})
     made._scale = Tuning._scale.fget(made)  # type: ignore[attr-defined]
     return made
