@@ -1,6 +1,7 @@
 """Runs the command line as a process: its exit code, what stops it, what it says of errors."""
 
 import atexit
+import gc
 import io
 import logging
 import math
@@ -57,6 +58,7 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
+    gc.set_threshold(50_000, 20, 100)  # collections while libraries are imported find nothing to free
     logging.basicConfig(format="fuselog: %(message)s")
     if sys.stderr.isatty():  # somebody waits
         logging.getLogger("fuselog").setLevel(logging.INFO)

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -33,7 +34,7 @@ from tests.bench import scaling
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 # Three cells, of which the last is small.
-RUNS = 260
+CELL, RUNS = 16, 36
 SETTINGS = {"duration_s": 1}
 
 
@@ -50,6 +51,13 @@ def contents(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.suffix != ".rrd" and path.name != TIMINGS
     }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_cells() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
+        yield
 
 
 def unfinished(folder: Path) -> Path:
@@ -122,7 +130,7 @@ def test_another_way_of_working_gives_the_same_bytes(whole, tmp_path, worked_off
             yield WorkerPool(Backwards(), 3)
 
         assert run(place, backwards, errors=True) == whole[1]
-        assert worked_off == [256, 128, 0]
+        assert worked_off == [2 * CELL, CELL, 0]
     finally:
         shutil.rmtree(place, ignore_errors=True)
         kept.rename(place)
@@ -149,7 +157,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
     counted = campaigns.Cell.packed
 
     def stopped(cell, folder):
-        if cell.first == 128:
+        if cell.first == CELL:
             raise KeyboardInterrupt
         return counted(cell, folder)
 
@@ -165,7 +173,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
     (half / "new.bin").write_bytes(b"half a ce")
     assert run(place) == files
     assert "has 1 of 3 cells" in caplog.text
-    assert worked_off == [0, 128, 256]
+    assert worked_off == [0, CELL, 2 * CELL]
     assert not unfinished(place).exists()
 
 
@@ -176,7 +184,7 @@ def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkey
     with monkeypatch.context() as patch:
         patch.setattr(campaigns.Checkpoints, "hand_over", lambda *_: 1 / 0)
         with pytest.raises(BadInput, match="division by zero"):
-            run(place, runs=130)
+            run(place, runs=CELL + 2)
     worked_off.clear()
     if what == "code":
         monkeypatch.setattr(campaigns, "version_of_code", lambda: "another")
@@ -187,8 +195,8 @@ def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkey
         half.write_bytes(b"killed while a log was written")
     elif what == "a file is gone":
         next(unfinished(place).glob("*/logs/run-0001.mcap")).unlink()
-    run(place, runs={"settings": 131, "one cell": 1}.get(what, 130))
-    assert worked_off == {"a file is gone": [0], "one cell": []}.get(what, [0, 128])
+    run(place, runs={"settings": CELL + 3, "one cell": 1}.get(what, CELL + 2))
+    assert worked_off == {"a file is gone": [0], "one cell": []}.get(what, [0, CELL])
     assert not list(place.rglob("half.mcap"))
     assert not unfinished(place).exists()
 
@@ -203,14 +211,14 @@ def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off)
 
     files = run(tmp_path / "result", dying)
     assert len(teams) == 3
-    assert worked_off == [128, 256, 0]  # the first cell died beside 128, then beside 256
+    assert worked_off == [CELL, 2 * CELL, 0]  # the first cell died beside the second, then the third
     assert json.loads(files["result.json"])["settings"]["runs"] == RUNS
 
     @contextmanager
     def hopeless():
         yield WorkerPool(Dying(deaths=True), 1)
 
-    with pytest.raises(BadInput, match="runs 0 to 127: the process that computed them died 3 times"):
+    with pytest.raises(BadInput, match="runs 0 to 15: the process that computed them died 3 times"):
         run(tmp_path / "other", hopeless)
 
 
@@ -287,7 +295,7 @@ class Elsewhere(InlineExecutor):
 
 @pytest.mark.paper
 def test_a_campaign_without_logs_has_its_timeline(tmp_path):
-    name, experiment = load_experiment("landmarks", SETTINGS, {"runs": 130})
+    name, experiment = load_experiment("landmarks", SETTINGS, {"runs": CELL + 2})
     run_experiment(name, experiment, tmp_path / "result", logs=0)
     assert (tmp_path / "result" / "timeline.rrd").is_file()
     assert not (tmp_path / "result" / "logs").exists()
@@ -301,11 +309,11 @@ def test_progress_tells_how_many_runs_how_fast_and_who_works(tmp_path):
             yield item
             said.append((str(title), total))
 
-    run(tmp_path / "result", runs=130, progress=progress)
+    run(tmp_path / "result", runs=CELL + 2, progress=progress)
     told = [each for each in said if each[0].startswith("replaying: ")]
     assert [total for _, total in told] == [2, 2]
-    for done, (text, _) in zip((128, 130), told, strict=True):
-        assert re.fullmatch(rf"replaying: {done} of 130 runs, [1-9]\d* runs/s, 1 worker; cells", text)
+    for done, (text, _) in zip((CELL, CELL + 2), told, strict=True):
+        assert re.fullmatch(rf"replaying: {done} of 18 runs, [1-9]\d* runs/s, 1 worker; cells", text)
 
 
 def test_what_is_not_ours_stays(tmp_path):
@@ -314,13 +322,13 @@ def test_what_is_not_ours_stays(tmp_path):
     note = unfinished(place) / "thesis.txt"
     note.write_text("years of work")
     with pytest.raises(BadInput, match=r"holds thesis\.txt, which fuselog did not write; move it away"):
-        run(place, runs=130)
+        run(place, runs=CELL + 2)
     assert note.read_text() == "years of work"
     note.unlink()
     with checkpoints_of(place) as checkpoints:
         checkpoints.begin()
         with pytest.raises(BadInput, match="another fuselog command is working on it"):
-            run(place, runs=130)
+            run(place, runs=CELL + 2)
 
 
 def test_a_metric_that_cannot_be_pickled_is_bad_input(monkeypatch, tmp_path):
@@ -333,7 +341,7 @@ def test_a_metric_that_cannot_be_pickled_is_bad_input(monkeypatch, tmp_path):
 
     monkeypatch.setattr(campaigns.Cell, "work_off", unpicklable)
     with pytest.raises(BadInput, match="what a metric keeps cannot be sent to another process"):
-        run(tmp_path / "result", runs=130)
+        run(tmp_path / "result", runs=CELL + 2)
 
 
 def test_bins_of_very_many_runs_are_wider():
@@ -401,12 +409,16 @@ def test_the_simulated_driver_is_the_limit_where_it_is_busy():
 
 
 @pytest.mark.paper
-def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
+def test_processes_give_the_same_bytes_also_after_a_kill(place, monkeypatch):
+    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 128)
+    runs = 260
+    files = run(place, runs=runs)
+    shutil.rmtree(place)
     command = [
         "run",
         "landmarks",
         "--runs",
-        str(RUNS),
+        str(runs),
         "--logs",
         "2",
         "--out",

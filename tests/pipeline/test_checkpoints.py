@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -20,8 +20,15 @@ from tests.pipeline.conftest import Said
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 # Three cells, of which the first writes logs, estimates and the timeline.
-RUNS = 260
+CELL, RUNS = 16, 36
 SETTINGS = {"duration_s": 1.0, "estimators": {"dead-reckoning": {}}}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_cells() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
+        yield
 
 
 def run(place: Path, seed: int = 3) -> dict[str, bytes]:
@@ -231,9 +238,7 @@ def test_a_scheduler_that_ends_is_told(tmp_path: Path) -> None:
             return future
 
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": RUNS})
-    with pytest.raises(
-        BadInput, match=r"runs 0 to 127: the process .* died 3 times \(the scheduler has"
-    ):
+    with pytest.raises(BadInput, match=r"runs 0 to 15: the process .* died 3 times \(the scheduler has"):
         run_experiment(
             name, experiment, tmp_path / "result", open_pool=lambda: nullcontext(WorkerPool(Ended(), 1))
         )

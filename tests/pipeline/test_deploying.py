@@ -68,7 +68,7 @@ def test_estimates_are_equal_to_the_last_bit(
     assert away <= 1e-12 * wide
     if sys.platform == "win32":
         return
-    library = compiled(folder, "-shared", "-fPIC")
+    library = compiled(folder, "-shared", "-fPIC", "-O0")  # as the program, optimised or not
     kinds = {"kind": label, **options}, {"kind": "lib", "path": str(library), "in_process": True}
     replays = [fl.replay(log, {"it": each}) for each in kinds]
     own, foreign = (each.estimates[0] for each in replays)
@@ -99,7 +99,7 @@ def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path, label: str) ->
     source.write_text(
         text.replace("return pass_gap(filter, time_ns, parameters);", "filter->is_in_gap = 0;")
     )
-    assert furthest(compiled(folder, "-Wno-unused-function")) > 0.1
+    assert furthest(compiled(folder, "-Wno-unused-function", "-O0")) > 0.1
 
 
 @needs_compiler
@@ -111,7 +111,7 @@ def test_check_says_whether_the_c_is_as_the_golden(
     log = recorded(tmp_path, "landmarks", duration_s=2.0)
     monkeypatch.chdir(tmp_path)
     folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", sigma_range_m=0.2)
-    library = compiled(folder, "-shared", "-fPIC")
+    library = compiled(folder, "-shared", "-fPIC", "-O0")
     for name, sigma_m in (("same", 0.2), ("other", 0.3)):
         kept = f"--update -e ekf --set ekf.model=robot --set ekf.sigma_range_m={sigma_m}"
         assert run_here("check", log, "--against", f"{name}.golden.xz", *kept.split()).code == 0
@@ -125,7 +125,7 @@ def test_check_says_whether_the_c_is_as_the_golden(
     source = folder / "robot_ekf.c"
     text = source.read_text()
     source.write_text(text.replace("+= C[row][i] * v[i];", "+= 1.0001 * C[row][i] * v[i];"))
-    compiled(folder, "-shared", "-fPIC")
+    compiled(folder, "-shared", "-fPIC", "-O0")
     said = run_here(*checked)
     assert said.code == 1
     assert "/estimates/ekf/robot1/" in said.out
@@ -221,7 +221,7 @@ def test_both_precisions_are_compared_with_intervals(tmp_path: Path) -> None:
     for precision in ("double", "single"):
         folder = tmp_path / precision
         fl.deploy(logs[0], "ekf", folder, model="robot", single=precision == "single")
-        sides += ["-e", f"lib:{compiled(folder, '-shared', '-fPIC')}"]
+        sides += ["-e", f"lib:{compiled(folder, '-shared', '-fPIC', '-O0')}"]
     said = run_here("compare", *logs, *sides)
     assert said.code == 0, said.err
     [row] = [line for line in said.out.splitlines() if line.startswith(" position_rmse_m ")]

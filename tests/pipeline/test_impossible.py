@@ -19,19 +19,29 @@ from pipeline.output.report import empty_cells, write_report
 from pipeline.output.results import Outcome, write_outcome
 from pipeline.output.terminal import format_value
 from recorders.log import write_log
-from tests.faults.planted import NOT_A_NUMBER, QUICK, Planted, complaints, in_order
+from tests.faults.planted import NOT_A_NUMBER, QUICK, Planted, complaints, in_order, recorded
 from tests.pipeline.conftest import Said
 
 SAMPLE = in_order(np.random.default_rng(4))
 
 
 def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
-    """One kind of value in each field of every scenario, and each kind somewhere."""
+    """One kind of value in each field of every scenario is replayed; all else once of a schema's field.
+
+    Each kind is somewhere.
+    """
     fields = {(each.scenario, each.topic, each.field): each for each in reversed(SAMPLE)}
     kinds = {each.kind: each for each in reversed(SAMPLE)}
-    chosen = dict.fromkeys([*fields.values(), *kinds.values()])
+    schemas = {(schema_of(each), each.field): each for each in fields.values()}
+    wholly = {*kinds.values(), *schemas.values()}
     assert len(fields) > 100
-    assert [wrong for each in chosen for wrong in complaints(each, QUICK)] == []
+    assert len(schemas) > 50
+    assert [wrong for each in fields.values() for wrong in complaints(each, QUICK[-1:])] == []
+    assert [wrong for each in SAMPLE if each in wholly for wrong in complaints(each, QUICK[:-1])] == []
+
+
+def schema_of(planted: Planted) -> str:
+    return recorded(planted.scenario)[0][planted.topic].schema.full_name
 
 
 @pytest.mark.parametrize(

@@ -85,10 +85,14 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
 
     monkeypatch.setattr(diagnosis, "seek", seek)
     walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
-    for name in ("degrees", "18 s, fixes"):
+    for name, words in (
+        ("degrees", "^/inertial: turn_rate_radps is in deg/s"),
+        ("18 s, fixes", "^/fix: its stamps are 18 s late"),
+    ):
         planted, [setting] = PLANTED[name]
         found = fl.diagnose(walk, "ekf", set=planted)
         assert found.sentences[0].setting == setting
+        assert re.search(words, found.sentences[0].words)
         assert found.replay.failures == []
         assert found.notes[0].startswith("all else is said of the log with --set /")
     for mended in sought:
@@ -117,16 +121,14 @@ def test_what_is_planted_into_a_walk_is_named_first(
     walk = replace(whole, streams=streams)
     first = {
         name: fl.diagnose(walk, "ekf", set=PLANTED[name][0]).sentences[0]
-        for name in ("nothing", "turn rate's sign", "degrees", "velocity x 3.6", "18 s, fixes")
+        for name in ("nothing", "turn rate's sign", "velocity x 3.6")
     }
     assert first["nothing"].kind == "unnamed"
     assert first["turn rate's sign"].setting == "/inertial.turn_rate_scale=1.0"
     assert "turn_rate_radps has the wrong sign" in first["turn rate's sign"].words
-    assert "turn_rate_radps is 57.3 times" in first["degrees"].words
     assert re.search(
         r"/velocity: velocity_mps is 3\.[56]\d* times .* too large", first["velocity x 3.6"].words
     )
-    assert first["18 s, fixes"].words.startswith("/fix: its stamps are 18 s late")
 
 
 @pytest.mark.paper

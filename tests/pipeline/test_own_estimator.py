@@ -143,7 +143,7 @@ def test_ours_are_made_as_those_of_others() -> None:
     assert makers == {"replay.engine.api.binding", "replay.inference.estimators", resting}
 
 
-def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
+def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:
     """Run commands in one process that has the package: exit code, output and errors of each.
 
     Figures are written without being drawn, as by `blank_figures`.
@@ -168,16 +168,45 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
     return [json.loads(line) for line in process.stdout.splitlines()]
 
 
+COMMANDS = [line for block in _blocks("sh") for line in block.splitlines()]
+COMMANDS.append("fuselog replay beacons.mcap -e locate -e nearest --json --out again.mcap")
+COMPARED = [
+    "fuselog record beacons --set duration_s=10 --out b.mcap",
+    "fuselog replay b.mcap -e nearest -e plain --out both.mcap",
+]
+_FAILING = "fuselog replay {} -e {} --out out --json"
+# with the words that standard error has
+WRONG = {
+    "fuselog record beacons --set duration_s=5 --out few.mcap --set beacons=3": "",
+    "fuselog record beacons --set duration_s=5 --out enough.mcap": "",
+    _FAILING.format(
+        "enough.mcap", "divide"
+    ): "estimator divide/walker raised ZeroDivisionError: division by zero",
+    _FAILING.format("enough.mcap", "gone"): "estimator 'gone' (gone:GONE) raised ModuleNotFoundError",
+    _FAILING.format("enough.mcap", "number"): "estimator 'number' (broken:NUMBER) is int",
+    _FAILING.format("few.mcap", "choosy"): "fewer than 4 beacons",
+    "fuselog record twice": "/landmarks: is recorded as 2 streams",
+    _FAILING.format(
+        "few.mcap enough.mcap", "choosy"
+    ): "few.mcap: choosy walker failed at 4.500 s: fewer than 4 beacons",
+    "fuselog estimators": "",
+}
+
+
+@pytest.fixture(scope="module")
+def said(package: Path) -> dict[str, dict[str, Any]]:
+    """What all commands said, in one process."""
+    commands = [*COMMANDS, *COMPARED, *WRONG]
+    return dict(zip(commands, _run(package, commands), strict=True))
+
+
 @pytest.mark.paper
-def test_the_page_works_as_written(package: Path) -> None:
+def test_the_page_works_as_written(package: Path, said: dict[str, dict[str, Any]]) -> None:
     """Every command of the page runs with its package; its model serves every method as it should."""
-    commands = [line for block in _blocks("sh") for line in block.splitlines()]
-    commands.append("fuselog replay beacons.mcap -e locate -e nearest --json --out again.mcap")
-    said = _run(package, commands)
-    assert len(commands) >= 9
-    for command, each in zip(commands, said, strict=True):
-        assert each["code"] == 0, (command, each)
-        assert each["err"] == "", command
+    assert len(COMMANDS) >= 9
+    for command in COMMANDS:
+        assert said[command]["code"] == 0, (command, said[command])
+        assert said[command]["err"] == "", command
     metrics = json.loads((package / "walk/result.json").read_text())["metrics"]
     for method in ("ekf", "ukf", "iekf"):
         assert metrics[f"{method}.position_rmse_m.walker"] < 1.2
@@ -191,21 +220,18 @@ def test_the_page_works_as_written(package: Path) -> None:
     assert metrics["locate.position_rmse_m.walker"] < metrics["nearest.position_rmse_m.walker"] < 4
     assert metrics["nearest.nees.walker"] == pytest.approx(2, abs=0.5)
     assert metrics["deaf.nis_per_component.walker"] < 0.3
-    out = {command: str(each["out"]) for command, each in zip(commands, said, strict=True)}
-    (evaluated,) = (text for command, text in out.items() if "fuselog evaluate" in command)
+    (evaluated,) = (said[command]["out"] for command in COMMANDS if "fuselog evaluate" in command)
     assert "within_1m_share" in evaluated
-    assert "signal_strength" in out["fuselog models walker"]
+    assert "signal_strength" in said["fuselog models walker"]["out"]
     assert (package / "beacons.rrd").stat().st_size > 1000
     schema = open_log(package / "beacons.mcap").topics["/walker/signal_strength"].schema_name
     assert schema == "radio.SignalStrength"
 
 
 @pytest.mark.paper
-def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
+def test_what_the_page_compiles_is_what_it_says(package: Path, said: dict[str, dict[str, Any]]) -> None:
     """The compiled recursion equals the same function in plain Python, as the page promises."""
-    record = "fuselog record beacons --set duration_s=10 --out b.mcap"
-    said = _run(package, [record, "fuselog replay b.mcap -e nearest -e plain --out both.mcap"])
-    assert [each["code"] for each in said] == [0, 0]
+    assert [said[command]["code"] for command in COMPARED] == [0, 0]
     log = open_log(package / "both.mcap")
     of = {
         name: [topic for topic in log.topics if topic.startswith(f"/estimates/{name}/")]
@@ -220,35 +246,16 @@ def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
 
 
 @pytest.mark.paper
-def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
+def test_the_code_of_others_that_fails_is_named(said: dict[str, dict[str, Any]]) -> None:
     """A plugin's mistake is one sentence that says whose it is, and hurts no other plugin."""
-    record = "fuselog record beacons --set duration_s=5 --out"
-    few, enough = f"{record} few.mcap --set beacons=3", f"{record} enough.mcap"
-    replay = "fuselog replay {} -e {} --out out --json"
-    cases = {
-        few: "",
-        enough: "",
-        replay.format(
-            "enough.mcap", "divide"
-        ): "estimator divide/walker raised ZeroDivisionError: division by zero",
-        replay.format("enough.mcap", "gone"): "estimator 'gone' (gone:GONE) raised ModuleNotFoundError",
-        replay.format("enough.mcap", "number"): "estimator 'number' (broken:NUMBER) is int",
-        replay.format("few.mcap", "choosy"): "fewer than 4 beacons",
-        "fuselog record twice": "/landmarks: is recorded as 2 streams",
-        replay.format(
-            "few.mcap enough.mcap", "choosy"
-        ): "few.mcap: choosy walker failed at 4.500 s: fewer than 4 beacons",
-        "fuselog estimators": "",
-    }
-    said = dict(zip(cases, _run(package, list(cases)), strict=True))
-    for command, words in cases.items():
-        assert words in str(said[command]["err"]), command
-        assert str(said[command]["err"]).count("\n") == bool(words)
-    codes = [each["code"] for each in said.values()]
+    for command, words in WRONG.items():
+        assert words in said[command]["err"], command
+        assert said[command]["err"].count("\n") == bool(words)
+    codes = [said[command]["code"] for command in WRONG]
     assert codes == [0, 0, 2, 2, 2, 2, 2, 0, 0]
-    ensemble = json.loads(str(said[replay.format("few.mcap enough.mcap", "choosy")]["out"]))
+    ensemble = json.loads(said[_FAILING.format("few.mcap enough.mcap", "choosy")]["out"])
     assert ensemble["metrics"]["choosy.failed_runs.walker"] == 1
-    listed = str(said["fuselog estimators"]["out"])
+    listed = said["fuselog estimators"]["out"]
     assert "raised ModuleNotFoundError" in listed
     assert "\n ekf " in listed
 

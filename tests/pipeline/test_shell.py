@@ -18,7 +18,6 @@ from tests.pipeline.conftest import Said
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-RUN = ["run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--logs", "0"]
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
@@ -56,20 +55,23 @@ def test_nothing_is_said_of_progress_where_nobody_watches(
 
 @pytest.mark.paper
 @pytest.mark.unix
-def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable[..., Any]) -> None:
+def test_progress_is_shown_in_a_terminal(
+    world: Path, tmp_path: Path, start_fuselog: Callable[..., Any]
+) -> None:
     import pty
 
     ours, theirs = pty.openpty()
     with os.fdopen(ours, "rb", 0) as watched:
-        process = start_fuselog(*RUN, "--json", "--out", str(tmp_path / "r"), stderr=theirs)
+        replay = ("replay", str(world / "log.mcap"), "-e", "ekf", "--json", "-o", f"{tmp_path}/est.mcap")
+        process = start_fuselog(*replay, stderr=theirs)
         os.close(theirs)
         shown = b""
         with suppress(OSError):  # Linux has no other end of a pseudo-terminal
             while part := watched.read(4096):
                 shown += part
         out, _ = process.communicate()
-    assert b"%" in shown
-    assert json.loads(out)["experiment"] == "landmarks"
+    assert b"replaying" in shown
+    assert "ekf.position_rmse_m.robot1" in json.loads(out)["metrics"]
 
 
 def test_who_is_no_terminal_has_a_line_a_minute(
