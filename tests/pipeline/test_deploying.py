@@ -316,6 +316,7 @@ def test_a_filter_is_written_where_it_was_asked_for_and_nowhere_else(
         assert state() == written
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("single", "away"), [(False, 1e-12), (True, 2e-6)])
 def test_an_emulated_cortex_m4f_gives_the_estimates(tmp_path: Path, single: bool, away: float) -> None:
     if missing := missing_of_target():
