@@ -146,6 +146,7 @@ def test_a_walk_that_is_not_there_has_a_bound() -> None:
     assert 1e-6 < walk_below(samples, found) < 3e-4
 
 
+@pytest.mark.paper
 def test_bic_tells_a_walk_from_gauss_markov_noise() -> None:
     kinds = {
         ("white",): Terms(1e-3),
