@@ -106,6 +106,7 @@ def worked_off(monkeypatch) -> list[int]:
     return cells
 
 
+@pytest.mark.paper
 def test_cells_are_merged_into_what_one_pass_gives(whole):
     folder, files = whole
     errors = pytest.importorskip("pandas").read_parquet(folder / "tables/errors/ekf-robot1.parquet")
@@ -201,6 +202,7 @@ def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkey
     assert not unfinished(place).exists()
 
 
+@pytest.mark.paper
 def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off):
     teams = []
 

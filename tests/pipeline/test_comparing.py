@@ -60,6 +60,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.paper
 def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: Path) -> None:
     found = fl.compare(*logs, estimators=["ekf", {"tight": TIGHT}])
     row = found.table.query("quantity == 'nees'").iloc[0]
@@ -111,6 +112,7 @@ def test_a_result_gives_what_its_estimates_logs_and_a_replay_give(
     assert "worse" not in tables[0]["verdict"].tolist()
 
 
+@pytest.mark.paper
 def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,6 +173,7 @@ CART = fl.Model(
 )
 
 
+@pytest.mark.paper
 @needs_compiler
 @pytest.mark.usefixtures("uncompiled")
 def test_single_precision_says_where_it_breaks_and_the_square_root_holds(tmp_path: Path) -> None:
@@ -316,6 +317,7 @@ def test_a_filter_is_written_where_it_was_asked_for_and_nowhere_else(
         assert state() == written
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("single", "away"), [(False, 1e-12), (True, 2e-6)])
 def test_an_emulated_cortex_m4f_gives_the_estimates(tmp_path: Path, single: bool, away: float) -> None:
     if missing := missing_of_target():
@@ -326,6 +328,7 @@ def test_an_emulated_cortex_m4f_gives_the_estimates(tmp_path: Path, single: bool
     assert [taken.average, taken.most] == pytest.approx([kept["average"], kept["most"]], rel=0.1)
 
 
+@pytest.mark.paper
 def test_the_costs_that_are_kept_are_those_of_now(tmp_path: Path) -> None:
     """`python -m tests.deployed --keep` keeps them."""
     tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})

@@ -256,6 +256,7 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
     assert "the gate that is set keeps these out" in found[0].words
 
 
+@pytest.mark.paper
 def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
     """The second gains what it gains after the first is undone."""
     faulty = alter.altered(run, SEEN, alter.shifted("range_m"), 0.2)
@@ -268,6 +269,7 @@ def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
 BESIDE_ITS_PLACE = {"/robot1/fix.origin": "1.0,-2.0"}
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("wrong", "part", "right"),
     [

@@ -116,6 +116,7 @@ def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
         session.slider("sigma_rang_m")
 
 
+@pytest.mark.paper
 def test_likelihood_is_greatest_where_tuning_ends(session: Session) -> None:
     points = list(session.likelihoods("ekf", SURE, "sigma_range_m"))
     best = max(points, key=lambda each: each[1])[0]

@@ -25,6 +25,7 @@ from tests.pipeline.conftest import Said
 SAMPLE = in_order(np.random.default_rng(4))
 
 
+@pytest.mark.paper
 def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
     """One kind of value in each field of every scenario is replayed; all else once of a schema's field.
 
@@ -104,6 +105,7 @@ def test_what_is_left_out_is_said_and_spoils_no_figure(
         assert metrics[f"ekf.{name}.robot1"] == pytest.approx(whole[f"ekf.{name}.robot1"], rel=0.5)
 
 
+@pytest.mark.paper
 def test_no_warning_of_numpy_reaches_standard_error(tmp_path: Path) -> None:
     rows = [f"{k} {1e200 * k} 0 0 0 0 1e200 1e200\n" for k in range(9)]
     (tmp_path / "line.tum").write_text("".join(rows))

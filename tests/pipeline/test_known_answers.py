@@ -305,6 +305,7 @@ def _bootstrapped(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.paper
 def test_a_comparison_is_of_the_second_less_the_first_whichever_comes_first(place: Path) -> None:
     """Intervals have about the width of Student's, and verdicts say who errs less."""
     for first, second, verdict in (("one", "two", "better"), ("two", "one", "worse")):

@@ -120,6 +120,7 @@ def test_likelihood_is_the_dense_one() -> None:
     assert first.log_likelihood == pytest.approx(683.303488791, abs=1e-7)
 
 
+@pytest.mark.paper
 def test_the_likeliest_noise_and_its_interval(walking: np.ndarray) -> None:
     samples = samples_of(walking, STEP_S)
     found = choose(samples)
@@ -145,6 +146,7 @@ def test_a_walk_that_is_not_there_has_a_bound() -> None:
     assert 1e-6 < walk_below(samples, found) < 3e-4
 
 
+@pytest.mark.paper
 def test_bic_tells_a_walk_from_gauss_markov_noise() -> None:
     kinds = {
         ("white",): Terms(1e-3),
@@ -214,6 +216,7 @@ def rest(size: int = 4096, seconds: float = STEP_S, **changed: np.ndarray) -> fl
     return fl.make_stream("/imu", fl.schemas.INERTIAL_SAMPLE, stamps, **columns | changed)
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("blank_figures")
 def test_the_command_writes_what_others_read(
     fuselog: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

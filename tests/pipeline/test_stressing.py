@@ -351,6 +351,7 @@ def test_heading_after_fixes(settings: Any, compass: bool, expected: Expected) -
     assert start.metres[-1] == pytest.approx(expected.by_start, rel=1e-2, abs=1e-3)
 
 
+@pytest.mark.paper
 def test_noise_per_prediction_is_a_discontinuity() -> None:
     done = fl.stress(drive_of(20, 80), {"ukf": fl.modelled(PER_PREDICTION, "ukf")})
     [stressed] = done.stressed
@@ -406,6 +407,7 @@ def test_a_lost_message_moves_a_filter_as_far_as_its_covariance_says() -> None:
     assert len({*worst_first}) > 1
 
 
+@pytest.mark.paper
 def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> None:
     logs = []
     for seed in range(5):
@@ -420,6 +422,7 @@ def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> No
     assert NOT_TESTED in fuselog("compare", logs[0], "-e", "ekf", "-e", "ukf").out
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("blank_figures")
 def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, monkeypatch: Any) -> None:
     """A verdict on every estimator, by all runs; what a change moves further than two differ is open."""

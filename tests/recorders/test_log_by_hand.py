@@ -296,7 +296,7 @@ def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
     region = log.container.regions[0]
     whole = open_region(path.read_bytes()[region.offset : region.offset + region.length], 0).data
     generator = np.random.default_rng(0)
-    for changes in [0, *[1, 2, 8] * 100]:
+    for changes in [0, *[1, 2, 8] * 40]:
         data = whole[: generator.integers(len(whole) // 2, len(whole) + 1)].copy()
         data[generator.integers(len(data), size=changes)] = generator.integers(256, size=changes)
         words = loops.words_of(data), len(data)

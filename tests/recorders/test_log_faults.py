@@ -16,6 +16,7 @@ def test_faults_hold(campaign, most):
     assert tally.held == tally.tried >= most
 
 
+@pytest.mark.paper
 def test_what_does_not_hold_is_noted(monkeypatch):
     """The campaign can fail: a reader that leaves the last message out in silence is found out."""
 

@@ -13,6 +13,7 @@ from recorders.linting.lint import lint
 from tests.recorders.strange_tables import draw, imported, judge
 
 
+@pytest.mark.paper
 def test_no_table_is_read_wrongly_without_a_word(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,9 +24,9 @@ pytestmark = pytest.mark.paper
 
 SIMULATED = [name for name, recipe in RECIPES.items() if not recipe.importer]
 IMPORTED = [name for name, recipe in RECIPES.items() if recipe.importer]
-# what rounding once decided: ties, vertices, half turns, searches that end early; with the variables of
-# `tests.older_cpu`, `make test` runs all tests so
-FRAGILE = ("biometrics-sequential-simulated", "navigation-unknown-heading", "set-filter")
+# what rounding once decided: vertices, half turns, searches that end early (`test_biometrics` has ties);
+# with the variables of `tests.older_cpu`, `make test` runs all tests so
+FRAGILE = ("navigation-unknown-heading", "set-filter")
 # what a process of its own does, as on another CPU; unless its arithmetic is the given one
 ON_IT = """
 import sys

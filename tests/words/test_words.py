@@ -16,6 +16,7 @@ def found(tmp_path_factory: pytest.TempPathFactory, blank_figures: None) -> Mapp
     return everything(tmp_path_factory.mktemp("words"))
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("command", KEPT)
 def test_a_command_says_what_was_reviewed(command: str, found: Mapping[str, str]) -> None:
     if command == "explore":
@@ -24,6 +25,7 @@ def test_a_command_says_what_was_reviewed(command: str, found: Mapping[str, str]
     assert not told, f"{told}\nif it is meant: python -m tests.words --update"
 
 
+@pytest.mark.paper
 def test_all_that_is_said_was_reviewed(found: Mapping[str, str]) -> None:
     assert found.keys() == {*KEPT}, "python -m tests.words --update"
 

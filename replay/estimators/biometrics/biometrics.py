@@ -280,7 +280,7 @@ def _learnt(
     pairs = chosen_pairs._replace(fold=fold)
     scores = _prepared(compared, parameters)[:, :, chosen]
     vectors = scores[pairs.probe, pairs.gallery]
-    with extra("papers", "a fusion that is learnt"):
+    with extra("papers", "a learnt fusion"):
         import sklearn.cluster  # noqa: F401  # only libraries that are loaded are limited below
     # the problems are small: on a busy machine, threads of the libraries only wait for one another
     with threadpool_limits(1):

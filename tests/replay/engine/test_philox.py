@@ -37,6 +37,7 @@ def test_keys_differ_by_seed_and_by_data() -> None:
     assert len(keys) == 6
 
 
+@pytest.mark.paper
 def test_normals_are_normal_into_the_tail_and_go_on_where_the_counter_stands() -> None:
     """Two million, whose words end where the counter says; every layer and the tail take part."""
     key, half = np.array([3, 1], np.uint64), 1_000_000

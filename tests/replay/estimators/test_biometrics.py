@@ -34,6 +34,7 @@ from replay.judging.consistency.verification import (
     verification_rate,
 )
 from replay.judging.metrics.measuring import find_metrics, measure
+from tests.replay.engine.processes import printed
 
 pytestmark = pytest.mark.paper
 
@@ -172,6 +173,31 @@ def test_whole_numbers_halfway_between_two_means_do_not_hang_on_rounding():
             for scale in (1.0 / 3.0, (1.0 + 1e-15) / 3.0, (1.0 - 1e-15) / 3.0)
         ]
         np.testing.assert_allclose(fitted[1:], fitted[:1] * 2, rtol=1e-9)
+
+
+LEARNT_WITH = """
+import numpy as np
+from threadpoolctl import threadpool_info
+from recorders.models.scores import Comparisons, Matcher
+from replay.estimators.biometrics import biometrics
+
+def threads(vectors, *_):
+    print(*(each["num_threads"] for each in threadpool_info() if each["user_api"] == "openmp"))
+    return np.zeros(len(vectors))
+
+biometrics.cross_validate = threads
+scores = np.random.default_rng(0).normal(size=(20, 20, 1))
+matchers = (Matcher(name="a", modality="face", score="similarity"),)
+compared = Comparisons(matchers, scores, np.zeros(scores.shape, bool), np.zeros(20, np.int64))
+biometrics._learnt(compared, [0], biometrics.ClassifierParameters(), None, True)
+"""
+
+
+@pytest.mark.paper
+def test_a_process_learns_by_one_thread_from_the_first_time_on(tmp_path):
+    """Scikit-learn brings its threads when it is imported: who limits them before limits nothing."""
+    [said] = printed([LEARNT_WITH], tmp_path, {}, "ignore")
+    assert {*said.split()} == {"1"}
 
 
 def test_ergodic_likelihood_never_falls():

@@ -30,7 +30,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "extended-target": ("extended-target", {}),
     "inertial": ("navigation", {"duration_s": 12.0}),
     "moving-shooter": ("shot-sequence", {"shots": 4}),
-    "moving-sights": ("moving-los", {"duration_s": 6.0}),
+    "moving-sights": ("moving-los", {"duration_s": 3.0}),
     "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
     "ranging-position": ("ranging", {**FEW_RANGES, "tags_m": [(0.0, 0.0, 0.0)]}),
     "robot": ("landmarks", {"duration_s": 6.0, "range_bearing": {"rate_hz": 4.0}}),

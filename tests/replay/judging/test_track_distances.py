@@ -85,6 +85,7 @@ def test_hota_of_the_sheet():
     )
 
 
+@pytest.mark.paper
 def test_figures_are_those_of_motmetrics_and_trackeval_on_random_scenes():
     """IDF1, switches and breaks of motmetrics, HOTA and IDF1 of TrackEval; see `track_peers`."""
     kept = json.loads(track_peers.KEPT.read_text())["scenes"]
