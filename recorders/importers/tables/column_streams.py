@@ -287,7 +287,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
         lines += [
             "# If this is the truth:",
             '# topic = "/truth", becomes = "TruthState", and in place of the fields above',
-            *(f"# {line}" for line in _truth(place, factors, turn, heading)),
+            *(f"# {line}" for line in _truth(place, factors, turn, heading) if not line.startswith("#")),
         ]
     names = ["a position"] * bool(place) + ["a unit quaternion"] * bool(turn)
     becomes = "Orientation" if not place else "Pose" if turn else "PositionFix"
