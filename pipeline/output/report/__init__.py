@@ -150,13 +150,14 @@ def _signed(page: bytes) -> bytes:
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
 
 
+_ODD = re.compile(r"[^\n\t -~]")  # what may be a control character; a page has a million others
+
+
 def _visible(value: object) -> object:
     """Show control characters of a text by their numbers, in all that the page is made of."""
     if not isinstance(value, str) or value.isprintable():
         return value
-    shown = "".join(
-        each if each in "\n\t" or category(each) == "Zs" else printable(each) for each in value
-    )
+    shown = _ODD.sub(lambda odd: odd[0] if category(odd[0]) == "Zs" else printable(odd[0]), value)
     return Markup(shown) if isinstance(value, Markup) else shown
 
 
