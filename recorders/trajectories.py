@@ -161,7 +161,8 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         _refuse(bad, path, numbers, "has a matrix that is not a rotation; give an orthogonal one")
     else:
         quaternion = values[:, 4:]
-        norm = np.linalg.norm(quaternion, axis=1)
+        with np.errstate(over="ignore"):  # an infinite length is refused as any other
+            norm = np.linalg.norm(quaternion, axis=1)
         bad = np.abs(norm - 1) > TOLERANCE
         mend = (
             "scale it to 1"

@@ -22,7 +22,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("parts", nargs="*", help=f"any of {', '.join(PARTS)} [default: all]")
     parser.add_argument(
-        "--seconds", type=float, default=500, help="for all parts together, but for those that count"
+        "--seconds", type=float, default=350, help="for all parts together, but for those that count"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--most", type=int, help="how often each part tries at most")

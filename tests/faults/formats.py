@@ -51,8 +51,8 @@ class Format(NamedTuple):
 
 
 def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Tally:
-    """Mutate each format `MUTANTS` times, or `most`; it stops after ten times `seconds`."""
-    end = time.monotonic() + 10 * seconds
+    """Mutate each format `MUTANTS` times, or `most`; it stops after 15 times `seconds`."""
+    end = time.monotonic() + 15 * seconds
     seed = int(rng.integers(1 << 32))
     tried, notes = 0, []
     whole: dict[str, Format] = {}

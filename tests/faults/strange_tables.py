@@ -13,12 +13,12 @@ MOST = 2000
 
 
 def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Tally:
-    """Draw tables until the time is over, or there are `most`; the share that is read right is noted."""
-    end, most = time.monotonic() + seconds, most or MOST
+    """Draw `MOST` tables, or `most`, in at most twice `seconds`; note the share that is read right."""
+    end = time.monotonic() + 2 * seconds
     tried = right = 0
     notes = []
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder:
-        while time.monotonic() < end and tried < most:
+        while time.monotonic() < end and tried < (MOST if most is None else most):
             drawn = draw(Path(folder), rng)
             verdict, why = judge(drawn)
             drawn.path.unlink()

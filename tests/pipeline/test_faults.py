@@ -1,5 +1,7 @@
 """A slice of `make faults`: outputs, troubled files and cells, killed commands, mutants of formats."""
 
+import importlib
+import inspect
 import subprocess
 import sys
 
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.faults import campaigns, files, kills, outputs
+from tests.faults.__main__ import PARTS
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
@@ -16,6 +19,12 @@ def test_a_slice_of_the_faults_holds(part, most):
     tally = part.run(60.0, np.random.default_rng(1), most)
     assert tally.notes == []
     assert tally.held == tally.tried > 0
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_every_part_takes_what_make_faults_gives_it(part: str) -> None:
+    run = importlib.import_module(f"tests.faults.{part}").run
+    inspect.signature(run).bind(50.0, np.random.default_rng(1), None)
 
 
 def test_a_mutant_of_every_format_is_read_or_refused_in_a_sentence() -> None:

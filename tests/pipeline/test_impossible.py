@@ -109,6 +109,8 @@ def test_what_is_left_out_is_said_and_spoils_no_figure(
 def test_no_warning_of_numpy_reaches_standard_error(tmp_path: Path) -> None:
     rows = [f"{k} {1e200 * k} 0 0 0 0 1e200 1e200\n" for k in range(9)]
     (tmp_path / "line.tum").write_text("".join(rows))
+    with pytest.raises(fl.BadInput, match="not of unit length"):  # a warning is an error here
+        fl.read_trajectory(tmp_path / "line.tum")
     program = Path(sys.executable).with_name("fuselog")
     command = [program, "evaluate", "line.tum", "--truth", "line.tum"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

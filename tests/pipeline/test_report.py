@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.output import RESULT_FILE
 from pipeline.output.charts import (
     COLOURS,
     OUTSIDE_COLOUR,
@@ -599,12 +600,17 @@ def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figur
 
 
 @pytest.mark.parametrize("path", KEPT_RESULTS, ids=lambda path: path.stem)
-def test_results_that_are_kept_have_an_opening(path: Path) -> None:
+def test_results_that_are_kept_have_an_opening_and_a_page(path: Path, tmp_path: Path) -> None:
     """Those of all shipped experiments, whose data need not be here; they do not state their kind."""
-    values = parse_json(path.read_text(encoding="utf-8"))
-    opened = opening(build(Result, {**values, "files": {}}, str(path)), {})
+    values = {**parse_json(path.read_text(encoding="utf-8")), "files": {}}
+    opened = opening(build(Result, values, str(path)), {})
     assert opened.tried.endswith(".")
     assert opened.story.verdict
+    (tmp_path / RESULT_FILE).write_text(json.dumps(values), encoding="utf-8")
+    write_report([tmp_path], tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ": fuselog report</title>" in text
+    assert not re.search(r">\s*[+-]?(nan|inf|None)\s*<", text)
 
 
 def test_an_experiment_is_not_taken_for_a_command_by_its_name_or_tables(tmp_path: Path) -> None:
