@@ -36,7 +36,17 @@ def shifted(field: str, entry: int | None = None) -> Alteration:
 
 
 def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.float64]) -> Stream:
-    """Add a number to a field or to one entry of it: the same to n messages, or (n,)."""
+    """Add a number to a field, or to one entry of it.
+
+    Args:
+        field: a field of n messages.
+        entry: of a vector; None stands for all of it.
+        stream: the messages.
+        by: in the field's unit: one number, or (n,), one for each message.
+
+    Returns:
+        The altered stream.
+    """
     column = stream[field].copy()
     if entry is None:
         column += by if column.ndim == 1 or np.ndim(by) == 0 else np.reshape(by, (-1, 1))

@@ -100,7 +100,15 @@ class Coordinates:
 
 
 def coordinates_of(cost: Cost, free: Sequence[Free], about: Floats) -> Coordinates:
-    """Return the coordinates to search in, with units as the cost bends about values (k,).
+    """Return the coordinates to search in.
+
+    Args:
+        cost: what values (n, k) cost.
+        free: the k parameters.
+        about: (k,), the values about which the cost bends as their units say.
+
+    Returns:
+        The coordinates.
 
     Raises BadInput where the cost does not change with a parameter.
     """
@@ -190,9 +198,17 @@ def least(
 
 
 def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """Find a point (k,) from which no change of one parameter costs less, see `least`.
+    """Find a point from which no change of one parameter costs less, see `least`.
 
     Ends after `ITERATIONS` changes where the cost falls without an end.
+
+    Args:
+        cost: what values (n, k) cost.
+        coordinates: what is searched over.
+        start: (k,), in coordinates.
+
+    Returns:
+        The point (k,), in coordinates.
     """
     low, high = coordinates.bounds
     changes = np.concatenate(
