@@ -107,8 +107,11 @@ def worked_off(monkeypatch) -> list[int]:
 
 
 @pytest.mark.paper
-def test_cells_are_merged_into_what_one_pass_gives(whole):
+def test_cells_are_merged_into_what_one_pass_gives(whole, tmp_path, monkeypatch):
     folder, files = whole
+    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", RUNS)
+    one_pass = json.loads(run(tmp_path / "one")["result.json"])["metrics"]
+    assert json.loads(files["result.json"])["metrics"] == pytest.approx(one_pass, rel=1e-12)
     errors = pytest.importorskip("pandas").read_parquet(folder / "tables/errors/ekf-robot1.parquet")
     runs = errors.groupby("run").size()
     assert len(runs) == RUNS
