@@ -115,7 +115,8 @@ def tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tupl
         (tmp_path / "test_it.py").write_text(MODULE.format("{}", value, more))
         sys.modules.pop("test_it", None)
         keeping.kept.cache_clear()
-        own = ["-q", "-p", "no:cacheprovider", "-p", keeping.__name__, "--import-mode=importlib"]
+        plugins = ["no:cacheprovider", "no:unraisableexception", keeping.__name__]
+        own = ["-q", *(f"-p{name}" for name in plugins), "--import-mode=importlib"]
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
             patch.setattr(keeping, "SESSION", keeping.Session())
             code = pytest.main([*own, f"--rootdir={tmp_path}", str(tmp_path), *options])
