@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.deploying.c_source.braces import braced
 from pipeline.deploying.c_source.names import CFilter, filled
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Integers
@@ -180,7 +181,7 @@ def test_text(made: CFilter) -> str:
             "                has_pivots = has_pivots && filter.factor[i][i] > 0.0_S;\n"
         )
         kept, definite = "", "has_pivots"
-    return filled(
+    text = filled(
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
  * units of the number itself, or of one where that is larger. Returns 0 where that is within the first
@@ -209,7 +210,7 @@ static void compare(int event, REAL found, double expected)
     const double size = fabs(expected) > 1.0 ? fabs(expected) : 1.0;
     const double away = fabs((double)found - expected) / size;
     if (away > furthest || isnan(away)) {
-        furthest = isnan(away) ? INFINITY : away;
+        furthest = isnan(away) ? (double)INFINITY : away;
         furthest_event = event;
     }
 }
@@ -246,10 +247,11 @@ int main(int argc, char **argv)
     NAME_innovation innovation;
     int estimates = 0, updates = 0, messages = 0;
     unsigned long taken = 0, most = 0;
-    NAME_init(&filter, start_ns, prior_mean, prior_covariance);
+    if (NAME_init(&filter, start_ns, prior_mean, prior_covariance) != NAME_WELL)
+        return lost(0);
     for (int event = 0; event < VECTORS_EVENTS; event++) {
         const REAL *data = event_data[event];
-        int outcome;
+        NAME_outcome outcome;
         if (event_time_ns[event] < filter.time_ns)
             continue;
         const unsigned long begin = INSTRUCTIONS();
@@ -263,7 +265,7 @@ CASES        }
         most = step > most ? step : most;
         messages++;
         updates += event_source[event] >= 0;
-        if (outcome == NAME_NOT_POSITIVE_DEFINITE)
+        if (outcome == NAME_NOT_POSITIVE_DEFINITE || outcome == NAME_NOT_FINITE)
             return lost(event);
         if (event_estimate[event] >= 0) {
             estimates++;
@@ -297,3 +299,4 @@ KEPT                    fuselogs[row][column] =
         .replace("PREDICT", predict)
         .replace("CASES", "".join(cases)),
     )
+    return braced(text)

@@ -122,7 +122,7 @@ void NAME_covariance(const NAME *filter, REAL covariance[T][T])
 """
 
 START = """\
-    for (int column = 0; column < T; column++) /* by Cholesky; NAN where there is none */
+    for (int column = 0; column < T; column++) /* by Cholesky */
         for (int row = 0; row < T; row++) {
             REAL entry = covariance[row * T + column];
             for (int k = 0; k < column; k++)
@@ -131,8 +131,10 @@ START = """\
                 entry = 0.0_S;
             else if (row > column)
                 entry /= filter->factor[column][column];
+            else if (entry > 0.0_S)
+                entry = sqrt_S(entry);
             else
-                entry = entry > 0.0_S ? sqrt_S(entry) : NAN;
+                outcome = NAME_NOT_POSITIVE_DEFINITE;
             filter->factor[row][column] = entry;
         }
 """

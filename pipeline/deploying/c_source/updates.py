@@ -85,7 +85,17 @@ def update_text(made: CFilter, number: int) -> str:
     places = [made.innovation.index(each) for each in sensor.measured]
     missing = " && ".join(f"isnan(data[{index}])" for index in range(m))
     begin = [f"static const int places[] = {{{', '.join(map(str, places))}}};"]
-    given = [f"if ({missing})", "    return NAME_NOTHING_MEASURED;"]
+    references = sensor.reference_size
+    usable = f"is_usable(data, {m}, {references})"
+    if sensor.covariance:
+        usable += f" || !is_noise_usable(data, {m}, data + {m + references})"
+    given = [
+        "forget(innovation);",
+        f"if ({missing})",
+        "    return NAME_NOTHING_MEASURED;",
+        f"if (!{usable})",
+        "    return NAME_BAD_INPUT;",
+    ]
     head = f"{update_signature(name)}\n{{\n"
     gate = f"&parameters->{name}.gate, innovation"
     if made.steps.is_iterated:
@@ -101,7 +111,7 @@ def update_text(made: CFilter, number: int) -> str:
             f"    outcome = iterate(filter, NAME_SENSOR_{name.upper()}, {m}, iteration,",
             f"                      v, S, C, step, slope, &factor, {gate});",
             "}",
-            "return outcome;",
+            "return finished(filter, outcome, innovation);",
         ]
         own = _bending(made, filled(made, head + body([*begin, *calls]) + "}\n"))
         return _linearise(made, name, body([*loops.declared, *lines])) + own
@@ -111,16 +121,18 @@ def update_text(made: CFilter, number: int) -> str:
         begin.append("REAL v[M], noise[M][M] = {{0}};")
         begin.append("factorisation found;")
         end = [
-            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places, v, noise,",
-            f"              &found, {gate});",
+            f"outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places, v, noise,",
+            f"                 &found, {gate});",
         ]
     else:
         begin.append("REAL v[M], S[M][M], C[T][M];")
         end = [
             f"keep(innovation, {m}, places, v, S);",
-            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
-            f"              {gate});",
+            f"outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
+            f"                 {gate});",
         ]
+    begin.append("int outcome;")
+    end.append("return finished(filter, outcome, innovation);")
     return filled(made, head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n")
 
 
