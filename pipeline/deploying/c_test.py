@@ -128,7 +128,7 @@ def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEven
 
 
 def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
-    """Put behind the last message of every sensor with a gate a copy that is far from what is measured."""
+    """Add to the last message of every sensor with a gate a copy that is far from what is measured."""
     source, data = events.source, events.data
     rows, far = [np.arange(len(source))], [data]
     for number, sensor in enumerate(filtering.stage.sensors):
@@ -153,8 +153,8 @@ def vectors_text(made: CFilter, vectors: Vectors) -> str:
     place = {row: index for index, row in enumerate(rows)}
     judged = [place.get(row, -1) for row in vectors.judged]
     lines = [
-        "/* A recorded log as the filter takes it, with outliers for its gates, and what fuselog's own",
-        " * filter made of it: whether it accepted a measurement (-1: nothing was measured), and estimates. */",
+        "/* A recorded log as the filter takes it, with outliers for its gates, and what fuselog's",
+        " * own filter made of it: whether it accepted a measurement (-1: none was), and more. */",
         f"#define VECTORS_EVENTS {count}",
         f"#define VECTORS_WIDTH {width}\n",
         f"static const int64_t start_ns = {vectors.start_ns};",

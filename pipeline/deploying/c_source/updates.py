@@ -121,17 +121,16 @@ def update_text(made: CFilter, number: int) -> str:
         begin.append("REAL v[M], noise[M][M] = {{0}};")
         begin.append("factorisation found;")
         end = [
-            f"outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places, v, noise,",
-            f"                 &found, {gate});",
+            f"const int outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places,",
+            f"                           v, noise, &found, {gate});",
         ]
     else:
         begin.append("REAL v[M], S[M][M], C[T][M];")
         end = [
             f"keep(innovation, {m}, places, v, S);",
-            f"outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
-            f"                 {gate});",
+            f"const int outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
+            f"                           {gate});",
         ]
-    begin.append("int outcome;")
     end.append("return finished(filter, outcome, innovation);")
     return filled(made, head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n")
 
