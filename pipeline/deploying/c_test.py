@@ -208,13 +208,13 @@ NIS_            if (outcome != NAME_WELL || innovation.is_accepted != event_acce
         }
 """
 _SHOWN = """\
-    int shown = 1;
+    int shown = 0;
     for (int sensor = 0; sensor < NAME_SENSORS; sensor++) {
         printf("%s: %d accepted, %d rejected%s\\n", sensors[sensor], accepted[sensor], rejected[sensor],
                accepted[sensor] == 0                     ? ": the log does not show it"
                : gated[sensor] && rejected[sensor] == 0 ? ": the log does not show its gate"
                                                          : "");
-        shown = shown && accepted[sensor] > 0;
+        shown += accepted[sensor];
     }
 """
 
@@ -271,8 +271,8 @@ def test_text(made: CFilter) -> str:
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
  * units of the number itself, or of one where that is larger, and what was accepted and rejected.
- * Returns 0 if that is within the first argument, which is 0 unless given, there are estimates, and
- * every sensor has a measurement that was accepted. */
+ * Returns 0 if that is within the first argument, which is 0 unless given, and there are estimates and
+ * accepted measurements. */
 #include "NAME.h"
 
 #include <math.h>
@@ -377,7 +377,7 @@ KEPT                    fuselogs[row][column] =
         lost(lost_event);
     if (messages > 0 && most > 0)
         printf("%lu instructions for a message, at most %lu\\n", taken / (unsigned long)messages, most);
-SHOWN    return furthest <= limit && lost_event < 0 && estimates > 0 && shown ? 0 : 1;
+SHOWN    return furthest <= limit && lost_event < 0 && estimates > 0 && shown > 0 ? 0 : 1;
 }
 """.replace("GAP", gap)
         .replace("SENSORS\n", _COUNTS.replace("LISTED", names).replace("GATES", gates) if names else "")

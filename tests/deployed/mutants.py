@@ -13,9 +13,9 @@ _FUNCTION = re.compile(r"^(?:static )?\w+ (\w+)\([^{};]*\)\n\{\n(.*?)^\}", re.DO
 _OPERATOR = re.compile(r"(?<= )[-+*/<>](?= |= )|(?<=[ (])-(?=\w)")
 
 
-# What a log of the robot cannot show: half a turn more or less before a modulo, guards of a range of zero, a
-# covariance of components that is zero in it, and in the derivative of sinc terms below rounding, and the
-# side of large angles.
+# What a log of the robot cannot show: half a turn more or less before a modulo, guards of a range of
+# zero, a covariance of components that is zero in it, and in the derivative of sinc terms below rounding
+# and the side of large angles.
 _SAME = re.compile(
     r"modulo\(v\d [-+]|INFINITY [*/]|[-+] v4 [-+]|[-+] \(v2 <= 0\.0|[-+]= noise_1_0;"
     r"|/ 28\.0 \* \(1\.0 - v10 \* v10 / 54\.0|\(cos\(v10\) - v5\) / v4"
