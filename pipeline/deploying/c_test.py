@@ -116,7 +116,8 @@ def _handed(source: LogSource, bound: Recursive, filtering: Filter) -> tuple[Fil
 
 
 def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
-    return FilterEvents(np.array([0, len(rows)]), *(column[rows] for column in events[1:]))
+    columns: list[Any] = [column[rows] for column in events[1:]]
+    return FilterEvents(np.array([0, len(rows)]), *columns)
 
 
 def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:

@@ -121,17 +121,15 @@ def _loop(made: CFilter) -> str:
         f"while (outcome != {upper}_NOT_POSITIVE_DEFINITE && outcome != {upper}_NOT_FINITE) {{",
         "    /* wait for the next message, in the order of the stamps */",
         f"    outcome = {name}_predict(&filter, message.time_ns{control}, &{name}_as_tuned);",
-        f"    if (outcome != {upper}_WELL) {{",
-        "        continue; /* see the table: nothing to update */",
-        "    }",
     ]
     if driven:
-        lines += ["    if (message.is_control) {", *(f"        {each}" for each in driven), "    }"]
+        lines.append("    if (message.is_control) { /* it drives the filter from here on */")
+        lines += [*(f"        {each}" for each in driven), "    }"]
     for each, _ in made.sensors[:1]:
         lines += [
-            f"    if (message.is_{each}) {{",
+            f"    if (outcome == {upper}_WELL && message.is_{each}) {{ /* and so for each sensor */",
             f"        outcome = {name}_update_{each}(&filter, message.data, &{name}_as_tuned,",
-            "                                    &innovation);",
+            "            &innovation);",
             "    }",
         ]
     return "\n".join([*lines, "}"])
@@ -190,10 +188,10 @@ cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
 
 It runs over the first messages of {log} from the filter's start on, with an outlier for every gate. It
 fails without estimates or accepted measurements, and prints how many measurements of each sensor were
-accepted and rejected, and which sensor or gate the log does not show. It prints how far it is from fuselog's own filter: nothing at
-all with the same libm, in double precision and without fused multiply-adds, which
-`-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and
-qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how many instructions a message
+accepted and rejected, and which sensor or gate the log does not show. It also prints how far it
+is from fuselog's own filter: nothing at all with the same libm, in double precision and without fused
+multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
+libnewlib-arm-none-eabi and qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how many instructions a message
 takes as well. QEMU knows no cycles.
 
 ```
