@@ -191,8 +191,8 @@ fails without estimates or accepted measurements, and prints how many measuremen
 accepted and rejected, and which sensor or gate the log does not show. It also prints how far it
 is from fuselog's own filter: nothing at all with the same libm, in double precision and without fused
 multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
-libnewlib-arm-none-eabi and qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how many instructions a message
-takes as well. QEMU knows no cycles.
+libnewlib-arm-none-eabi and qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how
+many instructions a message takes as well. QEMU knows no cycles.
 
 ```
 {chr(10).join(target_lines(name, argument="0.01" if made.precision.ending else "1e-12"))}
