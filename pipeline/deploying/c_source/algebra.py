@@ -96,7 +96,8 @@ static NAME_outcome finished(const NAME *filter, int outcome, NAME_innovation *i
 }
 
 /* Keeps an innovation for whoever looks at it: each component that is not missing at its place. */
-static void keep(NAME_innovation *innovation, int components, const int *places, REAL v[M], REAL S[M][M])
+static void keep(NAME_innovation *innovation, int components, const int *places, const REAL v[M],
+                 const REAL S[M][M])
 {
     for (int i = 0; i < components; i++) {
         if (isnan(v[i]))
@@ -175,7 +176,7 @@ static void find_step(int size, REAL v[M], REAL S[M][M], REAL C[T][M], REAL step
 }
 
 /* P - W W'. */
-static void downdate(REAL P[T][T], int size, REAL W[T][M])
+static void downdate(REAL P[T][T], int size, const REAL W[T][M])
 {
     for (int row = 0; row < T; row++)
         for (int column = 0; column <= row; column++) {
@@ -202,7 +203,7 @@ static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M]
         return NAME_WELL;
     inflate(size, v, S, inflation(innovation->nis, size, gate));
     find_step(size, v, S, C, step);
-    downdate(filter->covariance, size, C);
+    downdate(filter->covariance, size, (const REAL(*)[M])C);
     FIND_SLOPE;
     correct(filter, step, slope);
     return NAME_WELL;
@@ -237,7 +238,7 @@ static int iterate(NAME *filter, int sensor, int components, int iteration, REAL
             change = fabs_S(step[row] - before[row]);
     if (change >= LEAST_CHANGE && iteration + 1 < ITERATIONS)
         return UNSETTLED;
-    downdate(filter->covariance, size, C);
+    downdate(filter->covariance, size, (const REAL(*)[M])C);
     correct(filter, step, slope);
     return NAME_WELL;
 }

@@ -141,7 +141,7 @@ START = """\
 
 CARRYING = """\
 /* Rows become J L, of a Jacobian J and the state's factor L. */
-static void carry(const NAME *filter, REAL (*J)[T], const signed char (*columns)[T + 1], int size,
+static void carry(const NAME *filter, const REAL (*J)[T], const signed char (*columns)[T + 1], int size,
                   factorisation *found)
 {
     for (int k = 0; k < T; k++) {
@@ -216,7 +216,7 @@ static int update(NAME *filter, int sensor, int components, int columns, const i
     if (!factorise(found, components + T, columns, components, &noise[0][0], M))
         return NAME_NOT_POSITIVE_DEFINITE;
     square(&found->factor[0][0], ROWS, components, &S[0][0], M);
-    keep(innovation, components, places, v, S);
+    keep(innovation, components, places, v, (const REAL(*)[M])S);
     for (int i = 0; i < components; i++) {
         if (!(found->factor[i][i] > 0.0_S))
             return NAME_NOT_POSITIVE_DEFINITE;

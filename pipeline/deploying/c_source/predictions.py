@@ -92,9 +92,9 @@ def _step(made: CFilter) -> str:
     into = "noise" if made.is_root else "P"
     if sampled is None:
         call = (
-            f"carry(filter, F, columns_of_F, {t}, &found);"
+            f"carry(filter, (const REAL(*)[T])F, columns_of_F, {t}, &found);"
             if made.is_root
-            else "propagate(P, F, columns_of_F); /* P = F P F' */"
+            else "propagate(P, (const REAL(*)[T])F, columns_of_F); /* P = F P F' */"
         )
         loops, first, columns = jacobian_loops(step, "F", t, call, into, "states"), [], t
     else:

@@ -35,13 +35,15 @@ def correcting_text(made: CFilter) -> list[str]:
         text += "static void bend(NAME *filter, REAL slope[T])\n{\n"
         text += body([*declared, "REAL a[T];"])
         text += body(c_lines(entries(direction, "a"), names, made.precision))
-        texts.append(filled(made, text + f"    find_slope(filter->{carried}, a, slope);\n}}\n"))
+        texts.append(
+            filled(made, text + f"    find_slope((const REAL(*)[T])filter->{carried}, a, slope);\n}}\n")
+        )
     names, declared = Inputs(made, "").names(step, "step", "slope")
     named, assigned = moved_state(made, step)
     if step.has("F"):
-        t, call = made.tangent, f"propagate(filter->{carried}, F, columns_of_F);"
+        t, call = made.tangent, f"propagate(filter->{carried}, (const REAL(*)[T])F, columns_of_F);"
         if made.is_root:
-            call = f"carry(filter, F, columns_of_F, {t}, &found);"
+            call = f"carry(filter, (const REAL(*)[T])F, columns_of_F, {t}, &found);"
             declared = ["factorisation found;", *declared]
             assigned = [f"orthogonalise(&found, {t}, {t});", "take_factor(filter, &found);", *assigned]
         loops = jacobian_loops(step, "F", t, call, "P", "states")
@@ -55,7 +57,7 @@ def correcting_text(made: CFilter) -> list[str]:
         "static void correct(NAME *filter, const REAL step[T], const REAL slope[T])\n{\n"
     )
     lines = c_lines(named, names, made.precision)
-    text = filled(made, head + body(declared)) + body(lines) + body(assigned) + "}\n"
+    text = filled(made, head + body(declared) + body(lines) + body(assigned)) + "}\n"
     return [*texts, _bending(made, text)]
 
 
@@ -107,7 +109,7 @@ def update_text(made: CFilter, number: int) -> str:
             "FIND_SLOPE;",
             "for (int iteration = 0; outcome == UNSETTLED; iteration++) {",
             f"    linearise_{name}(filter, step, slope, data, parameters, v, S, C);",
-            f"    keep(innovation, {m}, places, v, S);",
+            f"    keep(innovation, {m}, places, v, (const REAL(*)[M])S);",
             f"    outcome = iterate(filter, NAME_SENSOR_{name.upper()}, {m}, iteration,",
             f"                      v, S, C, step, slope, &factor, {gate});",
             "}",
@@ -127,7 +129,7 @@ def update_text(made: CFilter, number: int) -> str:
     else:
         begin.append("REAL v[M], S[M][M], C[T][M];")
         end = [
-            f"keep(innovation, {m}, places, v, S);",
+            f"keep(innovation, {m}, places, v, (const REAL(*)[M])S);",
             f"const int outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
             f"                           {gate});",
         ]
@@ -144,9 +146,10 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
     if sampled is None:
         names, declared = Inputs(made, name).names(step, "data", "", "step", "slope")
         call = (
-            f"carry(filter, H, columns_of_H, {m}, &found);"
+            f"carry(filter, (const REAL(*)[T])H, columns_of_H, {m}, &found);"
             if made.is_root
-            else f"measure(filter->covariance, H, columns_of_H, {m}, C, S); /* C = P H', S = H C */"
+            else f"measure((const REAL(*)[T])filter->covariance, (const REAL(*)[T])H, columns_of_H, {m},"
+            " C, S); /* C = P H', S = H C */"
         )
         loops = jacobian_loops(step, "H", m, call, into, "components")
         if made.is_root:
