@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+from pipeline.deploying.c_source.braces import braced
 from pipeline.deploying.c_source.names import CFilter, filled, identifier
 from recorders.parameters import unit_of
 from replay.inference.model.model import Map, Sensor
@@ -130,8 +131,7 @@ def replay_text(made: CFilter) -> str:
         )
         topic += 1
     cases.append(
-        "    if (fuselog_filter_predict(filter, time_ns) != FUSELOG_FILTER_WELL)\n"
-        "        return NOT_POSITIVE_DEFINITE;\n"
+        "    if (fuselog_filter_predict(filter, time_ns) != FUSELOG_FILTER_WELL)\n        return LOST;\n"
     )
     if made.controls:
         cases.append(
@@ -182,7 +182,7 @@ static double wrapped(double angle)
 #include "NAME.h"
 
 {"enum { MOST_POINTS = 4096 };" if maps else ""}
-enum {{ NEEDS_PRIOR = 1, NOT_POSITIVE_DEFINITE, NO_ROOM }};
+enum {{ NEEDS_PRIOR = 1, LOST, NO_ROOM, BAD_PRIOR }};
 
 typedef struct {{
     NAME filter;
@@ -240,21 +240,21 @@ int32_t fuselog_filter_start(void *filter, int64_t time_ns, const double *mean, 
         return NEEDS_PRIOR;
     take(state, mean, NAME_STATES);
     take(spread, covariance, NAME_TANGENT * NAME_TANGENT);
-    NAME_init(&own->filter, time_ns, state, spread);
-    return FUSELOG_FILTER_WELL;
+    return NAME_init(&own->filter, time_ns, state, spread) == NAME_WELL ? FUSELOG_FILTER_WELL
+                                                                          : BAD_PRIOR;
 }}
 
 int32_t fuselog_filter_predict(void *filter, int64_t time_ns)
 {{
     Own *own = filter;
-    const int outcome = NAME_predict(&own->filter, time_ns, &own->parameters);
-    return outcome == NAME_WELL ? FUSELOG_FILTER_WELL : NOT_POSITIVE_DEFINITE;
+    const NAME_outcome outcome = NAME_predict(&own->filter, time_ns, &own->parameters);
+    return outcome == NAME_WELL || outcome == NAME_BACKWARD ? FUSELOG_FILTER_WELL : LOST;
 }}
 
-static int32_t told(Own *own, int outcome)
+static int32_t told(Own *own, NAME_outcome outcome)
 {{
-    if (outcome == NAME_NOT_POSITIVE_DEFINITE)
-        return NOT_POSITIVE_DEFINITE;
+    if (outcome == NAME_NOT_POSITIVE_DEFINITE || outcome == NAME_NOT_FINITE)
+        return LOST;
     if (outcome == NAME_WELL)
         own->outcome = own->innovation.is_accepted ? FUSELOG_FILTER_WELL : FUSELOG_FILTER_REJECTED;
     return FUSELOG_FILTER_WELL;
@@ -292,7 +292,7 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
         else spread.replace("WHOSE", "own->filter.covariance")
     )
     text = filled(made, text.replace("COVARIANCE", covariance))
-    return text.replace("DESCRIPTION", _literal(_description(made)))
+    return braced(text).replace("DESCRIPTION", _literal(_description(made)))
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
@@ -306,7 +306,8 @@ def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
         number = [one.topic for one in maps].index(each.topic)
         lines.append("int at = 0;" if each is sensor.maps[0] else "at = 0;")
         where = ids.index(each.of)
-        lines.append(f"while (at < own->points{number} && own->point{number}[at][0] != fields[{where}])")
+        is_it = f"fabs(own->point{number}[at][0] - fields[{where}]) <= 0.0"
+        lines.append(f"while (at < own->points{number} && !({is_it}))")
         lines.append("    at++;")
         lines.append(f"if (at == own->points{number})")
         lines.append("    return FUSELOG_FILTER_WELL; /* an unknown one says nothing */")

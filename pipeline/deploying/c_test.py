@@ -1,11 +1,13 @@
 """Makes a recorded log a test of a filter in C: what it is handed, and what ours makes of it."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.deploying.c_source.braces import braced
 from pipeline.deploying.c_source.names import CFilter, filled
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Integers
@@ -13,19 +15,22 @@ from replay.engine.replaying.estimator import Recursive
 from replay.engine.replaying.replaying import replay
 from replay.engine.streams.sources import LogSource
 from replay.inference.kalman.update import message_layout
-from replay.inference.run.filtering import Filter
-from replay.inference.run.recursion import CONTROL
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import CONTROL, FilterEvents
 
-MOST_EVENTS = 400
+MOST_EVENTS = 400  # more only until every sensor has a message
+FAR = 1e4  # how far outliers are from what was measured, in units of it and one
 
 
 class Vectors(NamedTuple):
-    """Holds a log as a filter takes it, and the estimates that it gives.
+    """Holds a log as a filter takes it, and what the filter makes of it.
 
     Attributes:
         start_ns, mean, covariance: the prior.
         time_ns, source, data: of the events (n,), (n,), (n, width).
-        means, covariances: after the events that are `judged` (n,).
+        accepted, nis: of the measurements (n,), -1 and NaN where nothing is measured.
+        judged: (n,) rows of the estimates after events, -1 where there is none.
+        means, covariances: the estimates.
     """
 
     start_ns: int
@@ -34,33 +39,69 @@ class Vectors(NamedTuple):
     time_ns: Integers
     source: Integers
     data: Floats
+    accepted: Integers
+    nis: Floats
     judged: Integers
     means: Floats
     covariances: Floats
 
 
 def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vectors:
-    """Replay a log, and keep what the filter was handed and gave.
+    """Run a filter over the first messages of a log from its start on, and outliers among them.
 
-    Raises BadInput where the log has no prior for it.
+    Raises BadInput if the filter does not start in the log, estimates nothing, or accepts nothing.
     """
-    handed: list[Any] = []
-    given: list[Any] = []
-    begun: list[Any] = []
+    start, events = _handed(source, bound, filtering)
+    first, sensors = start.carried, filtering.stage.sensors
+    events = _with_outliers(filtering, _from_start(events, int(first.time_ns[0]), len(sensors)))
+    count, time_ns = len(events.time_ns), events.time_ns
+    last = np.append(np.diff(time_ns) > 0, True)
+    events = events._replace(wants_estimate=last, target_id=np.arange(count, dtype=np.uint32))
+    _, (given, _), made = filtering.filtered(start, events)
+    accepted, nis = np.full(count, -1), np.full(count, np.nan)
+    if sensors:
+        innovations = made[0].stream
+        at = innovations["target_id"]
+        accepted[at] = innovations["accepted"]
+        nis[at] = innovations["normalised_innovation_squared"]
+    rows = np.searchsorted(given.time_ns, time_ns).clip(max=max(len(given.time_ns) - 1, 0))
+    if not len(given.time_ns) or (sensors and not (accepted > 0).any()):
+        raise BadInput(
+            f"{source.name}: the filter accepts no measurement after its start, so that its C would not "
+            "be tested; give a log with messages of its sensors that it accepts"
+        )
+    covariance = first.belief.covariance[0].copy()
+    filtering.form.to_covariance(covariance)
+    return Vectors(
+        int(first.time_ns[0]),
+        first.belief.mean[0],
+        covariance,
+        time_ns,
+        events.source,
+        events.data,
+        accepted,
+        nis,
+        np.where(last & (given.time_ns[rows] == time_ns), rows, -1),
+        given.mean,
+        given.covariance,
+    )
+
+
+def _handed(source: LogSource, bound: Recursive, filtering: Filter) -> tuple[FilterState, FilterEvents]:
+    """Replay a log: the filter's first state, and the events that it was handed."""
+    handed: list[FilterEvents] = []
+    begun: list[FilterState] = []
 
     class Listening(Filter):
-        """Filters, and keeps what it is handed and what it gives."""
+        """Filters, and keeps what it is handed."""
 
         def filtered(self, state: Any, events: Any) -> Any:
-            found = super().filtered(state, events)
             handed.append(events)
-            given.append(found[1][0])
-            return found
+            return super().filtered(state, events)
 
     def start(static: Any) -> Any:
-        state = bound.start(static)
-        begun.append(state.carried)
-        return state
+        begun.append(bound.start(static))
+        return begun[-1]
 
     listening = Listening(*(getattr(filtering, each.name) for each in fields(Filter)))
     heard = replace(bound, start=start, run=listening.run, finish=listening.finish)
@@ -70,29 +111,39 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
         raise BadInput(
             f"{source.name}: has nothing that the filter starts from; give a log with a prior"
         )
-    time_ns, sources, data = (
-        np.concatenate([getattr(each, name) for each in handed])
-        for name in ("time_ns", "source", "data")
-    )
-    stamps = np.concatenate([each.time_ns for each in given])
-    chosen = slice(0, MOST_EVENTS)
-    last = np.append(np.diff(time_ns) > 0, True)
-    rows = np.searchsorted(stamps, time_ns).clip(max=max(len(stamps) - 1, 0))
-    is_there = last & (stamps[rows] == time_ns)
-    first = begun[0]
-    covariance = first.belief.covariance[0].copy()
-    filtering.form.to_covariance(covariance)
-    return Vectors(
-        int(first.time_ns[0]),
-        first.belief.mean[0],
-        covariance,
-        time_ns[chosen],
-        sources[chosen],
-        data[chosen],
-        np.where(is_there, rows, -1)[chosen],
-        np.concatenate([each.mean for each in given]),
-        np.concatenate([each.covariance for each in given]),
-    )
+    columns = [np.concatenate(each) for each in zip(*(each[1:] for each in handed), strict=True)]
+    return begun[0], FilterEvents(np.array([0, len(columns[0])]), *columns)
+
+
+def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
+    columns: list[Any] = [column[rows] for column in events[1:]]
+    return FilterEvents(np.array([0, len(rows)]), *columns)
+
+
+def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:
+    """Take the first events from the start on, and more until every sensor has a message."""
+    rows = np.flatnonzero(events.time_ns >= start_ns)
+    found = [np.flatnonzero(events.source[rows] == sensor) for sensor in range(sensors)]
+    until = max([MOST_EVENTS, *(int(each[0]) + 1 for each in found if len(each))])
+    return _rows(events, rows[:until])
+
+
+def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
+    """Add to the last message of every sensor with a gate a copy that is far from what is measured."""
+    source, data = events.source, events.data
+    rows, far = [np.arange(len(source))], [data]
+    for number, sensor in enumerate(filtering.stage.sensors):
+        m = len(sensor.measured)
+        own = np.flatnonzero((source == number) & ~np.isnan(data[:, :m]).all(axis=1))
+        if len(own) and np.isfinite(filtering.gates[number, 1]):
+            outlier = data[own[-1:]].copy()
+            angular = np.array([kind == "angle" for kind in sensor.measured.values()])
+            outlier[0, :m] += np.where(angular, 0.5 * np.pi, FAR * (1.0 + abs(outlier[0, :m])))
+            rows.append(own[-1:])
+            far.append(outlier)
+    place = np.concatenate(rows)
+    order = np.argsort(place, kind="stable")
+    return _rows(events, place[order])._replace(data=np.concatenate(far)[order])
 
 
 def vectors_text(made: CFilter, vectors: Vectors) -> str:
@@ -103,7 +154,8 @@ def vectors_text(made: CFilter, vectors: Vectors) -> str:
     place = {row: index for index, row in enumerate(rows)}
     judged = [place.get(row, -1) for row in vectors.judged]
     lines = [
-        "/* A recorded log as the filter takes it, and what fuselog's own filter made of it. */",
+        "/* A recorded log as the filter takes it, with outliers for its gates, and what fuselog's",
+        " * own filter made of it: whether it accepted a measurement (-1: none was), and more. */",
         f"#define VECTORS_EVENTS {count}",
         f"#define VECTORS_WIDTH {width}\n",
         f"static const int64_t start_ns = {vectors.start_ns};",
@@ -112,6 +164,8 @@ def vectors_text(made: CFilter, vectors: Vectors) -> str:
         *_whole("int64_t", "event_time_ns", vectors.time_ns),
         *_whole("int", "event_source", vectors.source),
         *_whole("int", "event_estimate", judged),
+        *_whole("int", "event_accepted", vectors.accepted),
+        *([] if made.precision.ending else _array(made, "event_nis", vectors.nis, "[]")),
         *_array(made, "event_data", vectors.data, "[][VECTORS_WIDTH]"),
         *_array(made, "expected_mean", vectors.means[rows], f"[][{upper}_STATES]"),
         *_array(
@@ -139,6 +193,31 @@ def _whole(kind: str, name: str, values: Sequence[Any] | Integers) -> Iterator[s
     for first in range(0, len(values), 8):
         yield "    " + ", ".join(str(int(each)) for each in values[first : first + 8]) + ","
     yield "};"
+
+
+_COUNTS = """static const char *const sensors[] = {LISTED};
+static const int gated[] = {GATES};
+static int accepted[NAME_SENSORS], rejected[NAME_SENSORS];
+
+"""
+_JUDGED = """\
+        if (event_accepted[event] >= 0) {
+            int *const count = innovation.is_accepted ? accepted : rejected;
+            count[event_source[event]]++;
+NIS_            if (outcome != NAME_WELL || innovation.is_accepted != event_accepted[event])
+                compare(event, (REAL)NAN, 0.0);
+        }
+"""
+_SHOWN = """\
+    int shown = 0;
+    for (int sensor = 0; sensor < NAME_SENSORS; sensor++) {
+        printf("%s: %d accepted, %d rejected%s\\n", sensors[sensor], accepted[sensor], rejected[sensor],
+               accepted[sensor] == 0                     ? ": the log does not show it"
+               : gated[sensor] && rejected[sensor] == 0 ? ": the log does not show its gate"
+                                                         : "");
+        shown += accepted[sensor];
+    }
+"""
 
 
 def test_text(made: CFilter) -> str:
@@ -180,11 +259,21 @@ def test_text(made: CFilter) -> str:
             "                has_pivots = has_pivots && filter.factor[i][i] > 0.0_S;\n"
         )
         kept, definite = "", "has_pivots"
-    return filled(
+    nis = (
+        ""
+        if made.precision.ending
+        else "            compare(event, innovation.nis, event_nis[event]);\n"
+    )
+    gates = ", ".join(
+        str(int(math.isfinite(made.filtering.gates[number, 1]))) for number in range(len(made.sensors))
+    )
+    names = ", ".join(f'"{name}"' for name, _ in made.sensors)
+    text = filled(
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
- * units of the number itself, or of one where that is larger. Returns 0 where that is within the first
- * argument, which is 0 unless given. */
+ * units of the number itself, or of one where that is larger, and what was accepted and rejected.
+ * Returns 0 if that is within the first argument, which is 0 unless given, and there are estimates and
+ * accepted measurements. */
 #include "NAME.h"
 
 #include <math.h>
@@ -209,11 +298,12 @@ static void compare(int event, REAL found, double expected)
     const double size = fabs(expected) > 1.0 ? fabs(expected) : 1.0;
     const double away = fabs((double)found - expected) / size;
     if (away > furthest || isnan(away)) {
-        furthest = isnan(away) ? INFINITY : away;
+        furthest = isnan(away) ? (double)INFINITY : away;
         furthest_event = event;
     }
 }
 
+SENSORS
 /* Whether a covariance, which is used up, is positive definite: whether it has a Cholesky factor. */
 static int is_definite(double A[NAME_TANGENT][NAME_TANGENT])
 {
@@ -246,10 +336,11 @@ int main(int argc, char **argv)
     NAME_innovation innovation;
     int estimates = 0, updates = 0, messages = 0;
     unsigned long taken = 0, most = 0;
-    NAME_init(&filter, start_ns, prior_mean, prior_covariance);
+    if (NAME_init(&filter, start_ns, prior_mean, prior_covariance) != NAME_WELL)
+        return lost(0);
     for (int event = 0; event < VECTORS_EVENTS; event++) {
         const REAL *data = event_data[event];
-        int outcome;
+        NAME_outcome outcome;
         if (event_time_ns[event] < filter.time_ns)
             continue;
         const unsigned long begin = INSTRUCTIONS();
@@ -263,7 +354,7 @@ CASES        }
         most = step > most ? step : most;
         messages++;
         updates += event_source[event] >= 0;
-        if (outcome == NAME_NOT_POSITIVE_DEFINITE)
+JUDGED        if (outcome == NAME_NOT_POSITIVE_DEFINITE || outcome == NAME_NOT_FINITE)
             return lost(event);
         if (event_estimate[event] >= 0) {
             estimates++;
@@ -287,9 +378,12 @@ KEPT                    fuselogs[row][column] =
         lost(lost_event);
     if (messages > 0 && most > 0)
         printf("%lu instructions for a message, at most %lu\\n", taken / (unsigned long)messages, most);
-    return furthest <= limit && lost_event < 0 ? 0 : 1;
+SHOWN    return furthest <= limit && lost_event < 0 && estimates > 0 && shown > 0 ? 0 : 1;
 }
 """.replace("GAP", gap)
+        .replace("SENSORS\n", _COUNTS.replace("LISTED", names).replace("GATES", gates) if names else "")
+        .replace("JUDGED", _JUDGED.replace("NIS_", nis) if names else "")
+        .replace("SHOWN", _SHOWN if names else "    const int shown = 1;\n")
         .replace("COVARIANCE", factor)
         .replace("KEPT", kept)
         .replace("WHETHER", definite)
@@ -297,3 +391,4 @@ KEPT                    fuselogs[row][column] =
         .replace("PREDICT", predict)
         .replace("CASES", "".join(cases)),
     )
+    return braced(text)

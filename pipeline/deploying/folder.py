@@ -5,8 +5,8 @@ from textwrap import fill
 from typing import Any
 
 from pipeline.deploying.c_replay import why_no_replay
-from pipeline.deploying.c_source.header import data_of
-from pipeline.deploying.c_source.names import CFilter
+from pipeline.deploying.c_source.header import data_of, outcomes
+from pipeline.deploying.c_source.names import CFilter, identifier
 from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import OPTIONS, Certificate
 from pipeline.deploying.costs import Cost
@@ -106,19 +106,43 @@ def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
     )
 
 
+def _loop(made: CFilter) -> str:
+    """Write a loop over messages: control, prediction, update, and what becomes of the outcomes."""
+    name, upper = made.name, made.name.upper()
+    driven = [
+        f"filter.control[{upper}_CONTROL_{identifier(each).upper()}] = message.{identifier(each)};"
+        for each in (() if made.is_interpolated else made.controls)
+    ]
+    control = ", message.control" if made.is_interpolated else ""
+    lines = [
+        f"{name} filter;",
+        f"{name}_innovation innovation;",
+        f"{name}_outcome outcome = {name}_init(&filter, time_ns, mean, covariance);",
+        f"while (outcome != {upper}_NOT_POSITIVE_DEFINITE && outcome != {upper}_NOT_FINITE) {{",
+        "    /* wait for the next message, in the order of the stamps */",
+        f"    outcome = {name}_predict(&filter, message.time_ns{control}, &{name}_as_tuned);",
+    ]
+    if driven:
+        lines.append("    if (message.is_control) { /* it drives the filter from here on */")
+        lines += [*(f"        {each}" for each in driven), "    }"]
+    for each, _ in made.sensors[:1]:
+        lines += [
+            f"    if (outcome == {upper}_WELL && message.is_{each}) {{ /* and so for each sensor */",
+            f"        outcome = {name}_update_{each}(&filter, message.data, &{name}_as_tuned,",
+            "            &innovation);",
+            "    }",
+        ]
+    return "\n".join([*lines, "}"])
+
+
 def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
     """Write README.md."""
     name, upper = made.name, made.name.upper()
-    control = ", control" if made.is_interpolated else ""
     updates = [
         f"| `{name}_update_{each}` | {sensor.topic} | {', '.join(data_of(sensor))} |"
         for each, sensor in made.sensors
     ]
-    gap = (
-        f" In a gap of\nwhat drives it the prediction returns `{upper}_NOT_DRIVEN`."
-        if made.has_gaps
-        else ""
-    )
+    codes = "\n".join(f"| `{upper}_{code}` | {meaning} |" for code, meaning in outcomes(made).items())
     why_not = why_no_replay(made)
     back = (
         f"fuselog cannot replay it: {why_not}."
@@ -137,20 +161,23 @@ fuselog replay PATH/{log} -e lib:./{name}.so
 C99 and libm: no heap, no recursion, no arrays of varying length. The filter is a struct that you own.
 
 ```c
-{name} filter;
-{name}_innovation innovation;
-{name}_init(&filter, time_ns, mean, covariance);
-{name}_predict(&filter, time_ns{control}, &{name}_as_tuned);
+{_loop(made)}
 ```
 
 | function | message | `data`, NAN where a component is missing |
 |---|---|---|
 {chr(10).join(updates)}
 
-An update is at the filter's time, so predict to a message's stamp first. They return `{upper}_WELL`,
-`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again.{gap}
-Angles of the state are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy
-it to change them.
+An update is at the filter's time, so predict to a message's stamp first. Every function returns a
+`{name}_outcome`:
+
+| outcome | meaning |
+|---|---|
+{codes}
+
+`innovation.is_accepted` is 1 if the measurement changed the state, and 0 with every outcome but
+`{upper}_WELL`. Angles of the state are not wrapped. The numbers that it was tuned with are in
+`{name}_as_tuned`; copy it to change them.
 
 ## Test
 
@@ -159,11 +186,13 @@ cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
 ./test_{name}{" 0.01" if made.precision.ending else ""}
 ```
 
-It runs over the first messages of {log}, and prints how far it is from fuselog's own filter: nothing at
-all with the same libm, in double precision and without fused multiply-adds, which
-`-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and
-qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how many instructions a message
-takes as well. QEMU knows no cycles.
+It runs over the first messages of {log} from the filter's start on, with an outlier for every gate. It
+fails without estimates or accepted measurements, and prints how many measurements of each sensor were
+accepted and rejected, and which sensor or gate the log does not show. It also prints how far it
+is from fuselog's own filter: nothing at all with the same libm, in double precision and without fused
+multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
+libnewlib-arm-none-eabi and qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how
+many instructions a message takes as well. QEMU knows no cycles.
 
 ```
 {chr(10).join(target_lines(name, argument="0.01" if made.precision.ending else "1e-12"))}

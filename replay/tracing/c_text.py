@@ -47,6 +47,12 @@ _LIBM = {
     np.power: "pow",
 }
 _TESTS = (np.isnan, np.isfinite, np.isinf, np.signbit)
+_IS_EQUAL = """/* Whether numbers are equal; no NaN is. */
+static int is_equal(REAL x, REAL y)
+{
+    return x <= y && x >= y;
+}
+"""
 # What C lacks; REAL is the type of numbers, and S ends libm's functions of it.
 HELPERS: Mapping[Any, tuple[str, str]] = {
     operator.mod: (
@@ -55,7 +61,7 @@ HELPERS: Mapping[Any, tuple[str, str]] = {
 static REAL modulo(REAL x, REAL y)
 {
     const REAL rest = fmod_S(x, y);
-    if (rest != 0.0_S)
+    if (!(fabs_S(rest) <= 0.0_S))
         return (y < 0.0_S) != (rest < 0.0_S) ? rest + y : rest;
     return y < 0.0_S ? -0.0_S : 0.0_S;
 }
@@ -68,11 +74,11 @@ static REAL floor_of_quotient(REAL x, REAL y)
 {
     const REAL rest = fmod_S(x, y);
     REAL quotient = (x - rest) / y, whole;
-    if (y == 0.0_S)
+    if (fabs_S(y) <= 0.0_S)
         return x / y;
-    if (rest != 0.0_S && (y < 0.0_S) != (rest < 0.0_S))
+    if (!(fabs_S(rest) <= 0.0_S) && (y < 0.0_S) != (rest < 0.0_S))
         quotient -= 1.0_S;
-    if (quotient == 0.0_S)
+    if (fabs_S(quotient) <= 0.0_S)
         return copysign_S(0.0_S, x / y);
     whole = floor_S(quotient);
     return quotient - whole > 0.5_S ? whole + 1.0_S : whole;
@@ -85,7 +91,7 @@ static REAL floor_of_quotient(REAL x, REAL y)
 static REAL sinc(REAL x)
 {
     const REAL angle = x * 3.141592653589793_S;
-    return x == 0.0_S ? 1.0_S : sin_S(angle) / angle;
+    return fabs_S(x) <= 0.0_S ? 1.0_S : sin_S(angle) / angle;
 }
 """,
     ),
@@ -190,7 +196,9 @@ def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision
         if isinstance(node.value, bool):
             return Text(str(int(node.value)), _WHOLE)
         text = precision.number(node.value)
-        return Text(text, _SIGN if text.startswith("-") else _WHOLE)
+        if not math.isfinite(node.value):
+            text = f"({precision.real}){text}"
+        return Text(text, _SIGN if text[0] in "-(" else _WHOLE)
     if operation is SELECT:
         condition, yes, no = given
         if node.is_truth and [each.value for each in node.arguments[1:]] == [False, True]:
@@ -212,6 +220,8 @@ def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision
         return _power(numbers[0].within(_WHOLE), node.value, precision)
     if operation is operator.neg:
         return Text(f"-{numbers[0].within(_WHOLE)}", _SIGN)
+    if operation in (operator.eq, operator.ne) and not all(each.is_truth for each in node.arguments):
+        return _equality(node, numbers, precision)
     if operation in _OPERATORS:
         sign, binds = _OPERATORS[operation]
         first, last = numbers
@@ -223,6 +233,16 @@ def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision
     if operation in _TESTS:
         return Text(f"({operation.__name__}({listed}) != 0)", _WHOLE)
     return Text(f"{_LIBM.get(operation, operation.__name__)}{precision.ending}({listed})", _WHOLE)
+
+
+def _equality(node: Node, numbers: list[Text], precision: Precision) -> Text:
+    """Write whether numbers are equal or not, without the == that compilers warn of."""
+    first, last = (each.text for each in numbers)
+    is_unequal = node.operation is operator.ne
+    if node.arguments[1].operation is CONSTANT and not node.arguments[1].value:
+        text = f"fabs{precision.ending}({first}) <= {last}"
+        return Text(f"!({text})", _SIGN) if is_unequal else Text(text, _COMPARISON)
+    return Text(f"{'!' if is_unequal else ''}is_equal({first}, {last})", _SIGN)
 
 
 def _power(base: str, exponent: int, precision: Precision) -> Text:
@@ -246,4 +266,6 @@ def _power(base: str, exponent: int, precision: Precision) -> Text:
 def helpers_of(nodes: Collection[Node], precision: Precision) -> list[str]:
     """Write the functions that these nodes need and C lacks."""
     used = {node.operation for node in nodes}
-    return [precision.text(text) for operation, (_, text) in HELPERS.items() if operation in used]
+    compared = [_IS_EQUAL] if used & {operator.eq, operator.ne} else []  # left out if nothing calls it
+    texts = [text for operation, (_, text) in HELPERS.items() if operation in used]
+    return [precision.text(text) for text in [*compared, *texts]]

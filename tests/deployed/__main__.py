@@ -22,7 +22,9 @@ from pipeline.deploying.certificate import CERTIFICATE
 from recorders.errors import BadInput
 from tests.claims.pages import DEPLOYED
 from tests.deployed.building import COMPILERS, furthest_of_all, missing_of_target, on_target
+from tests.deployed.hostile import hold_out_by_all
 from tests.deployed.models import Tried, deployed, models, robot_log
+from tests.deployed.mutants import ROBOT, mutants_of, survivors
 
 METHODS = ("ekf", "iekf", "ukf", "lrkf:s2kf-25", "sqrt:ekf", "sqrt:ukf")
 ON_TARGET = ("ekf", "ukf", "sqrt:ekf", "sqrt:ukf")
@@ -60,17 +62,31 @@ def main(names: tuple[str, ...], keep: bool) -> None:
                     wrong, unfit = wrong + fits, unfit + 1 - fits
                     said = str(error).partition(".mcap: ")[2]
                 else:
-                    away = furthest_of_all(made)
+                    away, calls = furthest_of_all(made), hold_out_by_all(made)
                     wrong += not away <= EQUAL
                     found.setdefault(tried.model, {})[method] = {"furthest": away, **costs(made)}
-                    said = f"furthest {away:.1e}"
+                    said = f"furthest {away:.1e}, {calls} hostile calls"
                 taken_s = time.perf_counter() - began
                 click.echo(f"{taken_s:5.1f} s  {tried.model:26}{method:14}{said}")
+        if not names:
+            wrong += _tried_mutants(folder)
         pairs = [pair for each in found.values() for pair in each.values()]
         click.echo(f"{len(pairs)} pairs compared, {wrong} are not as they should be; {unfit} do not fit")
         if keep and not names and not wrong:
             _keep(found, unfit, folder)
     raise SystemExit(min(wrong, 1))
+
+
+def _tried_mutants(folder: Path) -> int:
+    """Count the errors of one character that the test of a robot's filter does not notice."""
+    tried = Tried("robot", robot_log(folder), None, {"model": "robot", **ROBOT})
+    made = deployed(tried, "ekf", folder / "mutants")
+    planted = list(mutants_of((made / f"{made.name.lower()}.c").read_text(encoding="utf-8")))
+    missed = survivors(made, planted)
+    for each in missed:
+        click.echo(f"not noticed in {each.function}: {each.line[0]} as {each.line[1]}")
+    click.echo(f"{len(planted)} errors of one character planted, {len(missed)} not noticed")
+    return len(missed)
 
 
 def _keep(found: Mapping[str, Any], unfit: int, folder: Path) -> None:

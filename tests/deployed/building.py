@@ -11,7 +11,10 @@ from typing import NamedTuple
 from pipeline.deploying.c_target import target_lines
 
 COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
-WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
+WARNINGS = (
+    *("-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wfloat-equal", "-Wshadow"),
+    *("-pedantic", "-Werror"),
+)
 SANITIZERS = ("-fsanitize=address,undefined",)
 STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
 

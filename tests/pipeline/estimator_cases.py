@@ -190,6 +190,7 @@ METHODS = {
             "estimate_drift": {"bias_range_m": 0.3},
             "estimate_time_s": {"bias_range_m": 3.0},
             "topics": {"range_bearing": ""},
+            "of_topics": {"/robot1/range_bearing": {"sigma_range_m": 0.3}},
         },
         {
             "mode": drive(mode="manoeuvre"),

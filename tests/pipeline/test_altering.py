@@ -14,9 +14,9 @@ import pytest
 import fuselog as fl
 from pipeline.altering import alterations as put
 from pipeline.altering.changes import bare
+from pipeline.altering.entries import _columns
 from pipeline.altering.sources import alter
 from pipeline.diagnosing.battery.car import car
-from pipeline.diagnosing.hypotheses.components import _columns
 from recorders.log.streams import concatenate
 from recorders.models.orientation import heading
 from recorders.parameters import parse_settings

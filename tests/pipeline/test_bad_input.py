@@ -218,7 +218,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "info empty.mcap": ("empty.mcap", "not an MCAP"),
     "info cut.mcap": ("cut.mcap", "cut off", "--recover"),
     REPLAY_EKF.format("zzz.mcap"): ("zzz.mcap", "No such file"),
-    REPLAY_EKF.format("folder"): ("folder", "directory"),
+    REPLAY_EKF.format("folder"): ("folder", "no logs to replay"),
     REPLAY_EKF.format("text.mcap"): ("text.mcap", "not an MCAP"),
     REPLAY_EKF.format("empty.mcap"): ("empty.mcap", "not an MCAP"),
     REPLAY_EKF.format("cut.mcap"): ("cut.mcap", "cut off", "--recover"),

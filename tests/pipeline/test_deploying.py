@@ -1,6 +1,7 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
+import subprocess
 import sys
 from contextlib import chdir
 from dataclasses import replace
@@ -22,8 +23,12 @@ from tests.deployed.building import (
     furthest_of_all,
     missing_of_target,
     on_target,
+    sanitizes,
 )
+from tests.deployed.hostile import hold_out
 from tests.deployed.models import Tried, deployed, robot_log
+from tests.deployed.mutants import ROBOT as MUTATED_ROBOT
+from tests.deployed.mutants import Mutant, mutants_of, survivors
 from tests.deployed.own_models import own_models
 from tests.pipeline.conftest import run_here
 from tests.replay.estimators.test_attitude import carried
@@ -173,33 +178,83 @@ CART = fl.Model(
 )
 
 
+def cart_log(log: Path, prior_s: float, seconds: float, variance: float) -> Path:
+    """Write a log of a cart that rolls past its camera, with a prior of so wide variances."""
+    stamps = fl.simulation_stamps_ns(np.arange(0.0, seconds, 0.01))
+    noise = 0.01 * np.random.default_rng(1).standard_normal((len(stamps), 1))
+    prior = fl.make_stream(
+        "/cart/prior",
+        fl.schemas.GAUSSIAN_ESTIMATE,
+        fl.simulation_stamps_ns(np.array([prior_s])),
+        metadata={"components": "x_m,v_mps", "kinds": "linear,linear"},
+        mean=np.zeros((1, 2)),
+        covariance=np.diag([variance, variance]).reshape(1, 4),
+    )
+    camera = fl.make_stream(
+        "/cart/camera",
+        fl.schemas.VECTOR_MEASUREMENT,
+        stamps,
+        metadata={"components": "x_m"},
+        value=5.0 + 0.02 * np.arange(len(stamps))[:, None] + noise,
+    )
+    fl.write(log, [prior, camera])
+    return log
+
+
+@needs_compiler
+@pytest.mark.usefixtures("uncompiled")
+def test_vectors_begin_where_the_filter_starts_and_are_refused_if_they_show_nothing(
+    tmp_path: Path,
+) -> None:
+    log = cart_log(tmp_path / "late.mcap", 4.5, 5.0, 100.0)
+    folder = fl.deploy(log, fl.modelled(CART, "ekf"), tmp_path / "late", gate_probability=0.999)
+    said = subprocess.run([compiled(folder)], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == [
+        "51 updates, 50 estimates: furthest 0, at event -1",
+        "camera: 50 accepted, 1 rejected",
+    ]
+    log = cart_log(tmp_path / "after.mcap", 6.0, 5.0, 100.0)
+    with pytest.raises(BadInput, match="accepts no measurement after its start"):
+        fl.deploy(log, fl.modelled(CART, "ekf"), tmp_path / "after")
+    assert not (tmp_path / "after").exists()
+
+
+@needs_compiler
+def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
+    """Four or more of each function; `python -m tests.deployed` plants all."""
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot", **MUTATED_ROBOT})
+    folder = deployed(tried, "ekf", tmp_path)
+    planted: dict[str, list[Mutant]] = {}
+    for each in mutants_of((folder / f"{folder.name.lower()}.c").read_text()):
+        planted.setdefault(each.function, []).append(each)
+    assert len(planted) == 7
+    chosen = [each for own in planted.values() for each in own[:: max(1, len(own) // 4)]]
+    assert [(each.function, each.line) for each in survivors(folder, chosen)] == []
+
+
+@needs_compiler
+@pytest.mark.parametrize(("label", "single"), [("ekf", True), ("sqrt:ukf", False)])
+def test_a_hostile_caller_gets_outcomes_and_finite_states(
+    tmp_path: Path, label: str, single: bool
+) -> None:
+    if not sanitizes(COMPILERS[0]):
+        pytest.skip(f"{COMPILERS[0]} lacks its sanitizers' libraries here")
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})
+    folder = deployed(tried, label, tmp_path, single=single)
+    assert hold_out(folder, COMPILERS[0], sanitized=True) > 500
+    source = next(each for each in folder.glob("*.c") if each.stem == folder.name.lower())
+    text = source.read_text()
+    source.write_text(text.replace("return checked(filter);", f"return {source.stem.upper()}_WELL;"))
+    with pytest.raises(AssertionError, match="is_state_finite"):
+        hold_out(folder, COMPILERS[0], sanitized=False)
+
+
 @pytest.mark.paper
 @needs_compiler
 @pytest.mark.usefixtures("uncompiled")
 def test_single_precision_says_where_it_breaks_and_the_square_root_holds(tmp_path: Path) -> None:
     """The prior is 1e5 times as wide as a measurement: squared that is more than float's digits."""
-    stamps = fl.simulation_stamps_ns(0.01 * np.arange(150))
-    noise = 0.01 * np.random.default_rng(1).standard_normal((150, 1))
-    log = tmp_path / "cart.mcap"
-    prior = {"components": "x_m,v_mps", "kinds": "linear,linear"}
-    streams = [
-        fl.make_stream(
-            "/cart/prior",
-            fl.schemas.GAUSSIAN_ESTIMATE,
-            stamps[:1],
-            metadata=prior,
-            mean=np.zeros((1, 2)),
-            covariance=np.diag([1e6, 1e6]).reshape(1, 4),
-        ),
-        fl.make_stream(
-            "/cart/camera",
-            fl.schemas.VECTOR_MEASUREMENT,
-            stamps,
-            metadata={"components": "x_m"},
-            value=5.0 + 0.02 * np.arange(150)[:, None] + noise,
-        ),
-    ]
-    fl.write(log, streams)
+    log = cart_log(tmp_path / "cart.mcap", 0.0, 1.5, 1e6)
     costs = {}
     for kind in ("ekf", "sqrt:ekf"):
         folder = fl.deploy(log, fl.modelled(CART, kind), tmp_path / kind.replace(":", "_"), single=True)

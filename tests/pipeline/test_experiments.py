@@ -342,7 +342,7 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(
         *["replay", str(world / "log.mcap"), "-e", "ukf", "-e", "lost", "--set", "lost.kind=ukf"],
         *["--set", "lost.turn_noise_density=1e160", "--out", str(tmp_path), "--json"],
     )
-    assert said.code == 0, said.err
+    assert said.code == 1, said.err
     assert said.json["metrics"]["ukf.failed_runs.robot1"] == 0
     assert said.json["metrics"]["lost.failed_runs.robot1"] == 1
     (sentence,) = said.json["failures"]

@@ -133,14 +133,14 @@ def test_the_page_goes_back_for_late_messages() -> None:
 def test_ours_are_made_as_those_of_others() -> None:
     """By `recursive`, `batch`, or a model and a method; not so are libraries and programs.
 
-    Those of nine axes are made by `recursive`, and then find how long the unit rests.
+    Those of nine axes are made by `recursive`, and then find their magnetometer.
     """
     makers = set()
     for name in set(available("estimators")) - {"exec", "lib"}:
         bind = load("estimators", name, fl.Estimator).bind
         makers.add(getattr(bind, "func", bind).__module__)
-    resting = "replay.estimators.orientation.resting"
-    assert makers == {"replay.engine.api.binding", "replay.inference.estimators", resting}
+    nine_axes = "replay.estimators.orientation.magnetometers"
+    assert makers == {"replay.engine.api.binding", "replay.inference.estimators", nine_axes}
 
 
 def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:

@@ -112,7 +112,8 @@ def test_a_foreign_filter_may_not_read_it(
 ) -> None:
     read = [{"topic": "odometry", "fields": ["forward_mps"]}, {"topic": "truth", "fields": ["state[3]"]}]
     state = {f"told{number}_m": "linear" for number in range(9)}
-    text = json.dumps({**DESCRIPTION, "topics": read, "state": state, "prior": "", "truth": "truth"})
+    own = {"topics": read, "state": state, "prior": "", "truth": "truth", "protocol": 2}
+    text = json.dumps({**DESCRIPTION, **own})
     if way == "program":
         (tmp_path / "description.json").write_text(text, encoding="utf-8")
         telling = Path(__file__).parents[1] / "replay" / "foreign" / "telling.py"

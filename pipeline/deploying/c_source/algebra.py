@@ -47,25 +47,66 @@ static REAL inflation(REAL nis, int size, const NAME_gate *gate)
 /* Whether a measurement is used: its NIS is below the bound, or the last one was used too long ago. */
 static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate *gate)
 {
-    const double waited_s = (double)(filter->time_ns - filter->accepted_ns[sensor]) * 1e-9;
-    if (size == 0 || !(waited_s > gate->reopens_s || nis <= gate->nis[size]))
+    if (size == 0 || !(nis <= gate->nis[size] ||
+                       seconds(filter->accepted_ns[sensor], filter->time_ns) > gate->reopens_s))
         return 0;
     filter->accepted_ns[sensor] = filter->time_ns;
     return 1;
 }
 
-/* Keeps an innovation for whoever looks at it: each component at its place, NaN where it is missing. */
-static void keep(NAME_innovation *innovation, int components, const int *places, REAL v[M], REAL S[M][M])
+/* Makes an innovation that of nothing: all NaN, and not accepted. */
+static void forget(NAME_innovation *innovation)
 {
     for (int i = 0; i < NAME_INNOVATION; i++) {
         innovation->difference[i] = NAN;
         for (int j = 0; j < NAME_INNOVATION; j++)
             innovation->covariance[i][j] = NAN;
     }
+    innovation->nis = NAN;
+    innovation->is_accepted = 0;
+}
+
+/* Whether a message can be used: what was measured is finite or missing, what comes with it finite. */
+static int is_usable(const REAL *data, int measured, int references)
+{
+    for (int i = 0; i < measured; i++)
+        if (isinf(data[i]))
+            return 0;
+    return is_finite(data + measured, references);
+}
+
+/* Whether the rows of a covariance that comes with what was measured can be used. */
+static int is_noise_usable(const REAL *data, int measured, const REAL *entry)
+{
+    for (int row = 0; row < measured; row++)
+        for (int column = 0; column <= row; column++, entry++)
+            if (!isnan(data[row]) && !isnan(data[column]) &&
+                (!is_finite(entry, 1) || (row == column && *entry < 0.0_S)))
+                return 0;
+    return 1;
+}
+
+/* What an update returns: NAME_WELL only of a finite state, and nothing is accepted otherwise. */
+static NAME_outcome finished(const NAME *filter, int outcome, NAME_innovation *innovation)
+{
+    const NAME_outcome found = outcome == NAME_WELL ? checked(filter) : (NAME_outcome)outcome;
+    if (found != NAME_WELL)
+        innovation->is_accepted = 0;
+    return found;
+}
+
+/* Keeps an innovation for whoever looks at it: each component that is not missing at its place. */
+static void keep(NAME_innovation *innovation, int components, const int *places, const REAL v[M],
+                 const REAL S[M][M])
+{
     for (int i = 0; i < components; i++) {
+        if (isnan(v[i]))
+            continue;
         innovation->difference[places[i]] = v[i];
-        for (int j = 0; j < components; j++)
-            innovation->covariance[places[i]][places[j]] = isnan(v[i] + v[j]) ? NAN : S[i][j];
+        for (int j = 0; j <= i; j++)
+            if (!isnan(v[j]))
+                innovation->covariance[places[i]][places[j]] =
+                    innovation->covariance[places[j]][places[i]] = S[i][j];
     }
 }
 """
@@ -109,9 +150,9 @@ static int whiten(int size, REAL v[M], REAL S[M][M], REAL *nis)
 /* Makes the covariance of a whitened innovation `factor` times larger. */
 static void inflate(int size, REAL v[M], REAL S[M][M], REAL factor)
 {
-    const REAL root = sqrt_S(factor);
-    if (!(factor < 1.0_S || factor > 1.0_S))
+    if (!(factor > 1.0_S))
         return;
+    const REAL root = sqrt_S(factor);
     for (int i = 0; i < size; i++) {
         v[i] /= root;
         for (int k = 0; k <= i; k++)
@@ -135,7 +176,7 @@ static void find_step(int size, REAL v[M], REAL S[M][M], REAL C[T][M], REAL step
 }
 
 /* P - W W'. */
-static void downdate(REAL P[T][T], int size, REAL W[T][M])
+static void downdate(REAL P[T][T], int size, const REAL W[T][M])
 {
     for (int row = 0; row < T; row++)
         for (int column = 0; column <= row; column++) {
@@ -162,7 +203,7 @@ static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M]
         return NAME_WELL;
     inflate(size, v, S, inflation(innovation->nis, size, gate));
     find_step(size, v, S, C, step);
-    downdate(filter->covariance, size, C);
+    downdate(filter->covariance, size, (const REAL(*)[M])C);
     FIND_SLOPE;
     correct(filter, step, slope);
     return NAME_WELL;
@@ -197,7 +238,7 @@ static int iterate(NAME *filter, int sensor, int components, int iteration, REAL
             change = fabs_S(step[row] - before[row]);
     if (change >= LEAST_CHANGE && iteration + 1 < ITERATIONS)
         return UNSETTLED;
-    downdate(filter->covariance, size, C);
+    downdate(filter->covariance, size, (const REAL(*)[M])C);
     correct(filter, step, slope);
     return NAME_WELL;
 }

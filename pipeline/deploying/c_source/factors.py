@@ -122,7 +122,7 @@ void NAME_covariance(const NAME *filter, REAL covariance[T][T])
 """
 
 START = """\
-    for (int column = 0; column < T; column++) /* by Cholesky; NAN where there is none */
+    for (int column = 0; column < T; column++) /* by Cholesky */
         for (int row = 0; row < T; row++) {
             REAL entry = covariance[row * T + column];
             for (int k = 0; k < column; k++)
@@ -131,15 +131,17 @@ START = """\
                 entry = 0.0_S;
             else if (row > column)
                 entry /= filter->factor[column][column];
+            else if (entry > 0.0_S)
+                entry = sqrt_S(entry);
             else
-                entry = entry > 0.0_S ? sqrt_S(entry) : NAN;
+                outcome = NAME_NOT_POSITIVE_DEFINITE;
             filter->factor[row][column] = entry;
         }
 """
 
 CARRYING = """\
 /* Rows become J L, of a Jacobian J and the state's factor L. */
-static void carry(const NAME *filter, REAL (*J)[T], const signed char (*columns)[T + 1], int size,
+static void carry(const NAME *filter, const REAL (*J)[T], const signed char (*columns)[T + 1], int size,
                   factorisation *found)
 {
     for (int k = 0; k < T; k++) {
@@ -214,7 +216,7 @@ static int update(NAME *filter, int sensor, int components, int columns, const i
     if (!factorise(found, components + T, columns, components, &noise[0][0], M))
         return NAME_NOT_POSITIVE_DEFINITE;
     square(&found->factor[0][0], ROWS, components, &S[0][0], M);
-    keep(innovation, components, places, v, S);
+    keep(innovation, components, places, v, (const REAL(*)[M])S);
     for (int i = 0; i < components; i++) {
         if (!(found->factor[i][i] > 0.0_S))
             return NAME_NOT_POSITIVE_DEFINITE;

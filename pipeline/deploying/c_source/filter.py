@@ -3,6 +3,7 @@
 import re
 
 from pipeline.deploying.c_source.algebra import CHOLESKY
+from pipeline.deploying.c_source.braces import braced
 from pipeline.deploying.c_source.factors import (
     CARRYING,
     FACTORISING,
@@ -41,10 +42,11 @@ def source(made: CFilter) -> str:
     parts = [
         f"/* {made.origin} Made by fuselog deploy; see {made.name}.h.\n"
         " * Compile it with -ffp-contract=off to have fuselog's bits. */",
-        f'#include "{made.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n',
+        f'#include "{made.name}.h"\n\n#include <math.h>\n#include <string.h>\n',
         filled(made, "enum { T = NAME_TANGENT, M = NAME_MOST };\n"),
         _as_tuned(made),
         *helpers_of(every, made.precision),
+        _checks(made),
         *_products(made),
         *samples_text(made),
         *_moments(made),
@@ -54,7 +56,7 @@ def source(made: CFilter) -> str:
         *algebra_text(made),
         *(update_text(made, number) for number in range(len(made.sensors))),
     ]
-    return _without_unused("\n".join(parts))
+    return braced(_without_unused("\n".join(parts)))
 
 
 _FUNCTION = re.compile(
@@ -95,10 +97,61 @@ def repr_double(value: float) -> str:
 
 
 _COPY = """\
+    REAL factor[T][T];
     for (int row = 0; row < T; row++)
         for (int column = 0; column < T; column++)
-            filter->covariance[row][column] = covariance[row * T + column];
+            factor[row][column] = filter->covariance[row][column] = covariance[row * T + column];
+    if (!cholesky(&factor[0][0], T, T))
+        outcome = NAME_NOT_POSITIVE_DEFINITE;
 """
+
+
+# a small processor computes with `float`, and looks at the bits of `double` faster than it adds them
+_FINITE = """\
+/* Whether numbers are finite: no exponent has all of its bits set. */
+static int is_finite(const double *numbers, int count)
+{
+    const uint64_t exponent = 0x7FF0000000000000U;
+    for (int i = 0; i < count; i++) {
+        uint64_t bits;
+        memcpy(&bits, &numbers[i], sizeof bits);
+        if ((bits & exponent) == exponent)
+            return 0;
+    }
+    return 1;
+}
+"""
+_FINITE_IN_SINGLE = """\
+/* Whether numbers are finite: so is their sum, for inf - inf is NaN. */
+static int is_finite(const float *numbers, int count)
+{
+    float sum = 0.0f;
+    for (int i = 0; i < count; i++)
+        sum += numbers[i];
+    return !isnan(sum - sum);
+}
+"""
+_CHECKS = """\
+/* NAME_WELL if the state is finite. */
+static NAME_outcome checked(const NAME *filter)
+{
+    return is_finite(filter->mean, NAME_STATES) && is_finite(&filter->CARRIED[0][0], T * T)
+               ? NAME_WELL
+               : NAME_NOT_FINITE;
+}
+
+/* The time from a stamp to one that is not before it. */
+static double seconds(int64_t from_ns, int64_t to_ns)
+{
+    return (double)((uint64_t)to_ns - (uint64_t)from_ns) * 1e-9;
+}
+"""
+
+
+def _checks(made: CFilter) -> str:
+    """Write what checks numbers, and times."""
+    checks = _CHECKS.replace("CARRIED", "factor" if made.is_root else "covariance")
+    return "\n".join([_FINITE_IN_SINGLE if made.precision.ending else _FINITE, filled(made, checks)])
 
 
 def _init(made: CFilter) -> str:
@@ -112,14 +165,19 @@ def _init(made: CFilter) -> str:
         driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""
     return filled(
         made,
-        """void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance)
+        """NAME_outcome NAME_init(NAME *filter, int64_t time_ns, const REAL *mean,
+    const REAL *covariance)
 {
+    NAME_outcome outcome = NAME_WELL;
     filter->time_ns = time_ns;
+BELIEF    if (!is_finite(mean, NAME_STATES) || !is_finite(covariance, T * T))
+        outcome = NAME_BAD_INPUT;
     for (int i = 0; i < NAME_STATES; i++)
-        filter->mean[i] = mean[i];
-BELIEF    for (int sensor = 0; sensor < NAME_SENSORS + 1; sensor++)
+        filter->mean[i] = outcome == NAME_WELL ? mean[i] : (REAL)NAN;
+    for (int sensor = 0; sensor < NAME_SENSORS + 1; sensor++)
         filter->accepted_ns[sensor] = time_ns;
-DRIVEN}
+DRIVEN    return outcome;
+}
 """.replace("DRIVEN", driven).replace("BELIEF", START if made.is_root else _COPY),
     )
 

@@ -34,7 +34,7 @@ def header(made: CFilter) -> str:
         *_enum(made, "SENSOR_", [name for name, _ in made.sensors], "SENSORS"),
         *_enum(made, "INNOVATION_", [identifier(name) for name in made.innovation], "INNOVATION"),
         f"enum {{ {upper}_MOST = {made.most} }}; /* components of the widest sensor */",
-        f"enum {{ {', '.join(f'{upper}_{each}' for each in outcomes(made))} }};\n",
+        *_outcomes(made),
         filled(
             made,
             """/* A measurement with a larger NIS than nis[its components] is not used, unless the last
@@ -65,11 +65,12 @@ typedef struct {
     REAL difference[NAME_INNOVATION];
     REAL covariance[NAME_INNOVATION][NAME_INNOVATION];
     REAL nis;
-    int is_accepted;
+    int is_accepted; /* 1 if the measurement changed the state; only together with NAME_WELL */
 } NAME_innovation;
 
-/* Starts at a prior, undriven. */
-void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance);
+/* Starts at a prior, undriven. A prior that cannot be used leaves a state that is not finite. */
+NAME_outcome NAME_init(NAME *filter, int64_t time_ns, const REAL *mean,
+    const REAL *covariance);
 
 FACTOR""".replace("CARRIED", "factor" if made.is_root else "covariance")
             .replace("FACTOR", _COVARIANCE if made.is_root else "")
@@ -113,16 +114,37 @@ def _struct(made: CFilter) -> Iterator[str]:
         yield f"    }} {part};"
 
 
-def outcomes(made: CFilter) -> list[str]:
-    """List what a prediction or an update may return."""
-    lost = ["NOT_DRIVEN"] if made.has_gaps else []
-    return ["WELL", "NOTHING_MEASURED", "NOT_POSITIVE_DEFINITE", *lost]
+def outcomes(made: CFilter) -> dict[str, str]:
+    """List what the functions of a filter may return, with what each outcome means."""
+    gap = {"NOT_DRIVEN": "the control is silent: the estimate is unknown"} if made.has_gaps else {}
+    return {
+        "WELL": "the state is finite, and predicted, updated, or kept if a gate rejected the message",
+        "NOTHING_MEASURED": "all measured components are NAN: nothing changed",
+        "BAD_INPUT": "a number is infinite, is NAN but not missing, or is a negative variance: "
+        "nothing changed",
+        "BACKWARD": "the time is before that of the filter: nothing changed",
+        "NOT_POSITIVE_DEFINITE": "the covariance of the state or of an innovation has no Cholesky "
+        "factor: start again",
+        "NOT_FINITE": "the state is not finite: start again",
+        **gap,
+    }
+
+
+def _outcomes(made: CFilter) -> Iterator[str]:
+    """Write the enum of outcomes."""
+    yield "typedef enum {"
+    for name, meaning in outcomes(made).items():
+        yield f"    {made.name.upper()}_{name}, /* {meaning} */"
+    yield f"}} {made.name}_outcome;\n"
 
 
 def predict_signature(made: CFilter) -> str:
     """Write how a prediction is called."""
     control = ", const REAL *control" if made.is_interpolated else ""
-    return f"int NAME_predict(NAME *filter, int64_t time_ns{control}, const NAME_parameters *parameters)"
+    return (
+        f"NAME_outcome NAME_predict(NAME *filter, int64_t time_ns{control},\n"
+        "    const NAME_parameters *parameters)"
+    )
 
 
 def _predict_comment(made: CFilter) -> str:
@@ -154,8 +176,8 @@ def _between_comment(made: CFilter) -> str:
 def update_signature(name: str) -> str:
     """Write how an update by a sensor is called."""
     return (
-        f"int NAME_update_{name}(NAME *filter, const REAL *data, const NAME_parameters *parameters,\n"
-        "    NAME_innovation *innovation)"
+        f"NAME_outcome NAME_update_{name}(NAME *filter, const REAL *data,\n"
+        "    const NAME_parameters *parameters, NAME_innovation *innovation)"
     )
 
 

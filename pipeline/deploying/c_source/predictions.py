@@ -16,11 +16,16 @@ from pipeline.deploying.c_source.statements import (
 from replay.tracing.c_text import c_lines
 
 _BETWEEN_CONTROLS = """{
-    int outcome = NAME_WELL;
+    NAME_outcome outcome = checked(filter);
     if (time_ns < filter->time_ns)
-        return NAME_WELL;
+        return NAME_BACKWARD;
+    for (int k = 0; k < NAME_CONTROLS; k++)
+        if (isinf(control[k]) || isinf(filter->control[k]))
+            return NAME_BAD_INPUT;
     if (time_ns > filter->time_ns) {
-GAP        for (int k = 0; k < NAME_CONTROLS; k++) /* the first control holds from the start on */
+GAP        if (!is_finite(control, NAME_CONTROLS))
+            return NAME_BAD_INPUT;
+        for (int k = 0; k < NAME_CONTROLS; k++) /* the first control holds from the start on */
             filter->control[k] =
                 isnan(filter->control[k]) ? control[k] : 0.5_S * (filter->control[k] + control[k]);
         outcome = predict(filter, time_ns, parameters);
@@ -39,21 +44,33 @@ _INTO_A_GAP = """\
 """
 _OUT_OF_A_GAP = """\
         if (filter->is_in_gap) {
+            if (!is_finite(control, NAME_CONTROLS))
+                return NAME_BAD_INPUT;
             for (int k = 0; k < NAME_CONTROLS; k++)
                 filter->control[k] = control[k];
             return pass_gap(filter, time_ns, parameters);
         }
 """
-_STEP = "static int predict(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"
+_ONWARD = """\
+    if (time_ns < filter->time_ns)
+        return NAME_BACKWARD;
+    if (time_ns == filter->time_ns)
+        return checked(filter);
+"""
+_DRIVEN = """\
+    if (!is_finite(filter->control, NAME_CONTROLS))
+        return NAME_BAD_INPUT;
+"""
+_STEP = "static NAME_outcome predict(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"
 _PASS_GAP = """/* Over a gap of what drives it: the mean stays, the covariance widens. */
-static int pass_gap(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"""
+static NAME_outcome pass_gap(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"""
 
 
 def predicting_text(made: CFilter) -> list[str]:
     """Write the prediction, and what it calls."""
     gap = [] if made.steps.gap is None else [_pass_gap(made)]
     if not made.is_interpolated:
-        begin = "    if (time_ns <= filter->time_ns)\n        return NAME_WELL;\n"
+        begin = _ONWARD + (_DRIVEN if made.controls else "")
         return [*gap, filled(made, f"{predict_signature(made)}\n{{\n{begin}{_step(made)}")]
     return [*gap, filled(made, f"{_STEP}\n{{\n{_step(made)}"), _between_controls(made)]
 
@@ -75,9 +92,9 @@ def _step(made: CFilter) -> str:
     into = "noise" if made.is_root else "P"
     if sampled is None:
         call = (
-            f"carry(filter, F, columns_of_F, {t}, &found);"
+            f"carry(filter, (const REAL(*)[T])F, columns_of_F, {t}, &found);"
             if made.is_root
-            else "propagate(P, F, columns_of_F); /* P = F P F' */"
+            else "propagate(P, (const REAL(*)[T])F, columns_of_F); /* P = F P F' */"
         )
         loops, first, columns = jacobian_loops(step, "F", t, call, into, "states"), [], t
     else:
@@ -130,7 +147,7 @@ def _pass_gap(made: CFilter) -> str:
 def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
     """Write a prediction's body: what its lines use is declared before them."""
     text = "\n".join([*declared, *lines])
-    real, span = made.precision.real, "(double)(time_ns - filter->time_ns) * 1e-9"
+    real, span = made.precision.real, "seconds(filter->time_ns, time_ns)"
     used = {
         r"\bduration_s\b": f"const {real} duration_s = "
         + (f"({real})({span});" if real != "double" else f"{span};"),
@@ -141,4 +158,7 @@ def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
     }
     first = [line for sign, line in used.items() if re.search(sign, text)]
     first += [] if re.search(r"\bparameters\b", text) else ["(void)parameters;"]
-    return body([*first, *declared, *lines, "filter->time_ns = time_ns;", "return NAME_WELL;"]) + "}\n"
+    return (
+        body([*first, *declared, *lines, "filter->time_ns = time_ns;", "return checked(filter);"])
+        + "}\n"
+    )

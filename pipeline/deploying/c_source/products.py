@@ -7,7 +7,7 @@ those of a matrix row by row, each row ended by -1.
 from collections.abc import Mapping
 
 PROPAGATE = """/* P = F P F'. */
-static void propagate(REAL P[T][T], REAL F[T][T], const signed char columns[T][T + 1])
+static void propagate(REAL P[T][T], const REAL F[T][T], const signed char columns[T][T + 1])
 {
     REAL FP[T][T];
     for (int row = 0; row < T; row++)
@@ -28,7 +28,8 @@ static void propagate(REAL P[T][T], REAL F[T][T], const signed char columns[T][T
 """
 
 ADD_THROUGH = """/* A = A + G diag(u) G'. */
-static void add_through_WHAT(REAL A[SIZE][SIZE], int size, REAL G[SIZE][GAINS], const REAL *u, int gains)
+static void add_through_WHAT(REAL A[SIZE][SIZE], int size, const REAL G[SIZE][GAINS], const REAL *u,
+                             int gains)
 {
     for (int row = 0; row < size; row++)
         for (int column = 0; column <= row; column++) {
@@ -41,8 +42,8 @@ static void add_through_WHAT(REAL A[SIZE][SIZE], int size, REAL G[SIZE][GAINS], 
 """
 
 MEASURE = """/* C = P H', S = H C. */
-static void measure(REAL P[T][T], REAL H[M][T], const signed char (*columns)[T + 1], int components,
-                    REAL C[T][M], REAL S[M][M])
+static void measure(const REAL P[T][T], const REAL H[M][T], const signed char (*columns)[T + 1],
+                    int components, REAL C[T][M], REAL S[M][M])
 {
     for (int i = 0; i < components; i++)
         for (int row = 0; row < T; row++) {
@@ -83,7 +84,7 @@ FACTORS
 """
 
 SLOPE = """/* P a / (a' P a): how the state changes with what bends along a. */
-static void find_slope(REAL P[T][T], const REAL a[T], REAL slope[T])
+static void find_slope(const REAL P[T][T], const REAL a[T], REAL slope[T])
 {
     REAL variance = 0.0_S;
     for (int row = 0; row < T; row++)

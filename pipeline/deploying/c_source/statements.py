@@ -109,7 +109,7 @@ def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
     if gains:
         declared.append(f"REAL G[{size}][GAINS] = {{{{0}}}}, u[GAINS];")
         named |= entries(step, "G") | entries(step, "u")
-        calls.append(f"add_through_{what}({into}, {rows}, G, u, {gains});")
+        calls.append(f"add_through_{what}({into}, {rows}, (const REAL(*)[GAINS])G, u, {gains});")
     for (array, (row, *column)), node in step.outputs.items():
         if array == "N" and row >= column[0]:
             name = f"noise_{row}_{column[0]}"

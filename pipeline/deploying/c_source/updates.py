@@ -35,13 +35,15 @@ def correcting_text(made: CFilter) -> list[str]:
         text += "static void bend(NAME *filter, REAL slope[T])\n{\n"
         text += body([*declared, "REAL a[T];"])
         text += body(c_lines(entries(direction, "a"), names, made.precision))
-        texts.append(filled(made, text + f"    find_slope(filter->{carried}, a, slope);\n}}\n"))
+        texts.append(
+            filled(made, text + f"    find_slope((const REAL(*)[T])filter->{carried}, a, slope);\n}}\n")
+        )
     names, declared = Inputs(made, "").names(step, "step", "slope")
     named, assigned = moved_state(made, step)
     if step.has("F"):
-        t, call = made.tangent, f"propagate(filter->{carried}, F, columns_of_F);"
+        t, call = made.tangent, f"propagate(filter->{carried}, (const REAL(*)[T])F, columns_of_F);"
         if made.is_root:
-            call = f"carry(filter, F, columns_of_F, {t}, &found);"
+            call = f"carry(filter, (const REAL(*)[T])F, columns_of_F, {t}, &found);"
             declared = ["factorisation found;", *declared]
             assigned = [f"orthogonalise(&found, {t}, {t});", "take_factor(filter, &found);", *assigned]
         loops = jacobian_loops(step, "F", t, call, "P", "states")
@@ -55,7 +57,7 @@ def correcting_text(made: CFilter) -> list[str]:
         "static void correct(NAME *filter, const REAL step[T], const REAL slope[T])\n{\n"
     )
     lines = c_lines(named, names, made.precision)
-    text = filled(made, head + body(declared)) + body(lines) + body(assigned) + "}\n"
+    text = filled(made, head + body(declared) + body(lines) + body(assigned)) + "}\n"
     return [*texts, _bending(made, text)]
 
 
@@ -85,7 +87,17 @@ def update_text(made: CFilter, number: int) -> str:
     places = [made.innovation.index(each) for each in sensor.measured]
     missing = " && ".join(f"isnan(data[{index}])" for index in range(m))
     begin = [f"static const int places[] = {{{', '.join(map(str, places))}}};"]
-    given = [f"if ({missing})", "    return NAME_NOTHING_MEASURED;"]
+    references = sensor.reference_size
+    usable = f"is_usable(data, {m}, {references})"
+    if sensor.covariance:
+        usable += f" || !is_noise_usable(data, {m}, data + {m + references})"
+    given = [
+        "forget(innovation);",
+        f"if ({missing})",
+        "    return NAME_NOTHING_MEASURED;",
+        f"if (!{usable})",
+        "    return NAME_BAD_INPUT;",
+    ]
     head = f"{update_signature(name)}\n{{\n"
     gate = f"&parameters->{name}.gate, innovation"
     if made.steps.is_iterated:
@@ -97,11 +109,11 @@ def update_text(made: CFilter, number: int) -> str:
             "FIND_SLOPE;",
             "for (int iteration = 0; outcome == UNSETTLED; iteration++) {",
             f"    linearise_{name}(filter, step, slope, data, parameters, v, S, C);",
-            f"    keep(innovation, {m}, places, v, S);",
+            f"    keep(innovation, {m}, places, v, (const REAL(*)[M])S);",
             f"    outcome = iterate(filter, NAME_SENSOR_{name.upper()}, {m}, iteration,",
             f"                      v, S, C, step, slope, &factor, {gate});",
             "}",
-            "return outcome;",
+            "return finished(filter, outcome, innovation);",
         ]
         own = _bending(made, filled(made, head + body([*begin, *calls]) + "}\n"))
         return _linearise(made, name, body([*loops.declared, *lines])) + own
@@ -111,16 +123,17 @@ def update_text(made: CFilter, number: int) -> str:
         begin.append("REAL v[M], noise[M][M] = {{0}};")
         begin.append("factorisation found;")
         end = [
-            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places, v, noise,",
-            f"              &found, {gate});",
+            f"const int outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places,",
+            f"                           v, noise, &found, {gate});",
         ]
     else:
         begin.append("REAL v[M], S[M][M], C[T][M];")
         end = [
-            f"keep(innovation, {m}, places, v, S);",
-            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
-            f"              {gate});",
+            f"keep(innovation, {m}, places, v, (const REAL(*)[M])S);",
+            f"const int outcome = update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
+            f"                           {gate});",
         ]
+    end.append("return finished(filter, outcome, innovation);")
     return filled(made, head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n")
 
 
@@ -133,9 +146,10 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
     if sampled is None:
         names, declared = Inputs(made, name).names(step, "data", "", "step", "slope")
         call = (
-            f"carry(filter, H, columns_of_H, {m}, &found);"
+            f"carry(filter, (const REAL(*)[T])H, columns_of_H, {m}, &found);"
             if made.is_root
-            else f"measure(filter->covariance, H, columns_of_H, {m}, C, S); /* C = P H', S = H C */"
+            else f"measure((const REAL(*)[T])filter->covariance, (const REAL(*)[T])H, columns_of_H, {m},"
+            " C, S); /* C = P H', S = H C */"
         )
         loops = jacobian_loops(step, "H", m, call, into, "components")
         if made.is_root:

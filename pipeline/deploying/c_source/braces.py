@@ -1,0 +1,36 @@
+"""Puts the bodies of C's conditions and loops in braces, so that templates can do without them."""
+
+import re
+
+_HEAD = re.compile(r" *(?:\} )?(?:if|for|while|else)\b")
+_COMMENT = re.compile(r"\s*/\*.*\*/$")
+
+
+def braced(text: str) -> str:
+    """Put every body of an `if`, `else`, `for` and `while` in braces.
+
+    Args:
+        text: C whose bodies stand in lines of their own, indented by more than what they belong to.
+    """
+    found: list[str] = []
+    opened: list[int] = []  # indents of the heads whose bodies got a brace here
+    balance = head = 0  # parentheses that are open, and the indent of the head that they belong to
+    for line in text.split("\n"):
+        indent = len(line) - len(line.lstrip())
+        if balance == 0 and line.strip() and line[0] != "#":
+            while opened and indent <= opened[-1]:
+                found.append(f"{' ' * opened.pop()}}}")
+            if line.lstrip().startswith("else") and found[-1] == f"{' ' * indent}}}":
+                line = f"{found.pop()} {line.lstrip()}"
+        if balance == 0:
+            if not _HEAD.match(line):
+                found.append(line)
+                continue
+            head = indent
+        code = _COMMENT.sub("", line)
+        balance += code.count("(") - code.count(")")
+        if balance == 0 and code[-1] not in "{;":
+            line = f"{code} {{{line[len(code) :]}"
+            opened.append(head)
+        found.append(line)
+    return "\n".join(found)
