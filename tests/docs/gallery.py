@@ -34,21 +34,21 @@ def page_of(experiment: str) -> Path:
     return next(page for page in pages if told.search(page.read_text(encoding="utf-8")))
 
 
-def picture_of(experiment: str) -> Path:
-    """Its first run, which `tests.docs.pictures` draws, else its figure, else the first of its page."""
+def picture_of(experiment: str) -> Path | None:
+    """Its first run, which `tests.docs.pictures` draws, its figure, or the first of its page, if any."""
     page = page_of(experiment)
     shown = re.findall(r"!\[.*?\]\((.*?)\)", page.read_text(encoding="utf-8"))
     of_run, figure = DOCS / "gallery" / f"{experiment}.png", DOCS / "figures" / f"{experiment}.svg"
     of_page = [(page.parent / each).resolve() for each in shown]
-    return next(path for path in (of_run, figure, *of_page) if path.exists())
+    return next((path for path in (of_run, figure, *of_page) if path.exists()), None)
 
 
 def _card(entry: Entry) -> str:
-    picture, page = (
-        path.relative_to(DOCS).as_posix() for path in (picture_of(entry.name), page_of(entry.name))
-    )
+    page, picture = page_of(entry.name).relative_to(DOCS).as_posix(), picture_of(entry.name)
+    shown = "" if picture is None else _shown(entry, picture.relative_to(DOCS).as_posix(), page)
     command = f"fuselog run {entry.name}" + (" --data FOLDER" if "imports" in entry.facts else "")
-    return (
-        f"-   [![{entry.name}: {entry.what}]({picture}){{ loading=lazy }}]({page})\n\n"
-        f"    **[{entry.name}]({page})**\n\n    {entry.what}\n\n    `{command}`\n"
-    )
+    return f"-   {shown}**[{entry.name}]({page})**\n\n    {entry.what}\n\n    `{command}`\n"
+
+
+def _shown(entry: Entry, picture: str, page: str) -> str:
+    return f"[![{entry.name}: {entry.what}]({picture}){{ loading=lazy }}]({page})\n\n    "

@@ -76,7 +76,9 @@ def test_the_gallery_has_every_experiment() -> None:
     page = gallery.gallery()
     for name in shipped("experiments"):
         assert len(re.findall(rf"`fuselog run {name}(?: --data FOLDER)?`", page)) == 1, name
-        assert gallery.picture_of(name).is_relative_to(gallery.DOCS), name
+    shown = {name: gallery.picture_of(name) for name in shipped("experiments")}
+    assert [name for name, picture in shown.items() if picture is None] == ["false-causes"]
+    assert all(picture.is_relative_to(gallery.DOCS) for picture in shown.values() if picture)
 
 
 def test_the_reference_has_every_name() -> None:

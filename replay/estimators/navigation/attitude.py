@@ -171,10 +171,11 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     until_ns = begin_ns + round(parameters.rest_s * 1e9)
     rests = [each.take(each.publish_time_ns <= until_ns) for each in streams.values()]
     rest = stream.take(stream.publish_time_ns <= until_ns)
-    fields = [each["magnetic_field_ut"] for each in rests if each["magnetic_field_ut"].shape[1:] == (3,)]
+    fields = (each["magnetic_field_ut"] for each in rests)
+    measured = (each for each in fields if each.shape[1:] == (3,) and np.isfinite(each).any())
     force, field = (
         np.nanmean(values, axis=0) if np.isfinite(values).any() else np.full(3, np.nan)
-        for values in (rest["specific_force_mps2"], np.concatenate([np.empty((0, 3)), *fields]))
+        for values in (rest["specific_force_mps2"], next(measured, np.full((1, 3), np.nan)))
     )
     if not np.isfinite(field).all():
         raise BadInput(

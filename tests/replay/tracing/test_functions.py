@@ -212,6 +212,7 @@ KINDS: dict[str, Callable[..., Any]] = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("ignore:.*the noise does not add up")  # which is that of a step
 def test_any_callable_is_a_models_function(kind: str):
     model = replace(SCALAR, sensors=(replace(VALUE, measure=KINDS[kind]),))
     check_model(model)
