@@ -32,11 +32,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     FUSELOG_TRACEBACK=1 shows where an error comes from, for who writes an estimator.
 
     Args:
-        arguments: of the command; by default those that this process was started with, and then the
-            process ends here if threads are still at work.
+        arguments: of the command; by default those that this process was started with, which is then
+            ours: it collects less garbage, and ends here if threads are still at work.
     """
+    if arguments is not None:
+        return _code_of(arguments)
+    gc.set_threshold(50_000, 20, 100)  # collections while libraries are imported find nothing to free
     code = _code_of(arguments)
-    if arguments is None and threading.active_count() > 1:
+    if threading.active_count() > 1:
         _end(code)
     return code
 
@@ -58,7 +61,6 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
-    gc.set_threshold(50_000, 20, 100)  # collections while libraries are imported find nothing to free
     logging.basicConfig(format="fuselog: %(message)s")
     if sys.stderr.isatty():  # somebody waits
         logging.getLogger("fuselog").setLevel(logging.INFO)

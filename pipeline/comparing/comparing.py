@@ -17,6 +17,7 @@ from pipeline.comparing.groups import (
     comparable_groups,
     inputs_of,
     kind_of,
+    named_in,
     runs_of,
     table_of_runs,
     unlike_runs,
@@ -267,7 +268,7 @@ def compare(
     """
     if not 0 <= margin < np.inf:
         raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which means 2 %")
-    named = [label for each in estimators for label in _labels(each)]
+    named = named_in(estimators)
     paths = with_logs_of_folders(list(map(Path, candidates)), named, recover=recover)
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
@@ -297,10 +298,6 @@ def compare(
         paired = under_stress(paired, verdicts_of(found.stressed))
     notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
-
-
-def _labels(each: str | Mapping[str, Kind]) -> list[str]:
-    return [each] if isinstance(each, str) else list(each)
 
 
 def _compared(

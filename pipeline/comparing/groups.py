@@ -49,7 +49,7 @@ def inputs_of(
     recover: bool,
 ) -> list[Given]:
     """Read what every path stands for; logs that lack what is named are replayed together."""
-    named = [label for each in estimators for label in ([each] if isinstance(each, str) else each)]
+    named = named_in(estimators)
     kinds = [kind_of(path, named, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):
@@ -80,6 +80,11 @@ def inputs_of(
             if number not in found:
                 found[number] = of_trajectory(path, source, topic, gap_limit_s)
     return [found[number] for number in range(len(paths))]
+
+
+def named_in(estimators: Sequence[str | Mapping[str, Kind]]) -> list[str]:
+    """List the labels of estimators, as `replay` takes them."""
+    return [label for each in estimators for label in ([each] if isinstance(each, str) else each)]
 
 
 def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recover: bool) -> list[Path]:
