@@ -23,6 +23,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from pipeline.command_line import main
+from pipeline.output.results import TIMINGS
 from tests.faults import Tally
 
 FUSELOG = str(Path(sys.executable).with_name("fuselog"))
@@ -169,12 +170,14 @@ def _copy_of(start: Path) -> Iterator[Path]:
 
 
 def _state(folder: Path) -> dict[str, Any]:
-    """Everything in a folder, files by their bytes; of a timeline, whose bytes differ, its rows."""
+    """Everything in a folder: files by their bytes, a timeline by its rows, measured times by name."""
     state: dict[str, Any] = {}
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))
         if path.is_dir():
             state[name] = "folder"
+        elif path.name == TIMINGS:
+            state[name] = "times"
         elif path.suffix == ".rrd" and ".part" not in name:
             chunks = RrdReader(path).stream()
             state[name] = sorted((chunk.entity_path, chunk.num_rows) for chunk in chunks)
