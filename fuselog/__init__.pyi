@@ -61,7 +61,9 @@ from recorders.log import Stream as Stream
 from recorders.log import Topic as Topic
 from recorders.log import make_stream as make_stream
 from recorders.log import schemas as schemas
+from recorders.parameters import MeasurementNoise as MeasurementNoise
 from recorders.parameters import Parameters as Parameters
+from recorders.parameters import ProcessNoise as ProcessNoise
 from recorders.plausibility.finding import Finding as Finding
 from recorders.recording import SIMULATION_EPOCH_NS as SIMULATION_EPOCH_NS
 from recorders.recording import Blocks as Blocks

@@ -7,9 +7,16 @@ from functools import cache
 from inspect import cleandoc
 from textwrap import shorten
 from tomllib import TOMLDecodeError
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, PydanticUserError, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    PydanticUserError,
+    ValidationError,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -44,10 +51,22 @@ class Parameters(BaseModel):
         for name, field in cls.model_fields.items():
             entry = entries[field.alias or name]
             entry.setdefault("description", meaning_of.get(name, ""))
-            entry["unit"] = unit_of(name)
+            entry.setdefault("unit", unit_of(name))
         return schema
 
 
+# What a number is to its estimator: a standard deviation or density of noise, another number whose value
+# may be wrong, or how the estimator is run, which no log can tell.
+Role = Literal["process noise", "measurement noise", "parameter", "setting"]
+
+
+def has_role(role: Role) -> Any:
+    """Return the annotation of a number that has this role, see `roles_of`."""
+    return Field(json_schema_extra={"role": role})
+
+
+ProcessNoise = Annotated[float, Field(ge=0.0), has_role("process noise")]
+MeasurementNoise = Annotated[float, Field(ge=0.0), has_role("measurement noise")]
 ParametersType = TypeVar("ParametersType", bound=Parameters)
 
 
@@ -294,6 +313,24 @@ def field_of(key: str) -> str:
         return key
     field = re.sub(r"\W", "_", key).strip("_")
     return f"n{field}" if field[:1].isdigit() else field
+
+
+def roles_of(kind: type[BaseModel]) -> dict[str, Role]:
+    """Return what the numbers of a type are to their estimator, by name: "parameter" unless one says so.
+
+    >>> class Own(Parameters):
+    ...     drift_density: ProcessNoise | None = None
+    ...     lever_m: float = 0.0
+    ...     label: str = ""
+    >>> roles_of(Own)
+    {'drift_density': 'process noise', 'lever_m': 'parameter'}
+    """
+    return {
+        name: number.get("role", entry.get("role", "parameter"))
+        for name, entry in kind.model_json_schema()["properties"].items()
+        for number in entry.get("anyOf", [entry])
+        if number.get("type") == "number"
+    }
 
 
 def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:

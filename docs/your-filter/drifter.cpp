@@ -10,6 +10,7 @@ static const char *DESCRIPTION = R"json({
     "state": {"x_m": "linear", "y_m": "linear"},
     "innovation": {"x_m": "linear", "y_m": "linear"},
     "parameters": {"drift_density": {"default": 20, "minimum": 0, "unit": "m/sqrt(s)",
+                                     "role": "process noise",
                                      "meaning": "random walk of the position"}}
 })json";
 

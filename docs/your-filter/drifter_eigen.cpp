@@ -15,7 +15,8 @@ const char *const DESCRIPTION = R"json({
     "prior": "prior", "truth": "truth",
     "state": {"x_m": "linear", "y_m": "linear"},
     "innovation": {"x_m": "linear", "y_m": "linear"},
-    "parameters": {"drift_density": {"default": 20, "minimum": 0, "unit": "m/sqrt(s)"}}
+    "parameters": {"drift_density": {"default": 20, "minimum": 0, "unit": "m/sqrt(s)",
+                                     "role": "process noise"}}
 })json";
 
 struct Drifter {

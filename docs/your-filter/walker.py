@@ -15,7 +15,14 @@ DESCRIPTION = {
     "truth": "truth",
     "state": dict.fromkeys(["x_m", "vx_mps", "y_m", "vy_mps"], "linear"),
     "innovation": {"x_m": "linear", "y_m": "linear"},
-    "parameters": {"acceleration_sigma_mps2": {"default": 0.5, "minimum": 0, "unit": "m/s^2"}},
+    "parameters": {
+        "acceleration_sigma_mps2": {
+            "default": 0.5,
+            "minimum": 0,
+            "unit": "m/s^2",
+            "role": "process noise",
+        }
+    },
 }
 
 

@@ -5,7 +5,8 @@ from typing import Any
 
 from pipeline.deploying.c_source.braces import braced
 from pipeline.deploying.c_source.names import CFilter, filled, identifier
-from recorders.parameters import unit_of
+from recorders.parameters import Role, field_of, meanings, unit_of
+from replay.engine.replaying.estimator import Reading
 from replay.inference.model.model import Map, Sensor
 
 
@@ -40,9 +41,10 @@ def _fields(sensor: Sensor) -> list[str]:
     return [*fields, f"{sensor.covariance}[{m * m}]"] if sensor.covariance else fields
 
 
-def _description(made: CFilter) -> str:
+def _description(made: CFilter, reading: Reading) -> str:
     stage = made.filtering.stage
     model, single = stage.model, " in single precision" if made.precision.ending else ""
+    told = {identifier(name): meaning for name, meaning in meanings(model.parameters).items()}
     topics: list[dict[str, Any]] = [
         {
             "topic": each.topic,
@@ -78,7 +80,13 @@ def _description(made: CFilter) -> str:
             "state": dict(model.state),
             "innovation": dict(made.filtering.measured),
             "parameters": {
-                name: {"default": value, "unit": unit_of(name)} for name, _, value in _parameters(made)
+                name: {
+                    "default": value,
+                    "unit": unit_of(name),
+                    "meaning": told.get(places[0].partition(".")[2], ""),
+                    "role": _role(places[0], reading),
+                }
+                for name, places, value in _parameters(made)
             },
             "failures": [
                 "the filter needs a prior",
@@ -105,13 +113,23 @@ def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
     return found
 
 
+def _role(place: str, reading: Reading) -> Role:
+    """Say what the parameter in this place is to the filter, by what the model's functions read."""
+    _, _, name = place.partition(".")
+    topics = {identifier(field_of(key)): topic for key, topic in reading.noises.items()}
+    if name in topics:
+        return "measurement noise" if topics[name] else "process noise"
+    others = (*reading.augmentable, *reading.biases.values(), *reading.factors.values())
+    return "parameter" if name in {identifier(field_of(key)) for key in others} else "setting"
+
+
 def _literal(text: str) -> str:
     """Write a string of C, in lines."""
     pieces = [text[first : first + 90] for first in range(0, len(text), 90)]
     return "\n".join(f"    {json.dumps(each)}" for each in pieces)
 
 
-def replay_text(made: CFilter) -> str:
+def replay_text(made: CFilter, reading: Reading) -> str:
     """Write NAME_replay.c."""
     maps = _maps(made)
     parameters = _parameters(made)
@@ -292,7 +310,7 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
         else spread.replace("WHOSE", "own->filter.covariance")
     )
     text = filled(made, text.replace("COVARIANCE", covariance))
-    return braced(text).replace("DESCRIPTION", _literal(_description(made)))
+    return braced(text).replace("DESCRIPTION", _literal(_description(made, reading)))
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:

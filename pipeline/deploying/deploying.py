@@ -92,8 +92,8 @@ def deploy(
     certificate = certificate_of(made, files)
     files["README.md"] = readme_text(made, Path(log).name, certificate)
     files[CERTIFICATE] = certificate_text(made, certificate)
-    if not why_no_replay(made):
-        files[f"{made.name}_replay.c"] = replay_text(made)
+    if bound.reading is not None and not why_no_replay(made):
+        files[f"{made.name}_replay.c"] = replay_text(made, bound.reading())
         files["fuselog_filter.h"] = HEADER.read_text(encoding="utf-8")
     with whole_folder(place, _check_empty) as folder:
         for name, text in files.items():

@@ -51,9 +51,9 @@ class Trying:
     """Describes how advice is followed.
 
     Attributes:
-        label: the estimator's.
+        label: the estimator's; in a command, what names it there.
         applied: how the log is altered already.
-        is_own: whether the estimator is a program's own, which no command can name.
+        is_own: whether no command can name the estimator, as one of a Python program.
         gate: the probability of the gate that is set.
     """
 

@@ -5,6 +5,7 @@ noise is stated too small makes the range's innovations too large as well.
 """
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -52,12 +53,13 @@ from pipeline.runs.estimates import (
     stated_estimators,
 )
 from pipeline.tuning.measured import until_last_measured
+from pipeline.tuning.objective import for_likelihood
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, schemas
 from recorders.parameters import merge
-from replay.engine.replaying.estimator import Estimator, bind
+from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
-from replay.foreign.naming import allowed, of_file, refuse_programs
+from replay.foreign.naming import allowed, name_of, of_file, refuse_programs
 
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
@@ -246,7 +248,7 @@ def diagnose(
     bound = bind(label, [source], {"kind": label, **settings})
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
-        raise silent(source.name, label, bound)
+        raise silent(source.name, label, bound, settings)
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes, sought, end_ns = [*why], Sought(), None
@@ -256,11 +258,13 @@ def diagnose(
         notes += [note] if note else []
         sought = seek(part, label, opened, MOST_SENTENCES)
     if not np.isfinite(sought.log_likelihood):
+        mend = for_likelihood(settings)
         notes.append(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
-            "measurements alone"
+            f"measurements alone{'; ' if mend else ''}{mend}"
         )
-    trying = Trying(label, alterations_of(source), isinstance(settings.get("kind"), Estimator), gate)
+    named, beside = name_of(label, {"kind": label, **settings})
+    trying = Trying(shlex.quote(named), alterations_of(source), "kind" in beside, gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
     of_log = without_filter(source, streamed, undone_by(bound))

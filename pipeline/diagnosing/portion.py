@@ -10,6 +10,7 @@ from pipeline.api.replays import Replay, replay
 from pipeline.comparing.renamed import Renamed
 from pipeline.diagnosing.advice import number
 from pipeline.runs.ensemble import Pass, judge_logs
+from pipeline.tuning.objective import for_likelihood
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Schema, Stream, schemas, topics_of
 from recorders.log.streams import concatenate
@@ -47,11 +48,11 @@ class Outputs(Mapping[str, Stream]):
         return all(column in stream.columns for first in firsts for stream in first.values())
 
 
-def silent(name: str, label: str, bound: Sequence[Bound]) -> BadInput:
+def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str, Any]) -> BadInput:
     """Return the sentence on an estimator that gives no innovations of a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
-    mend = "give a filter of the same model, such as -e ekf"
+    mend = for_likelihood(settings) or "give a filter of the same model, such as -e ekf"
     if topic:
         mend = f"it does not take {topic}; with {setting} it does"
     return BadInput(f"{name}: {label} gives no innovations, and a diagnosis needs them; {mend}")

@@ -9,10 +9,9 @@ import numpy as np
 from pipeline.output.words import MINUS, number
 from pipeline.tuning.tuning import value_at_start
 from recorders.errors import BadInput
-from recorders.parameters import bounds_of, describe, field_of
+from recorders.parameters import bounds_of, describe, field_of, roles_of
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource
-from replay.foreign.description import ForeignParameters
 from replay.inference.model.parameters import number_fields
 
 STEPS = 400  # between the ends of a slider
@@ -152,12 +151,9 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
 def _groups(label: str, bound: Bound) -> dict[str, str]:
     """Name the parameters that matter on this log, with what they are of."""
     assert bound.parameters is not None
-    names = number_fields(type(bound.parameters))
     if not isinstance(bound, Recursive) or bound.reading is None:
-        how_run = (
-            ForeignParameters.model_fields if isinstance(bound.parameters, ForeignParameters) else ()
-        )
-        return dict.fromkeys((name for name in names if name not in how_run), label)
+        roles = roles_of(type(bound.parameters))
+        return {name: label for name, role in roles.items() if role != "setting"}
     reading = bound.reading()
     found = {name: topic or MOTION for name, topic in reading.noises.items()}
     for name, (_, topics) in reading.augmentable.items():
@@ -165,6 +161,7 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
     for (topic, _), name in (*reading.biases.items(), *reading.factors.items()):
         found.setdefault(name, topic)
     found |= {name: topic for topic, name in reading.delays.items()}
+    names = number_fields(type(bound.parameters))
     gate = {name: GATE for name in ("gate_probability",) if name in names}
     return dict(sorted(found.items(), key=lambda each: _order(each[1], bound.streams))) | gate
 

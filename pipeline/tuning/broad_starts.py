@@ -98,13 +98,11 @@ def _own_parts(
 
 def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
-    names = dict.fromkeys(name for part in parts for name in part)
-    return {
-        name: float(
-            np.logaddexp.reduce([part.get(name, -np.inf) for part in parts]) - np.log(len(parts))
-        )
-        for name in names
-    }
+    found = {}
+    for name in dict.fromkeys(name for part in parts for name in part):
+        known = [part[name] for part in parts if not np.isnan(part.get(name, np.nan))]
+        found[name] = float(np.logaddexp.reduce(known, initial=-np.inf) - np.log(len(parts)))
+    return found
 
 
 def initialization_of(bound: Bound) -> Initialization | None:

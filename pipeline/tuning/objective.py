@@ -29,7 +29,7 @@ from pipeline.tuning.control_noise import disturbed
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas, topics_of
 from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, Initialized, Recursive, bind
+from replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.ensembles import Ensemble
@@ -77,6 +77,19 @@ def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
     end_ns = source.end_ns if isinstance(source, LogSource) else None
     held = MemorySource(streams, run, source.name, source.start_ns, end_ns)
     return Run(Ensemble([held]), source.name)
+
+
+def for_likelihood(settings: Mapping[str, Any]) -> str:
+    """Say how an estimator of a user's own gives innovations with a likelihood; "" for another."""
+    kind = settings.get("kind")
+    if isinstance(kind, Estimator):
+        return (
+            "in the `follow` of a recursion, fill results.innovation, results.innovation_covariance and "
+            "results.squared, with their components named in `measured`"
+        )
+    if kind in ("lib", "exec"):
+        return "a filter of your own names the components of its innovations in its description"
+    return ""
 
 
 def is_innovation(rows: Ragged) -> bool:
@@ -276,9 +289,11 @@ class Objective:
             count = max(map(self._count, parts))
             cost = self._cost([self._total(parts, run, count)])
             if not np.isfinite(cost):
+                mend = for_likelihood(self.settings) if self.by == "likelihood" else ""
                 raise BadInput(
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
+                    f"{', or ' if mend else ''}{mend}"
                 )
             self._counts.append(count)
 

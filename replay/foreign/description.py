@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator
 
 from recorders.errors import BadInput
 from recorders.log import Topic
-from recorders.parameters import Parameters, build, unit_of
+from recorders.parameters import Parameters, Role, build, has_role, unit_of
 from recorders.parsing import parse_json
 from replay.engine.streams.channels import resolved
 from replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
@@ -27,9 +27,9 @@ class ForeignParameters(Parameters):
         seed: of the filter's random numbers.
     """
 
-    time_limit_s: Annotated[float, Field(gt=0)] = 10.0
-    memory_limit_mb: Annotated[float, Field(gt=0)] = 2000.0
-    every_s: Annotated[float, Field(gt=0)] | None = None
+    time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 10.0
+    memory_limit_mb: Annotated[float, Field(gt=0), has_role("setting")] = 2000.0
+    every_s: Annotated[float, Field(gt=0), has_role("setting")] | None = None
     seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
 
 
@@ -87,6 +87,7 @@ class ParameterRead(_Part):
     default: float | None = None
     unit: str = ""
     meaning: str = ""
+    role: Role = "parameter"
     minimum: float | None = None
     maximum: float | None = None
     exclusiveMinimum: float | None = None  # noqa: N815
@@ -174,11 +175,11 @@ class Description(_Part):
                 "lt": each.exclusiveMaximum,
             }
             stated: dict[str, Any] = {key: value for key, value in bounds.items() if value is not None}
-            unit = "" if not each.unit or unit_of(name) else f"in {each.unit}"
-            meaning = ", ".join(filter(None, (each.meaning, unit)))
             kind: Any = Annotated[float, Field(**stated)] if stated else float
             kind = kind | None if each.default is None else kind
-            fields[name] = (kind, Field(each.default, description=meaning))
+            told: dict[str, Any] = {"role": each.role, "unit": each.unit or unit_of(name)}
+            field = Field(each.default, description=each.meaning, json_schema_extra=told)
+            fields[name] = (kind, field)
         return create_model("FilterParameters", __base__=base, __doc__=base.__doc__, **fields)
 
 

@@ -14,7 +14,7 @@ from pydantic import Field, create_model
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
-from recorders.parameters import build
+from recorders.parameters import build, has_role
 from replay.engine.compiling.compile import core_count
 from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.replaying.truth import TRUTH, truths_among
@@ -55,7 +55,7 @@ class ProgramParameters(StreamParameters):
         truth: the topic of the truth; without it the only one of the log.
     """
 
-    time_limit_s: Annotated[float, Field(gt=0)] = 600.0
+    time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 600.0
     truth: str = ""
 
 

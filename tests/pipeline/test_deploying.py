@@ -90,6 +90,26 @@ def test_estimates_are_equal_to_the_last_bit(
 
 @pytest.mark.paper
 @needs_compiler
+@pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+def test_a_deployed_filter_has_the_cause_of_its_model(tmp_path: Path) -> None:
+    """It declares what its parameters are, as the model's functions read them."""
+    log = recorded(tmp_path, "landmarks", **ROBOT)
+    settings = {"forward_noise_density": 0.4, "gate_probability": 1.0}
+    folder = fl.deploy(log, "ekf", tmp_path / "filter_c", model="robot", **settings)
+    library = compiled(folder, "-shared", "-fPIC", "-O0")
+    kinds = (
+        {"kind": "ekf", "model": "robot", **settings},
+        {"kind": "lib", "path": str(library), "in_process": True},
+    )
+    own, foreign = (fl.diagnose(log, {"it": each}).causes.iloc[0] for each in kinds)
+    assert own["kind"] == "process noise"
+    names = ["value", "low", "high", "gain"]
+    assert foreign[names].tolist() == pytest.approx(own[names].tolist(), rel=1e-6)
+    assert foreign["sentence"].partition("; try")[0] == own["sentence"].partition("; try")[0]
+
+
+@pytest.mark.paper
+@needs_compiler
 @pytest.mark.parametrize("label", ["ekf", pytest.param("sqrt:ukf", marks=pytest.mark.paper)])
 def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path, label: str) -> None:
     """Of an orientation, whose mean is found in rounds where it is sampled."""

@@ -9,6 +9,7 @@ from pipeline.diagnosing.hypotheses.origins import of_origin
 from pipeline.diagnosing.hypotheses.parameters import (
     of_augmentable,
     of_covariances,
+    of_declared,
     of_gate,
     of_noises,
 )
@@ -41,7 +42,7 @@ def hypotheses(
     first_ns = source.extent("publish_time")[0]
     stated = (topic for each in bound for topic in each.priors if topic in source.streams)
     found = [*of_noises(bound, source, readings), *of_gate(parameters)]
-    found += of_augmentable(bound, readings)
+    found += of_augmentable(bound, readings) if readings else of_declared(bound, source)
     for topic in streamed:
         stream, reading = source.streams[topic], of_topic[topic]
         if len(stream) < FEWEST:

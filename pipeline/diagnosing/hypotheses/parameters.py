@@ -24,8 +24,16 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
 from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
-from recorders.log import Stream, Topic
-from recorders.parameters import Parameters, field_of, in_few_words, meanings
+from recorders.log import Stream
+from recorders.parameters import (
+    Described,
+    Parameters,
+    bounds_of,
+    describe,
+    field_of,
+    in_few_words,
+    roles_of,
+)
 from replay.engine.replaying.estimator import Bound, Reading, Recursive
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
@@ -41,35 +49,53 @@ def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
     """Yield the noise that the estimator's parameters state, channels for them, or that is assumed."""
-    parameters = bound[0].parameters
-    if parameters is None:
-        return
-    read = [
-        source.topics[topic]
-        for each in bound
-        for topic in (*each.streams, *each.static)
-        if topic in source.topics
-    ]
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
-    assumed = ChainMap(*(dict(each.assumed) for each in bound if isinstance(each, Recursive)))
+    told = _described(bound)
     for name, topic in noises.items():
-        value = _noise_of(parameters, name, read, assumed)
-        if value is None:
+        value = _value_of(bound, source, name)
+        if value > 0.0:
+            kind: Kind = "measurement noise" if topic else "process noise"
+            yield _scaled(name, told[field_of(name)].meaning, value, kind)
+
+
+def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
+    """Suppose other values of the numbers that an estimator declares; of one whose reading is not known.
+
+    What is a noise, or cannot be below zero, is scaled.
+    """
+    if bound[0].parameters is None:
+        return
+    kind, told = type(bound[0].parameters), _described(bound)
+    for name, role in roles_of(kind).items():
+        value = _value_of(bound, source, name)
+        if role == "setting" or name == "gate_probability" or np.isnan(value):
             continue
-        kind: Kind = "measurement noise" if topic else "process noise"
-        yield _noise(name, in_few_words(meanings(type(parameters)).get(field_of(name), "")), value, kind)
+        if value > 0.0 and (role != "parameter" or bounds_of(kind, name)[0] >= 0.0):
+            yield _scaled(name, told[name].meaning, value, role)
+        elif role == "parameter":
+            step = STEPS.get(told[name].unit, STEPS[""])
+            yield _parameters([name], (value,), step, (), is_angle=False)
 
 
-def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
-    letter = "R" if kind == "measurement noise" else "Q"
+def _described(bound: Sequence[Bound]) -> dict[str, Described]:
+    """Describe the parameters by name."""
+    parameters = bound[0].parameters
+    return {} if parameters is None else {each.name: each for each in describe(type(parameters))}
+
+
+def _scaled(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
+    """Suppose that a number above zero is stated too small or too large by a factor."""
+    what = in_few_words(meaning)
     named = f"{name} ({what})" if what else name
+    letter = {"measurement noise": "R", "process noise": "Q"}.get(kind)
 
     def without(trial: Trial, logarithm: float) -> Trial:
         settings = with_values(trial.settings, [name], np.array([value * np.exp(logarithm)]))
         return trial._replace(settings=settings)
 
     def words(at: float, low: float, high: float) -> str:
-        return f"{named} is {times(at, low, high)}, so that {letter} is too {size_of(at)}"
+        so = f", so that {letter} is too {size_of(at)}" if letter else ""
+        return f"{named} is {times(at, low, high)}{so}"
 
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
@@ -77,18 +103,26 @@ def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
     return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor)
 
 
-def _noise_of(
-    parameters: Parameters, name: str, read: Sequence[Topic], assumed: Mapping[str, float]
-) -> float | None:
-    """Return the value of a parameter that is a noise: given, stated by a channel, or assumed."""
-    value = getattr(parameters, field_of(name))
-    if value is None:
+def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
+    """Return the value of a number: given, stated by a channel, or assumed; NaN where it has none."""
+    parameters = bound[0].parameters
+    value = getattr(parameters, field_of(name), None)
+    if value is None and parameters is not None:
+        read = [
+            source.topics[topic]
+            for each in bound
+            for topic in (*each.streams, *each.static)
+            if topic in source.topics
+        ]
         topic, _, own = name.rpartition(".")
         first = [each for each in read if each.name == topic]
         value = stated([*first, *read], own, type(parameters), needed=False)
-        value = assumed.get(field_of(name)) if np.isnan(value) else value
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if is_number and 0.0 < value < np.inf else None
+        if np.isnan(value):
+            assumed = ChainMap(*(dict(each.assumed) for each in bound if isinstance(each, Recursive)))
+            value = assumed.get(field_of(name), np.nan)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return np.nan
+    return float(value) if np.isfinite(value) else np.nan
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
@@ -178,7 +212,7 @@ def _parameters(
         ]
         where = " and ".join(topic or "the motion" for topic in topics)
         given = ", ".join(number(value) for value in values)
-        return f"{where}: {', '.join(changes)}, not {given}"
+        return f"{where}{': ' if where else ''}{', '.join(changes)}, not {given}"
 
     def mend(at: Any) -> Advice:
         (name, value), *more = zip(

@@ -21,6 +21,7 @@ from replay.engine.streams.results import (
     states_in,
 )
 from replay.engine.vectors.components import Components
+from replay.engine.vectors.covariances import log_likelihood
 from replay.engine.vectors.tangent import tangent_components
 
 DIVERGED = "the estimate is no longer finite: the filter diverged"
@@ -33,7 +34,8 @@ class Results(NamedTuple):
         mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
             space (see `replay.engine.vectors.tangent`), d where all are linear or angles.
         innovation, innovation_covariance: (n, m), (n, m, m) of the message.
-        squared: (n,) the normalised innovation squared.
+        squared: (n,) the normalised innovation squared. With the two above the message has a likelihood,
+            by which `tune` and `diagnose` go.
         accepted: (n,) whether a gate let the message in; 1 unless set.
         target: (n,) what the message was about; 0 unless set.
         further: (n, k) the fields of the further outputs that were named, after the sensor's clock, side
@@ -199,13 +201,17 @@ class Outputs:
 
     def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
         rows = np.flatnonzero(np.isfinite(results.squared))
+        accepted, squared = results.accepted[rows], results.squared[rows]
+        innovation, covariance = results.innovation[rows], results.innovation_covariance[rows]
+        likelihood = np.where(accepted, log_likelihood(squared, innovation, covariance), 0.0)
         columns = InnovationColumns(
             messages.time_ns[rows],
             results.target[rows],
-            results.accepted[rows],
-            results.innovation[rows],
-            results.innovation_covariance[rows],
-            results.squared[rows],
+            accepted,
+            innovation,
+            covariance,
+            squared,
+            likelihood,
         )
         topic = f"{self.topic}/innovation"
         stream = innovation_stream(topic, self.measured, self.truth, columns)

@@ -37,6 +37,29 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
         return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
 
 
+def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
+    """Compute the log-likelihood of Gaussian errors (..., n) with NEES or NIS `squared` (...).
+
+    A component that is NaN is missing. NaN if the covariance of the others is not positive definite.
+
+    Args:
+        squared: (...).
+        error: (..., n).
+        covariance: (..., n, n).
+
+    >>> spread = np.array([[4.0, np.nan], [np.nan, np.nan]])
+    >>> round(float(log_likelihood(np.array(1.0), np.array([2.0, np.nan]), spread)), 6)
+    -2.112086
+    """
+    known = np.isfinite(error)
+    both = known[..., :, None] & known[..., None, :]
+    pivots = np.diagonal(
+        _factors(np.where(both, covariance, np.eye(error.shape[-1]))), axis1=-2, axis2=-1
+    )
+    determinant = 2.0 * np.sum(np.log(pivots), axis=-1)
+    return -0.5 * (squared + determinant + known.sum(axis=-1) * np.log(2.0 * np.pi))
+
+
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
     """Tell whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
     pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
