@@ -1012,7 +1012,8 @@ def test_a_table_without_a_known_time_is_refused(head: str, tmp_path: Path) -> N
     of_name = {
         "frame": lambda row: row % 20, "trackLifetime": lambda row: row % 20,
         "id": lambda row: row // 20, "trackId": lambda row: row // 20,
-        "YEAR": lambda _: 2026, "year": lambda _: 2026, "DOY": lambda _: 123, "day_of_year": lambda _: 123, "recordingId": lambda _: 7,
+        "YEAR": lambda _: 2026, "year": lambda _: 2026, "DOY": lambda _: 123,
+        "day_of_year": lambda _: 123, "recordingId": lambda _: 7,
         "time": lambda row: 3_800_000_000 + row,
     }  # fmt: skip
     names = head.split(",")
