@@ -632,6 +632,16 @@ def test_halves_that_a_message_says_it_has_not_are_missing(tmp_path: Path) -> No
         for number, own in enumerate((1.0, -1.0))
     ]  # fmt: skip
     sent[-1][2].twist.covariance[:] = no_twist
+    denied = {
+        "/amcl_pose": ("geometry_msgs/msg/PoseWithCovarianceStamped", "pose__covariance", 36),
+        "/velocity": ("geometry_msgs/msg/TwistWithCovarianceStamped", "twist__covariance", 36),
+        "/mag": ("sensor_msgs/msg/MagneticField", "magnetic_field_covariance", 9),
+    }
+    sent += [
+        (topic, START_NS + number, make(kind, START_NS + number, **{field: [own] + [0.0] * (width - 1)}))
+        for topic, (kind, field, width) in denied.items()
+        for number, own in enumerate((1.0, -1.0))
+    ]
     streams, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
     inertial = streams["/inertial"]
     assert inertial.publish_time_ns.tolist() == [START_NS + number for number in range(3)]
@@ -641,7 +651,8 @@ def test_halves_that_a_message_says_it_has_not_are_missing(tmp_path: Path) -> No
     assert notes[f"{without} specific forces: linear_acceleration_covariance[0] is -1"] == "1"
     assert notes[f"{without} turn rates: angular_velocity_covariance[0] is -1"] == "1"
     assert notes["/imu: inertial dropped: without specific forces and turn rates"] == "1"
-    assert len(streams["/odometry"]) == 1
+    names = ("/odometry", "/odometry_twist", "/pose", "/twist", "/magnetic_field")
+    assert [len(streams[name]) for name in names] == [1] * 5
     assert notes["/odom: odometry dropped: without a twist: twist.covariance[0] is -1"] == "1"
 
 

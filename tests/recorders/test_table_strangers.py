@@ -1,5 +1,6 @@
 """Inputs of the kinds that strangers reported: read right, or refused by a sentence that helps."""
 
+import re
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -665,7 +666,7 @@ def test_places_of_a_vbo_are_minutes_to_the_north_and_west(tmp_path: Path) -> No
     assert fix["latitude_deg"][0] == pytest.approx(51.984955)
     assert fix["longitude_deg"][0] == pytest.approx(-0.97488)
     assert got.times("/fix")[:2] == ["2026-01-01 12:45:12", "2026-01-01 12:45:12.100000"]
-    assert "positive to the west" in got.said
+    assert "minutes that are positive to the west" in got.said
     path.write_text("\n".join(rows), encoding="utf-8")
     with pytest.raises(BadInput, match=r"has no sections \[column names\] and \[data\]"):
         Got(path)
@@ -889,3 +890,180 @@ def test_a_date_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> None:
     degrees = text_of(tmp_path, "time,lat,lon", lambda k: f"{EPOCH + k},52°12'{k}\"N,11°24'{k}\"E")
     with pytest.raises(BadInput, match="column lat holds places such as '52°12'0\"N'"):
         Got(degrees)
+
+
+# Files of devices that are known by their names or form.
+
+
+def _clock(row: int) -> str:
+    return f"2026-05-03T10:00:{row:02d}"
+
+
+def _inspva(row: int) -> str:
+    place = f"2417,{36000 + row}.0,{48.1 + row * 1e-5:.7f},11.5,500.1,1.1,0.0,0.01,0.1,0.3,0.0"
+    status = "INS_ALIGNING" if row < 5 else "INS_SOLUTION_GOOD"
+    return f"#INSPVAA,COM1,0,50.0,FINESTEERING,2417,{36000 + row}.0,0,0,1;{place},{status}*12ab34cd\n"
+
+
+VBOX_HEAD = "satellites,time,latitude,longitude,velocity kmh,heading,height\n"
+# What a file holds, and the first fix by the guess: its stamp, latitude and longitude.
+DEVICES = {
+    "vbox.csv": (
+        VBOX_HEAD
+        + "".join(f"9,{100000 + row},{2886 + row / 1e3:.5f},-690.0,4.0,0,500\n" for row in ROWS),
+        ("2026-01-01 10:00:00", 48.1, 11.5),
+    ),
+    "flysight.csv": (
+        "$FLYS,1\n$VAR,FIRMWARE_VER,v2023.09.22\n$COL,GNSS,time,lat,lon,hMSL\n$UNIT,GNSS,,deg,deg,m\n$DATA\n"
+        + "".join(f"$GNSS,{_clock(row)}.00Z,{48.1 + row * 1e-5:.7f},11.5,500\n" for row in ROWS),
+        ("2026-05-03 10:00:00", 48.1, 11.5),
+    ),
+    "novatel.asc": (
+        "".join(f"#BESTPOSA,COM1,0,1;SOL_COMPUTED,1.0,2.0*00000000\n{_inspva(row)}" for row in ROWS),
+        ("2026-05-03 10:00:05", 48.10005, 11.5),
+    ),
+    "androsensor.csv": (
+        "LOCATION Latitude : ;LOCATION Longitude : ;Time since start in ms ;YYYY-MO-DD HH-MI-SS_SSS\n"
+        + "".join(
+            f"{48.1 + row * 1e-5:.6f};11.5;{500 * row};2016-06-02 13-00-{row:02d}_083\n" for row in ROWS
+        ),
+        ("2016-06-02 13:00:00.083000", 48.1, 11.5),
+    ),
+    "day of year.txt": (
+        "year doy hour minute second lat lon\n"
+        + "".join(f"2026 123 10 0 {row} {48.1 + row * 1e-5:.6f} 11.5\n" for row in ROWS),
+        ("2026-05-03 10:00:00", 48.1, 11.5),
+    ),
+    "ordinal.csv": (
+        "time,lat,lon\n"
+        + "".join(f"2026-123T10:00:{row:02d}Z,{48.1 + row * 1e-5:.6f},11.5\n" for row in ROWS),
+        ("2026-05-03 10:00:00", 48.1, 11.5),
+    ),
+    "letters.csv": (
+        "time,lat,lon\n" + "".join(f"{_clock(row)}Z,{48.1 + row * 1e-5:.6f}S,W 11.5°\n" for row in ROWS),
+        ("2026-05-03 10:00:00", -48.1, -11.5),
+    ),
+    "ddmm letters.csv": (
+        "time,lat,lon\n" + "".join(f"{_clock(row)}Z,4806.{row:04d}N,01130.0000W\n" for row in ROWS),
+        ("2026-05-03 10:00:00", 48.1, -11.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_files_of_devices_are_read_in_their_units(name: str, tmp_path: Path) -> None:
+    text, (stamp, latitude, longitude) = DEVICES[name]
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    got = Got(path)
+    fix = got.streams["/fix"]
+    assert got.times("/fix")[0] == stamp
+    assert fix["latitude_deg"][0] == pytest.approx(latitude)
+    assert fix["longitude_deg"][0] == pytest.approx(longitude)
+    assert np.ptp(fix["latitude_deg"]) > 1e-5
+
+
+@pytest.mark.parametrize(("step", "seconds"), [(100, 1e-4), (25, 1e-4), (10_000, 1e-4), (16_667, 1e-6)])
+def test_the_counter_of_xsens_has_ticks_of_its_own(step: int, seconds: float, tmp_path: Path) -> None:
+    begin = 2**32 - 20 * step
+    head = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
+    got = Got(
+        text_of(tmp_path, head, lambda row: f"{row},{(begin + row * step) % 2**32},0,0,9.81,0,0,0.1")
+    )
+    steps_ns = np.diff(got.streams["/inertial"].publish_time_ns)
+    assert steps_ns.tolist() == [round(step * seconds * 1e9)] * 39
+
+
+def test_tables_of_ardupilot_have_one_clock_and_its_codes_and_axes(tmp_path: Path) -> None:
+    (tmp_path / "gps.csv").write_text(
+        "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U\n"
+        + "".join(
+            f"{10**8 + 200_000 * row},3,{220_000_000 + 200 * row},2288,14,0.8,{48.1 + row * 1e-5:.7f},"
+            "11.5,500,5.5,0,0,0,1\n"
+            for row in ROWS
+        )
+    )
+    (tmp_path / "imu.csv").write_text(
+        "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n"
+        + "".join(f"{10**8 + 2500 * row},0,0,0.1,0.2,0,-9.8\n" for row in ROWS)
+    )
+    got = Got(tmp_path)
+    inertial = got.streams["/imu/inertial"]
+    assert got.streams["/gps/fix"].publish_time_ns[0] == inertial.publish_time_ns[0]
+    np.testing.assert_allclose(inertial["specific_force_mps2"][0], [0.2, 0, 9.8], atol=1e-12)
+    np.testing.assert_allclose(inertial["turn_rate_radps"][0], [0, 0, -0.1], atol=1e-12)
+    assert "Yaw: 0 means not available, in 40 rows" in got.said
+    assert not any(topic.endswith("/heading") for topic in got.streams)
+
+
+# Tables without a time that is known, and what the refusal says.
+TIMELESS = {
+    "frame,id,x,y": 'column = "frame", rate_hz = 25 } for 25 a second, and in the table vehicle = "id"',
+    "recordingId,trackId,frame,trackLifetime,xCenter,yCenter": 'vehicle = "trackId"',
+    "id,x,y": "no column could be the time of rows of several vehicles, by column id",
+    "YEAR,DOY,SOD,lat,lon": "columns DOY, YEAR hold the date in parts",
+    "year,day_of_year,seconds_of_day,lat,lon": "hold the date in parts",
+    "time,lat,lon": "neither a date since 1970 nor less than a year",
+}
+
+
+@pytest.mark.parametrize("head", TIMELESS)
+def test_a_table_without_a_known_time_is_refused(head: str, tmp_path: Path) -> None:
+    of_name = {
+        "frame": lambda row: row % 20, "trackLifetime": lambda row: row % 20,
+        "id": lambda row: row // 20, "trackId": lambda row: row // 20,
+        "YEAR": lambda _: 2026, "year": lambda _: 2026, "DOY": lambda _: 123,
+        "day_of_year": lambda _: 123, "recordingId": lambda _: 7,
+        "time": lambda row: 3_800_000_000 + row,
+    }  # fmt: skip
+    names = head.split(",")
+    path = text_of(
+        tmp_path,
+        head,
+        lambda row: ",".join(str(of_name.get(name, lambda row: 36 + row)(row)) for name in names),
+    )
+    with pytest.raises(BadInput, match=re.escape(TIMELESS[head])):
+        Got(path)
+
+
+def test_a_mapping_states_the_rate_of_frames(tmp_path: Path) -> None:
+    path = text_of(tmp_path, "frame,id,x,y", lambda row: f"{5 + row % 20},{row // 20},{row},0")
+    got = Got(
+        path,
+        '[[tables]]\nfiles = "own.csv"\nvehicle = "id"\ntime = { column = "frame", rate_hz = 25 }\n'
+        '[[tables.streams]]\ntopic = "/{vehicle}/position"\nbecomes = "PositionFix"\n'
+        'fields = { position_m = ["x", "y"] }\n',
+    )
+    for topic in ("/0/position", "/1/position"):
+        stamps_ns = got.streams[topic].publish_time_ns
+        assert stamps_ns.tolist() == [(5 + row) * 40_000_000 for row in range(20)]
+
+
+def test_a_clock_that_was_never_set_counts_from_1970(tmp_path: Path) -> None:
+    path = text_of(
+        tmp_path,
+        "TIMESTAMP,TRACK_ID,X,Y",
+        lambda row: f"{315_969_904.25 + 0.1 * (row // 2):.3f},{'ab'[row % 2]},{row},0",
+    )
+    got = Got(path)
+    assert got.times("/a/position")[0] == "1980-01-06 01:25:04.250000"
+    assert "by a clock that was never set" in got.said
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("raw.nmea", "$GPGGA,100000.00,4806.1000,N,01130.2000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", "NMEA"),
+        ("log.asc", "#BESTPOSA,COM1,0,1;SOL_COMPUTED,1.0,2.0*00000000\n", "has no rows of INSPVAA"),
+        ("sensor.csv", "$FLYS,1\n$COL,IMU,time,wx,wy,wz\n$DATA\n$IMU,1,2,3,4\n", "without rows of GNSS"),
+        (
+            "dms.csv",
+            "time,lat,lon\n2026-05-03 10:00:00,48°06'01\"N,11°30'02\"E\n",
+            "convert them to degr",
+        ),
+    ],
+)
+def test_other_logs_of_receivers_are_refused(name: str, text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(BadInput, match=words):
+        Got(tmp_path / name)

@@ -506,6 +506,23 @@ def test_instances_of_a_topic_have_streams_of_their_own(tmp_path: Path):
     assert told.startswith("another one, as /vehicle/fix_vehicle_gps_position_2, /vehicle/velocity_")
 
 
+def test_an_instance_that_is_subscribed_to_again_is_one_stream(tmp_path: Path):
+    subscribed = [message("A", struct.pack("<BH", 0, number) + b"sensor_mag") for number in (30, 31)]
+    rows = [
+        message(
+            "D", struct.pack("<HQ3f", 30 + number % 2, 1_000_000 + 4000 * number, 0.1 * number, 0, 0)
+        )
+        for number in range(4)
+    ]
+    path = tmp_path / "twice.ulg"
+    path.write_bytes(
+        by_hand(*subscribed, formats=(f"sensor_mag:{RAW_MAG}",), last=b"".join(rows), rows=4)
+    )
+    streams = {each.topic: each for each in ULOG.read(path, UlogParameters()).together().streams}
+    found = streams["/vehicle/magnetometer_0"]["magnetic_field_ut"][:, 0]
+    np.testing.assert_allclose(found, [0, 10, 20, 30], rtol=1e-6)
+
+
 @pytest.mark.parametrize("is_new", [False, True], ids=["1.13", "1.15"])
 @pytest.mark.parametrize(
     ("ellipsoid_m", "separation_m"),

@@ -110,6 +110,11 @@ def has_none(messages: Messages, path: str) -> NDArray[np.bool_]:
     return np.asarray(messages.numbers(path)[:, 0] == -1.0)
 
 
+def _denied(messages: Messages, what: str, path: str) -> dict[str, NDArray[np.bool_]]:
+    """Return which messages to drop as their covariance says that there is no such data; see `Part`."""
+    return {f"without {what}: {path}[0] is -1": has_none(messages, path)} if path else {}
+
+
 def _unknown(messages: Messages, width: int) -> Floats:
     return np.full((len(messages), width), np.nan)
 
@@ -167,9 +172,7 @@ def _inertial(messages: Messages) -> Iterator[Part]:
         {"quaternion": orientation},
         constants={"covariance_rad2": covariance(messages, "orientation_covariance")},
         dropped={
-            "without an orientation: orientation_covariance[0] is -1": has_none(
-                messages, "orientation_covariance"
-            ),
+            **_denied(messages, "an orientation", "orientation_covariance"),
             "without an orientation: its quaternion is zero": (orientation == 0.0).all(axis=1),
         },
     )
@@ -187,6 +190,7 @@ def _magnetic(messages: Messages) -> Iterator[Part]:
             "magnetic_field_ut": 1e6 * vector(messages, "magnetic_field"),
             "covariance_ut2": 1e12 * covariance(messages, "magnetic_field_covariance"),
         },
+        dropped=_denied(messages, "a magnetic field", "magnetic_field_covariance"),
     )
 
 
@@ -200,7 +204,7 @@ def _odometry(messages: Messages) -> Iterator[Part]:
         schemas.ODOMETRY,
         {"forward_mps": velocity[:, 0], "turn_radps": turn[:, 2]},
         noise={"forward_noise_density": spread[:, 0], "turn_noise_density": spread[:, 35]},
-        dropped={"without a twist: twist.covariance[0] is -1": has_none(messages, "twist.covariance")},
+        dropped=_denied(messages, "a twist", "twist.covariance"),
         doubtful={
             "with a motion sideways, up or down, rolling or pitching, which it leaves out": beside
             > _PLANAR
@@ -221,6 +225,7 @@ def _twist(kind: str, messages: Messages, path: str, uncertainty: str = "") -> P
             "turn_rate_radps": vector(messages, f"{path}.angular" if path else "angular"),
             "covariance": covariance(messages, uncertainty) if uncertainty else _unknown(messages, 36),
         },
+        dropped=_denied(messages, "a twist", uncertainty),
     )
 
 
@@ -233,6 +238,7 @@ def _pose(kind: str, messages: Messages, position: str, orientation: str, uncert
             "quaternion": quaternion(messages, orientation),
             "covariance": covariance(messages, uncertainty) if uncertainty else _unknown(messages, 36),
         },
+        dropped=_denied(messages, "a pose", uncertainty),
     )
 
 
@@ -248,7 +254,7 @@ def as_truth(part: Part) -> Part:
     orientation = part.columns["quaternion"]
     state = np.column_stack([part.columns["position_m"], heading(orientation), orientation])
     metadata = {"components": ",".join(TRUTH), "kinds": ",".join(TRUTH.values())}
-    return Part("truth", schemas.TRUTH_STATE, {"state": state}, metadata)
+    return Part("truth", schemas.TRUTH_STATE, {"state": state}, metadata, dropped=part.dropped)
 
 
 def as_estimate(part: Part, truth: str) -> Part:
@@ -263,7 +269,7 @@ def as_estimate(part: Part, truth: str) -> Part:
         "covariance": part.columns["covariance"],
     }
     metadata |= {"rotation_axes": "world", "truth": truth}
-    return Part("estimate", schemas.GAUSSIAN_ESTIMATE, columns, metadata)
+    return Part("estimate", schemas.GAUSSIAN_ESTIMATE, columns, metadata, dropped=part.dropped)
 
 
 def _twists(path: str, uncertainty: str = "") -> Taken:

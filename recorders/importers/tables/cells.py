@@ -13,6 +13,7 @@ from recorders.importers.stamps import BEYOND, NOT_A_TIME, Stamps, to_ns
 # Numbers that a decimal of 38 digits holds if they are short; a large exponent crashes Arrow.
 _PARTS = r"^[-+]?[0-9]*\.?(?P<part>[0-9]*)(?P<power>(?:[eE][-+]?[0-9]{1,2})?)$"
 _SHORT, _LARGEST_POWER, _MORE_DIGITS = 30, 18, 11
+_SIDED = r"^\s*(?P<before>[NSEWnsew]?)\s*(?P<number>\d+(?:\.\d*)?)\s*°?\s*(?P<after>[NSEWnsew]?)\s*$"
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 
 
@@ -59,6 +60,15 @@ def read_ns(
     if is_text:
         found = _to_the_last_digit(cells, digits, found)
     return to_ns(found, 1, since_ns, where=where, mend=mend)
+
+
+def sided(cells: pa.Array) -> tuple[pa.Array, pa.Array]:
+    """Split texts such as 48.1N or W 11.5° into numbers and letters of hemispheres; null for others."""
+    parts = pc.extract_regex(cells.cast(pa.string()), _SIDED)
+    letters = [pc.struct_field(parts, name) for name in ("before", "after")]
+    return pc.struct_field(parts, "number").cast(pa.float64()), pc.utf8_upper(
+        pc.binary_join_element_wise(*letters, "")
+    )
 
 
 def _plain(texts: pa.Array, digits: int) -> Stamps | None:

@@ -86,6 +86,8 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
     rate_unit, rate_why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
     # a magnetometer of the same table is one of a nine-axis unit, which orientation filters read
     field = take_axes(list(columns), *_MAGNETOMETERS, usual="uT")
+    is_ned = force[0].frame == "ned"
+    axes = "forward, right and down" if is_ned else "forward, left and up"
     yield from stream_lines(
         f"{table.prefix}/inertial",
         "InertialSample",
@@ -96,9 +98,9 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
         f"units.specific_force_mps2 = {json.dumps(force_unit)}   # {why}",
         f"units.turn_rate_radps = {json.dumps(rate_unit)}   # {rate_why}",
         *_field_lines(field)[1:],
-        f"{ASSUMED}the axes of {force[0].name} and the others are the body's, forward, left and up; "
+        f"{ASSUMED}the axes of {force[0].name} and the others are the body's, {axes}; "
         "mounting_deg turns those of the sensor (roll, pitch, yaw)",
-        "# mounting_deg = [0, 0, 0]",
+        "mounting_deg = [180, 0, 0]" if is_ned else "# mounting_deg = [0, 0, 0]",
     )
 
 

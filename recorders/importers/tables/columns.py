@@ -185,7 +185,8 @@ _WRITTEN = {
     "gee": "g",
     "arcminutes": "arcmin", "minutes": "min",
     "microdegrees": "1e-6 deg", "microdeg": "1e-6 deg", "udeg": "1e-6 deg", "cdeg": "0.01 deg",
-    "centidegrees": "0.01 deg", "µs": "us", "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2",
+    "centidegrees": "0.01 deg", "µs": "us", "µt": "uT",
+    "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2",
     "m/s²": "m/s^2", "degc": "", "utesla": "uT", "gauss": "G",
 }  # fmt: skip
 
@@ -211,7 +212,14 @@ def bracketed(name: str) -> re.Match[str] | None:
 
 def unit_in(text: str) -> str:
     """Return the unit that a text such as °/s, knots or m/(s^2) means; empty if it means none."""
-    bare = text.strip().strip("()[]").replace("°", "deg").replace("(", "").replace(")", "")
+    bare = (
+        text.strip()
+        .strip("()[]")
+        .replace("\u03bc", "\u00b5")
+        .replace("°", "deg")
+        .replace("(", "")
+        .replace(")", "")
+    )
     if re.fullmatch(r"(?i)hh:?mm:?ss(\.s+)?", bare):
         return TIME_OF_DAY
     if bare.lower().startswith("deg") and (scaled := re.fullmatch(r"(?i)deg_?\*?1?e-?(\d)", bare)):

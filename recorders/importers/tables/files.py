@@ -1,8 +1,8 @@
 """Opens files that hold tables, one like another: the names of columns, and batches of rows.
 
 CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), logs of a VBOX (.vbo),
-and the trajectories of benchmarks. A batch has an Arrow array for each column that is asked for; memory
-holds one at a time.
+of a FlySight and of NovAtel (ASCII), and the trajectories of benchmarks. A batch has an Arrow array for
+each column that is asked for; memory holds one at a time.
 """
 
 import bz2
@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, cast
 
@@ -42,6 +42,7 @@ from recorders.importers.tables.blocks import (
 )
 from recorders.importers.tables.layout import Layout, layout_of
 from recorders.importers.tables.npz import columns_of
+from recorders.importers.tables.tagged import Tagged, tagged_of
 from recorders.parsing import DEEPEST
 from recorders.trajectories import NO_END, read_trajectory
 
@@ -56,15 +57,12 @@ _SUFFIXES: dict[str, Format] = {
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 _BLOCK_ROWS = 1 << 17
-# How many lines there are at most before the data of a .vbo file, and what its columns are in.
+# How many lines there are at most before the data of a .vbo file, and what columns of a VBOX are in.
 _HEADER_LINES = 10_000
-_VBO_UNITS = {
-    "time": "hhmmss",
-    "lat": "arcmin",
-    "long": "-1 arcmin",
-    "velocity": "km/h",
-    "heading": "deg",
-}
+VBOX_UNITS = {
+    "time": "hhmmss", "lat": "arcmin", "latitude": "arcmin", "long": "-1 arcmin",
+    "longitude": "-1 arcmin", "velocity": "km/h", "heading": "deg",
+}  # fmt: skip
 # Arrow takes 10 kB for a column, however few rows there are.
 MOST_COLUMNS = 10_000
 # Of JSON, such as a quotation mark that ends no string.
@@ -158,7 +156,9 @@ def open_table(
     format = format or _SUFFIXES.get(suffix.lower(), "csv")  # noqa: A001
     try:
         if format == "csv":
-            found = _open_text(path, more, options)
+            with open_decompressed(path) as file:
+                tagged = tagged_of(file, path)
+            found = _open_tagged(path, tagged) if tagged else _open_text(path, more, options)
         elif format in ("rtklib", "vbo"):
             found = _open_rtklib(path) if format == "rtklib" else _open_vbo(path)
         else:
@@ -283,6 +283,21 @@ def _open_text(path: Path, more: Sequence[Path], options: TextOptions) -> Table:
     return Table(path, columns, read, left_out, units=units, doubts=doubts)
 
 
+def _open_tagged(path: Path, found: Tagged) -> Table:
+    columns, left_out, doubts = list(found.columns), Counter[str](), set[str]()
+    layout = Layout(columns, len(columns), ",", 0, (), [], 0)
+
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        with open_decompressed(path) as file:
+            rows = found.rows(blocks_of(file, doubts), left_out)
+            first = next((block for block in rows if block), None)
+            if first is None:
+                raise BadInput(f"{path}: has no rows of {found.what}; give a log or a table with them")
+            yield from _text_batches(chain([first], rows), columns, wanted, layout, ".", left_out)
+
+    return Table(path, columns, read, left_out, units=found.units, doubts=doubts)
+
+
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
     """Name columns; such as are empty, come again or are lacking are numbers from 1 on."""
     if len(names) > width:
@@ -377,7 +392,7 @@ def _open_vbo(path: Path) -> Table:
     named = titles if len(titles) == len(names) else names
     table = _open_text(path, (), TextOptions(named, has_header=False, delimiter=" ", skip=count))
     for name, short in zip(table.columns, names, strict=False):
-        if unit := _VBO_UNITS.get(short.lower()):
+        if unit := VBOX_UNITS.get(short.lower()):
             table.units[name] = unit
     return table
 

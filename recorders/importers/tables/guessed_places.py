@@ -85,6 +85,8 @@ def without_codes(table: GuessedTable) -> GuessedTable:
             known = tuple(code for code in _NOT_A_PLACE if _is_code(column.values, code, 90.0))
         elif re.fullmatch(r"(.*_)?(lon|lng|long)(gitude)?", column.plain):
             known = (181.0,) if _is_code(column.values, 181.0, 180.0) else ()
+        elif column.plain == "yaw" and "nsats" in plain:  # of ArduPilot, whose north is 360
+            known = (0.0,)
         elif re.fullmatch(ALTITUDE, column.plain) and np.nanmedian(column.values) > _LOWEST_M:
             known = _NO_ALTITUDE
         if found := [code for code in known if np.any(column.values == code)]:
@@ -203,10 +205,16 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         both[""] += [latitude.name, longitude.name]
     else:
         lines += [
-            f'units.{field} = "{name}"' + "   # positive to the west" * name.startswith("-")
+            f'units.{field} = "{name}"'
+            + "   # minutes that are positive to the west, as a VBOX has them" * name.startswith("-")
             for field, name in zip(("latitude_deg", "longitude_deg"), units, strict=True)
             if name != "deg"
         ]
+    if own == "arcmin":
+        lines.append(
+            f"{ASSUMED}{longitude.name} is positive to the east; units.longitude_deg = "
+            '"-1 arcmin" if to the west'
+        )
     zero = (degrees[0] == 0) & (degrees[1] == 0)
     if zero.any() and np.abs(np.nanmedian(degrees[0])) > 0.5:
         missing = table.prepared.setdefault("missing", {})
@@ -236,6 +244,8 @@ def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> No
 
 def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray:
     """Return a column with the signs of a column of hemispheres, if there is one."""
+    if column.name in table.prepared.get("hemispheres", {}):
+        return column.values
     sides = [
         name
         for name, cells in table.texts.items()

@@ -21,6 +21,7 @@ from recorders.importers.tables.columns import ASSUMED, TIME_OF_DAY, GuessedColu
 from recorders.importers.tables.files import Batch
 from recorders.importers.tables.order import Order, is_reversed, rollover_of
 from recorders.importers.tables.times import (
+    DIGITS,
     ISO,
     OWN_OFFSET,
     ZONED,
@@ -36,16 +37,21 @@ from recorders.models.geodesy import local_metres
 UNKNOWN_ZERO = "2026-01-01"
 # What times of FIT files count from in s, and where numbers are more likely of 1970.
 _FIT_ZERO, _FIT_END = "1989-12-31", 1.3e9
-_SIZES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# Unix time, in s, of 2000 and of 2100: what numbers that count from 1970 are between.
-_DATES_S = (946_684_800.0, 4_102_444_800.0)
+_SIZES = {unit: 10.0 ** (digits - 9) for unit, digits in DIGITS.items()}
+_LIKELY = ("s", "ms", "us", "ns")
+# Unix time, in s, of 2000 and of 2050: what numbers that count from 1970 are between.
+_DATES_S = (946_684_800.0, 2_524_608_000.0)
+# Unix time, in s, of the date and of a year later at which receivers begin whose clock was never set.
+_UNSET_S = (315_964_800.0, 347_500_800.0)
+# Nothing that is not a date counts longer, in s: a year.
+_LONGEST_S = 31_557_600.0
 _UNIT_WORDS = {
     "ms": r"ms|millis(ec(ond)?s?)?|msecs?",
     "us": r"us|micros(ec(ond)?s?)?|usecs?",
     "ns": r"ns|nanos(ec(ond)?s?)?|nsecs?",
 }
 _NAMED = re.compile(
-    r"time|stamp|utc|epoch|clock|zeit|^(s|ms|us|ns)$|"
+    r"(?<!life)time|stamp|utc|epoch|clock|zeit|^(s|ms|us|ns)$|"
     r"(^|_)(t|secs?|seconds?|i?tow|millis(econds?)?|micros(econds?)?|msecs?|usecs?|nsecs?|ticks?|elapsed)"
     r"(_|$|\d)|(^|_)(excel|serial_date|date_?num|mjd|julian)(_|$)"
 )
@@ -70,9 +76,19 @@ _VEHICLES = re.compile(
     r"(_?(id|no|nr|num|number|name|code|local_identifier|identifier|ident))?)|id|name"
 )
 _PARTS = (
-    ("year|yr|yyyy", "%Y"), ("month|mon|mm", "%m"), ("day|dd", "%d"),
+    ("doy|yday|julian_day|day_of_(the_)?year|ddd", "%j"),
+    ("year|yr|yyyy", "%Y"), ("month|mon|mm", "%m"), ("(?<!of_)(day|dd)", "%d"),
     ("hour|hr|hh", "%H"), ("minute|min", "%M"), ("second|sec|ss", "%S"),
 )  # fmt: skip
+_RANGES = {
+    "%Y": (1980, 2050), "%j": (1, 366), "%m": (1, 12), "%d": (1, 31), "%H": (0, 23), "%M": (0, 59),
+    "%S": (0, 60),
+}  # fmt: skip
+_DAYS_IN_PARTS = (["%Y", "%j"], ["%Y", "%m", "%d"])
+# Numbers of pictures, whose rate is stated elsewhere.
+_FRAMES = r"(.*_)?(frame|image|img)(_?(id|no|nr|num|number|idx|index|count|counter))?"
+# The clock of all messages of ArduPilot, and that of the computer that received them.
+_ARDUPILOT, _RECEIVED = "TimeUS", "timestamp"
 
 
 class GuessedTime(NamedTuple):
@@ -90,7 +106,10 @@ class GuessedTime(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,)."""
+    """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,).
+
+    `has_others` is whether there are other tables, with which it has to share a clock.
+    """
 
     path: Path
     batch: Batch
@@ -99,18 +118,26 @@ class _Table(NamedTuple):
     vehicle: str
     codes: NDArray[np.int64]
     kind: str
+    has_others: bool
 
 
 def guess_time(
-    path: Path, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+    path: Path,
+    batch: Batch,
+    columns: Sequence[GuessedColumn],
+    texts: Sequence[str],
+    *,
+    has_others: bool = False,
 ) -> GuessedTime:
-    """Guess the time of a table's rows.
+    """Guess the time of a table's rows; `has_others` is whether other tables are guessed with it.
 
     Raises BadInput if columns could be times, and it is not certain which they are.
     """
     plain = {column.plain for column in columns}
     vehicle = _vehicle(batch, columns, texts)
-    table = _Table(path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain))
+    table = _Table(
+        path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain), has_others
+    )
     refusals: list[BadInput] = []
     try:
         for mapping, comments in _candidates(table):
@@ -148,7 +175,9 @@ def _kind_of(plain: set[str]) -> str:
 def _vehicle(batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]) -> str:
     """Return the column that says whose row it is, of several; empty without one."""
     plain = {column.name: column.plain for column in columns} | {name: parted(name)[0] for name in texts}
-    is_placed = any(re.fullmatch(r"(.*_)?(lat(itude)?|x|east(ing)?)", each) for each in plain.values())
+    is_placed = any(
+        re.fullmatch(r"(.*_)?(lat(itude)?|x(_center)?|east(ing)?)", each) for each in plain.values()
+    )
     if not is_placed or any(re.fullmatch(r"(.*_)?(range|bearing)", each) for each in plain.values()):
         return ""
     return next(
@@ -197,6 +226,7 @@ def _parts(stamps: Stamps, codes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     """Yield what the time may be, the likeliest first; raises BadInput for what could be several."""
     dated: set[str] = set()
+    yield from _of_ardupilot(table)
     yield from _dates(table, dated)
     yield from _calendars(table)
     yield from _clocks_of_day(table)
@@ -204,7 +234,10 @@ def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     named = [column for column in table.columns if _NAMED.search(column.plain)]
     named.sort(key=lambda column: (_epoch_unit(column) == "", not re.search(_OF_HEADER, column.plain)))
     for column in named:
+        if not _epoch_unit(column):
+            _check_calendars(table)
         yield from _counted(table, column)
+    _check_calendars(table)
     _check_texts(table, dated)
     others = [column for column in table.columns if column.name not in {each.name for each in named}]
     for column in others:
@@ -222,6 +255,31 @@ def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
                 f'mapping by hand, with time = {{ column = "{column.name}", unit = ... }}, or with '
                 "`rate_hz` in `time`"
             )
+    _check_frames(table)
+
+
+def _of_ardupilot(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
+    """Yield the clock that all messages of ArduPilot have, so that several tables have one."""
+    by_name = {column.name: column for column in table.columns}
+    if _ARDUPILOT in by_name and (table.has_others or _RECEIVED in by_name):
+        received = by_name.get(_RECEIVED)
+        is_date = received is not None and _epoch_unit(received) == "s"
+        yield from _counted(table, received if received and is_date else by_name[_ARDUPILOT])
+
+
+def _check_frames(table: _Table) -> None:
+    """Raise BadInput for rows that are of several vehicles or counted as frames, and have no time."""
+    frames = next((each.name for each in table.columns if re.fullmatch(_FRAMES, each.plain)), "")
+    of_several = f"several vehicles, by column {table.vehicle}" if table.vehicle else ""
+    if not (frames or of_several):
+        return
+    whose = f', and in the table vehicle = "{table.vehicle}"' if table.vehicle else ""
+    of_frames = f"column {frames} counts frames, whose rate is not in the file" if frames else ""
+    column = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
+    raise BadInput(
+        f"{table.path}: {of_frames or 'no column could be the time of rows of ' + of_several}; write a "
+        f"mapping by hand with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
+    )
 
 
 def _rises(values: NDArray) -> bool:
@@ -529,25 +587,70 @@ def _zone(names: Sequence[str]) -> str:
 
 
 def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield year, month, day, hour, minute and second in columns of their own."""
-    found, taken = [], []
-    for pattern, letters in _PARTS:
-        column = next(
-            (each for each in table.columns if re.fullmatch(f"(.*_)?({pattern})", each.plain)), None
-        )
-        if column is None:
-            return
-        found.append(column.name)
-        taken.append(letters)
-    cells = [_first_cell(table.batch[name]) for name in found]
-    if not re.fullmatch(r"\d{4}", cells[0].partition(".")[0]):
+    """Yield year, month and day, or day of the year, and the time of day in columns of their own."""
+    parts = _parts_of_date(table)
+    day = [letters for letters in ("%Y", "%j", "%m", "%d") if letters in parts]
+    if day not in _DAYS_IN_PARTS:
         return
-    parts = [letters + ".%f" * ("." in cell) for letters, cell in zip(taken, cells, strict=True)]
-    mapping = TimeMapping(column=found, unit="date", format=" ".join(parts))
+    clock = [letters for letters in ("%H", "%M", "%S") if letters in parts]
+    if clock == ["%H", "%M", "%S"]:
+        found = [parts[letters] for letters in (*day, *clock)]
+        cells = [_first_cell(table.batch[name]) for name in found]
+        formats = [
+            letters + ".%f" * ("." in cell) for letters, cell in zip([*day, *clock], cells, strict=True)
+        ]
+    else:
+        of_day = {name: next(formats_of(_first_cell(table.batch[name]))) for name in table.texts}
+        name = next((name for name in of_day if of_day[name].startswith(("%H", "%I"))), "")
+        if not name:
+            return
+        found = [*(parts[letters] for letters in day), name]
+        formats = [*day, of_day[name]]
     yield (
-        mapping,
+        TimeMapping(column=found, unit="date", format=" ".join(formats)),
         [f"{ASSUMED}{', '.join(found)} are in UTC, as no zone is stated; utc_offset_h or zone"],
     )
+
+
+def _parts_of_date(table: _Table) -> dict[str, str]:
+    """Return the columns with a year and other parts of a time, by letters; none without a year."""
+    found: dict[str, str] = {}
+    for pattern, letters in _PARTS:
+        for column in table.columns:
+            if column.name not in found.values() and re.fullmatch(f"(.*_)?({pattern})", column.plain):
+                found.setdefault(letters, column.name)
+    if "%j" in found:
+        found = {letters: name for letters, name in found.items() if letters not in ("%m", "%d")}
+    if all(column.name.isdecimal() for column in table.columns):
+        found = _nameless_parts(table)
+    cell = _first_cell(table.batch[found["%Y"]]) if "%Y" in found else ""
+    return found if re.fullmatch(r"(19|20)\d\d", cell.partition(".")[0]) else {}
+
+
+def _nameless_parts(table: _Table) -> dict[str, str]:
+    """Return what `_parts_of_date` does by the numbers of columns without names; none if unclear."""
+    fitting = []
+    for day in _DAYS_IN_PARTS:
+        own = {
+            letters: column.name
+            for letters, column in zip([*day, "%H", "%M", "%S"], table.columns, strict=False)
+            if _RANGES[letters][0] <= np.nanmin(column.values)
+            and np.nanmax(column.values) <= _RANGES[letters][1]
+            and (letters == "%S" or _are_whole(column.values))
+        }
+        fitting += [own] if len(own) == len(day) + 3 else []
+    return fitting[0] if len(fitting) == 1 else {}
+
+
+def _check_calendars(table: _Table) -> None:
+    """Raise BadInput for dates in several columns whose time of day is in no form that is known."""
+    parts = _parts_of_date(table)
+    if [letters for letters in ("%Y", "%j", "%m", "%d") if letters in parts] in _DAYS_IN_PARTS:
+        raise BadInput(
+            f"{table.path}: columns {', '.join(parts.values())} hold the date in parts, and the time of "
+            "day is in no form that is known; add a column of times such as 2026-05-03T10:00:00Z, or "
+            'state in `time` of a mapping the columns and their format, such as "%Y %j %H %M %S"'
+        )
 
 
 def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
@@ -658,7 +761,7 @@ def _epoch_unit(column: GuessedColumn) -> str:
     if not len(known):
         return ""
     middle = float(np.median(known))
-    units = [stated] if (stated := _stated_unit(column)) else list(_SIZES)
+    units = [stated] if (stated := _stated_unit(column)) else _LIKELY
     return next((unit for unit in units if _DATES_S[0] < middle * _SIZES[unit] < _DATES_S[1]), "")
 
 
@@ -680,25 +783,33 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             f"{table.path}: column {column.name} counts days, by its name; convert them to seconds or "
             "dates, and state these in `time`"
         )
-    if not unit:
+    if unit in ("", "s") and _LONGEST_S < largest < _FIT_END and _is_fit(table):
+        unit, zero = "s", {"zero": _FIT_ZERO}
+        comments = [f"{ASSUMED}{column.name} counts from {_FIT_ZERO}, as files of FIT have it; zero"]
+    elif not unit and _UNSET_S[0] < float(known.min()) and largest < _UNSET_S[1]:
+        unit = "s"
+        comments = [
+            f"{ASSUMED}{column.name} counts in s from 1970, by a clock that was never set, as it begins "
+            "in 1980; zero"
+        ]
+    elif not unit:
         zero = {"zero": UNKNOWN_ZERO}
         unit, why = _stated_unit(column), ""
         if not unit:
             unit, why = _relative_unit(table, column, step)
-        if largest * _SIZES[unit] > _DATES_S[1]:
+        if largest * _SIZES[unit] > _LONGEST_S:
             raise BadInput(
                 f"{table.path}: column {column.name} could be the time, and reaches {largest:.6g}, "
-                "which is "
-                f"beyond 2100 in {unit}; write a mapping by hand with the `unit` and `zero` of `time`"
+                f"which in {unit} is neither a date since 1970 nor less than a year; write a mapping by "
+                'hand with the `unit` and `zero` of `time`, such as zero = "1904-01-01"'
             )
         comments = [
             f"# Stamps begin at {known[0]:g}.",
             f"{ASSUMED}{column.name} counts in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; "
             "unit, zero",
         ]
-    elif unit == "s" and largest < _FIT_END and _is_fit(table):
-        zero = {"zero": _FIT_ZERO}
-        comments = [f"{ASSUMED}{column.name} counts from {_FIT_ZERO}, as files of FIT have it; zero"]
+    elif "gps" in column.plain and unit == "s":
+        comments = [f"{ASSUMED}{column.name} counts from 1970, not from GPS's 1980-01-06; zero"]
     given = {"column": column.name, "unit": unit, **zero}
     yield TimeMapping.model_validate(given), comments
 
@@ -710,11 +821,11 @@ def _is_fit(table: _Table) -> bool:
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:
     """Return the unit of a counter of unknown zero, and why: by its steps, if speeds do not tell."""
     if (ratio := _seconds_a_count(table, column)) is not None:
-        nearest = min(_SIZES, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
+        nearest = min(_LIKELY, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
         if abs(np.log10(_SIZES[nearest] / ratio)) < 1.0:
             return nearest, ", by which places move as fast as the speed says,"
     least_s = _STEPS_S[table.kind]
-    fitting = [unit for unit, size in _SIZES.items() if least_s <= step * size < 1000 * least_s]
+    fitting = [unit for unit in _LIKELY if least_s <= step * _SIZES[unit] < 1000 * least_s]
     unit = fitting[0] if fitting else "s" if step >= 1 else "ns"
     rate_hz = 1.0 / (step * _SIZES[unit])
     if not 1e-5 < rate_hz < 2e4:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME, Stamps
+from recorders.importers.tables.cells import sided
 from recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
 from recorders.importers.tables.columns import (
     ASSUMED,
@@ -29,6 +30,7 @@ from recorders.importers.tables.columns import (
     underlined,
     unit_in,
 )
+from recorders.importers.tables.devices import of_device
 from recorders.importers.tables.exports import export_mapping
 from recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
 from recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
@@ -135,9 +137,11 @@ def _table(source: Source, *, is_alone: bool) -> str:
     """Write one [[tables]] of a mapping, with its streams."""
     path, name = source.path, source.name
     table, batch, decimal, split = _first_rows(source)
-    columns, texts = [], []
+    columns, texts, with_side = [], [], []
     for column in table.columns:
         values = _numbers(batch[column])
+        if values is None and (values := _sided(column, batch[column])) is not None:
+            with_side.append(column)
         if values is None:
             texts.append(column)
         else:
@@ -148,11 +152,21 @@ def _table(source: Source, *, is_alone: bool) -> str:
             unknown = "" if unit else below or (inside[1] if inside else "")
             columns.append(GuessedColumn(column, plain, unit, values, unknown))
     _check_kinds(path, table.columns, batch)
-    columns = _in_frame(_without_denied(_of_sensor(columns, path)), path)
+    columns = of_device(_in_frame(_without_denied(_of_sensor(columns, path)), path))
     exported = export_mapping(path, table.columns, batch)
-    time = None if exported else _time(source, batch, columns, texts)
+    time = None if exported else _time(source, batch, columns, texts, has_others=not is_alone)
     used = time.used if time else set()
     is_timed = bool(used or exported or source.stamps)
+    unread = [
+        f"column {text} holds places such as '{found}', which are no numbers; convert them to degrees"
+        for text in texts
+        if re.search(_PLACE, parted(text)[0])
+        and (
+            found := next((cell for cell in batch[text].to_pylist() if re.search(r"\d", cell or "")), "")
+        )
+    ]
+    if unread and not columns:
+        raise BadInput(f"{path}: {unread[0]}")
     if not columns or (not is_timed and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
@@ -196,7 +210,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
         list(left),
         [],
         [],
-        {},
+        {"hemispheres": {column: column for column in with_side}} if with_side else {},
     )
     every = _in_order(without_codes(every), batch, time.vehicle)
     of_truth = true_columns(every.columns, is_reference=is_reference)
@@ -205,12 +219,6 @@ def _table(source: Source, *, is_alone: bool) -> str:
     streams = [line for guessed in GUESSES for line in guessed(rest)]
     plain_numbers = [column.name for column in rest.columns]
     streams += [*_rest(rest), *truth_lines(true)]
-    unread = [
-        f"column {text} holds places such as '{found}', which are no numbers; convert them to degrees"
-        for text in texts
-        if re.search(_PLACE, parted(text)[0])
-        and (found := next((cell for cell in cells[text] if re.search(r"\d", cell)), ""))
-    ]
     rest.made.extend(_unknown_units([each for each in every.whole if each.name not in plain_numbers]))
     if not streams:
         nothing = "has no column of numbers beside its time; write a mapping by hand"
@@ -292,11 +300,16 @@ def _without_denied(columns: list[GuessedColumn]) -> list[GuessedColumn]:
 
 
 def _time(
-    source: Source, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+    source: Source,
+    batch: Batch,
+    columns: Sequence[GuessedColumn],
+    texts: Sequence[str],
+    *,
+    has_others: bool,
 ) -> GuessedTime:
     """Guess the time of rows, which may be in a file of its own."""
     if source.stamps is None:
-        return guess_time(source.path, batch, columns, texts)
+        return guess_time(source.path, batch, columns, texts, has_others=has_others)
     path, name = source.stamps
     cells = pa.array(stamps_in(path)[: len(next(iter(batch.values())))], pa.string())
     values = _numbers(cells)
@@ -400,6 +413,18 @@ def _numbers(cells: pa.Array) -> NDArray | None:
     except pa.ArrowException:
         return None
     return found if np.isfinite(found).any() else None
+
+
+def _sided(name: str, cells: pa.Array) -> NDArray | None:
+    """Read a column of places such as 48.1N, with signs; None if it holds others."""
+    if not (re.search(_PLACE, parted(name)[0]) and pa.types.is_string(cells.type)):
+        return None
+    numbers, letters = sided(cells)
+    known = pc.fill_null(pc.not_equal(pc.utf8_trim_whitespace(cells), ""), False)
+    if not pc.all(pc.is_in(letters.filter(known), pa.array([*"NSEW"]))).as_py():
+        return None
+    is_south = pc.fill_null(pc.is_in(letters, pa.array(["S", "W"])), False)
+    return floats(pc.if_else(is_south, pc.negate(numbers), numbers))
 
 
 # What columns are together.

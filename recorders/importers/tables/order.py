@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.times import TimeMapping
+from recorders.importers.tables.times import DIGITS, TimeMapping
 
 # How many rows in a row, and by how many usual steps, are behind a row before where a clock began again.
 _ROWS, _STEPS = 10, 5.0
@@ -31,7 +31,7 @@ class Order:
 
     def __init__(self, label: str, mapping: TimeMapping) -> None:
         self._label, self._is_any = label, mapping.order == "any"
-        self._unit_ns = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}.get(str(mapping.unit), 0)
+        self._unit_ns = 10 ** DIGITS[str(mapping.unit)] if str(mapping.unit) in DIGITS else 0
         self._zero_ns = mapping.zero_ns
         self._usual_ns = 0.0
         self._first_ns = self._reached_ns = NOT_A_TIME

@@ -29,7 +29,7 @@ from recorders.importers.mapping import (
 )
 from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
 from recorders.importers.tables.blocks import lines_of
-from recorders.importers.tables.cells import read_ns
+from recorders.importers.tables.cells import read_ns, sided
 from recorders.importers.tables.files import (
     Batch,
     Table,
@@ -206,18 +206,23 @@ class Rows:
         column = self.table.column(source)
         if column in self._numbers_of:
             return self._numbers_of[column]
+        sides = batch[self._halves[column]] if column in self._halves else None
         try:
-            found = floats(batch[column])
+            if sides is not None and self._halves[column] == column:
+                numbers, sides = sided(batch[column])
+                found = floats(numbers)
+            else:
+                found = floats(batch[column])
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             raise BadInput(
                 f"{self.path}: column {column} has cells that are not numbers; give a column of numbers"
             ) from None
         if self._is_prepared:
-            found = self._prepared(batch, column, found)
+            found = self._prepared(column, found, sides)
             self._numbers_of[column] = found
         return found
 
-    def _prepared(self, batch: Batch, column: str, found: NDArray) -> NDArray:
+    def _prepared(self, column: str, found: NDArray, sides: pa.Array | None) -> NDArray:
         """Return a column's numbers (n,) without codes of missing values, in degrees and with a sign."""
         for code in self._missing.get(column, []):
             is_missing = found == code
@@ -233,8 +238,8 @@ class Rows:
                     "minutes (ddmm.mmmm); leave it out of degrees_minutes"
                 )
             found = np.copysign(np.floor(size / 100.0) + minutes / 60.0, found)
-        if column in self._halves:
-            sides = pc.utf8_upper(pc.utf8_trim_whitespace(batch[self._halves[column]].cast(pa.string())))
+        if sides is not None:
+            sides = pc.utf8_upper(pc.utf8_trim_whitespace(sides.cast(pa.string())))
             letters = sides.to_numpy(zero_copy_only=False).astype(str)
             initials = np.char.ljust(letters, 1).astype("<U1")
             is_south, is_north = np.isin(initials, ["S", "W"]), np.isin(initials, ["N", "E"])

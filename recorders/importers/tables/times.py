@@ -20,13 +20,15 @@ from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
 from recorders.importers.tables.cells import read_ns
 from recorders.parameters import Parameters
 
-CountUnit = Literal["s", "ms", "us", "ns"]
-Unit = Literal["s", "ms", "us", "ns", "date"]
+CountUnit = Literal["s", "ms", "0.1 ms", "us", "ns"]
+Unit = Literal["s", "ms", "0.1 ms", "us", "ns", "date"]
 # How many digits after the second (or what else the unit is) are nanoseconds.
-_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+DIGITS = {"s": 9, "ms": 6, "0.1 ms": 5, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
 _WEEKS = 1024  # after which receivers with ten bits begin again at 0
 _WEEK_NS = 7 * 86400 * 10**9
+# What does not go with a column of frames.
+_UNCOUNTED = {"unit", "week", "rollover"}
 MEND = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
 # Hours ahead of UTC of zones by their short names, as far as these mean one zone.
@@ -43,6 +45,9 @@ _OFFSET = re.compile(r"(?<=\d)( ?)([Zz]|[-+][01]\d:?\d\d)$")
 _SPACED = r"(:[\d.]+) ([-+]\d\d:?\d\d)$"
 _CLOCK = r"(?:([ T,]*)(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
 _WRITTEN = re.compile(r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?" + _CLOCK)
+# With the day of the year, and with a time of day as AndroSensor and names of files have it.
+_ORDINAL = re.compile(r"\d{4}([-:./ ])\d{3}(?:([ T:])(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?)?")
+_DASHED = re.compile(r"\d{4}-\d\d-\d\d[ _T]\d\d(-\d\d-\d\d([_:.]\d{1,6})?|:\d\d:\d\d:\d{1,6})")
 # With the name of the month in second or first place.
 _DAY_MONTH = re.compile(r"\d{1,2}([-/. ])([A-Z][a-z]{2,8})\1\d{4}" + _CLOCK)
 _MONTH_DAY = re.compile(r"([A-Z][a-z]{2,8}) \d{1,2}(,?) \d{4}" + _CLOCK)
@@ -62,7 +67,8 @@ class TimeMapping(Parameters):
             has its own, such as ["s", "ns"], and they are added.
         zero: date that numbers count from; by default 1970-01-01, with `week` 1980-01-06.
         week: column of GPS weeks; `column` then has the seconds of the week.
-        rate_hz: rows per second of files without stamps, from `zero` on.
+        rate_hz: rows per second of files without stamps, from `zero` on; with `column`, how many of its
+            counts there are in a second, as of numbers of frames.
         utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
         zone: name of the zone of these clocks, such as Europe/Berlin, which knows summer time, or CET.
         format: format of dates that are not as ISO 8601 has them, in the letters of strptime; of times
@@ -95,8 +101,17 @@ class TimeMapping(Parameters):
 
     @model_validator(mode="after")
     def _check(self) -> "TimeMapping":
-        if bool(self.columns) + (self.rate_hz is not None) + (self.file is not None) != 1:
+        if bool(self.columns or self.rate_hz) + (self.file is not None) != 1:
             raise ValueError("give either `column`, which has the times, or `rate_hz`, or `file`")
+        if (
+            self.rate_hz
+            and self.columns
+            and (len(self.columns) > 1 or self.model_fields_set & _UNCOUNTED)
+        ):
+            raise ValueError(
+                "`rate_hz` beside `column` counts numbers of frames in one column; leave out `unit`, "
+                "`week` and `rollover`, or `rate_hz`"
+            )
         counted = len(self.columns) - bool(self.week)
         if isinstance(self.unit, list) and len(self.unit) != counted:
             raise ValueError(f"unit has {len(self.unit)} units for {counted} columns; give one for each")
@@ -174,6 +189,12 @@ def formats_of(cell: str) -> Iterator[str]:
     if named := _MONTH_DAY.fullmatch(bare):
         yield f"{_month(named[1])} %d{named[2]} %Y" + _of_day(*named.groups()[2:]) + of_offset
         return
+    if ordinal := _ORDINAL.fullmatch(bare):
+        yield f"%Y{ordinal[1]}%j" + _of_day(*ordinal.groups()[1:]) + of_offset
+        return
+    if _DASHED.fullmatch(bare):
+        yield _dashed(bare)
+        return
     found = _WRITTEN.fullmatch(bare) or _WRITTEN.fullmatch(re.sub(ZONED, "", bare))
     if not (bare and found):
         yield ISO
@@ -201,8 +222,19 @@ def _month(name: str) -> str:
     return "%b" if len(name) == 3 else "%B"
 
 
+def _dashed(cell: str) -> str:
+    """Return the format of a date and a time of day that are as `_DASHED` has them."""
+    marks = re.split(r"\d+", cell)[1:-1]
+    parts = ("%Y", "%m", "%d", "%H", "%M", "%S", "%f")
+    return "".join(part + mark for part, mark in zip(parts, [*marks, ""], strict=False))
+
+
 def _of_day(
-    between: str | None, clock: str | None, second: str | None, point: str | None, half: str | None
+    between: str | None,
+    clock: str | None,
+    second: str | None,
+    point: str | None,
+    half: str | None = None,
 ) -> str:
     """Return the format of a time of day as `_CLOCK` takes it apart."""
     if not clock:
@@ -272,8 +304,9 @@ def stamps_ns(
     """
     reading = reading or Reading()
     if mapping.rate_hz is not None:
+        counts = rows if not mapping.columns else _frames(columns[mapping.columns[0]], mapping, where)
         return to_ns(
-            rows / mapping.rate_hz,
+            counts / mapping.rate_hz,
             10**9,
             mapping.zero_ns,
             where=where,
@@ -287,7 +320,7 @@ def stamps_ns(
         units = mapping.units
         found = np.zeros(len(cells[0]), np.int64)
         for each, unit in zip(cells, units, strict=False):
-            found = read_ns(each, _DIGITS[unit], found, where=label, mend=MEND)
+            found = read_ns(each, DIGITS[unit], found, where=label, mend=MEND)
         if mapping.week:
             weeks = read_ns(cells[-1], 0, where=label, mend=MEND)
             known = weeks[weeks != NOT_A_TIME]
@@ -299,12 +332,19 @@ def stamps_ns(
                 )
             found = to_ns(weeks, _WEEK_NS, found, where=label, mend=MEND)
         if mapping.rollover is not None:
-            rollover_ns = round(mapping.rollover * 10 ** _DIGITS[units[0]])
+            rollover_ns = round(mapping.rollover * 10 ** DIGITS[units[0]])
             found = reading.continued_ns(found, rollover_ns, label)
         found = to_ns(found, 1, mapping.zero_ns, where=label, mend=MEND)
     if np.any(found[found != NOT_A_TIME] < 0):
         raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {MEND}")
     return found
+
+
+def _frames(cells: pa.Array, mapping: TimeMapping, where: str) -> NDArray[np.float64]:
+    """Return numbers of frames (n,), NaN for empty cells."""
+    label = f"{where}: column {mapping.columns[0]}"
+    counts = read_ns(cells, 0, where=label, mend="give a column of whole numbers")
+    return np.where(counts == NOT_A_TIME, np.nan, counts)
 
 
 def _dates_ns(

@@ -29,7 +29,7 @@ _LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info
 
 
 class Rows(NamedTuple):
-    """Holds some rows (n,) of a topic's instance, in the order of the file.
+    """Holds some rows (n,) of a topic's instance, in the order of the file, or of their stamps.
 
     `time_us` are their stamps, for rows without one those between which they lie in the file, of which
     `untimed` counts how many.
@@ -244,7 +244,7 @@ class UlogFile:
         for position, kind, body in others:
             self._take(kind, body, int(of.reached[np.searchsorted(at, position)]))
         self._last_us = int(of.reached[-1])
-        return end, is_broken, rows
+        return end, is_broken, _joined(rows)
 
     def _count_strays(
         self, which: NDArray[np.int64], data: NDArray[np.uint8], at: NDArray[np.int64]
@@ -311,6 +311,22 @@ class UlogFile:
                 raise Damaged("messages of a type that is not known")
         except Damaged as why:
             self.losses[str(why)] += 1
+
+
+def _joined(rows: list[Rows]) -> list[Rows]:
+    """Join the rows of each topic's instance, which may have several numbers, by their stamps."""
+    of_key: dict[tuple[str, int], list[Rows]] = {}
+    for each in rows:
+        of_key.setdefault((each.topic, each.instance), []).append(each)
+    joined = []
+    for key, parts in of_key.items():
+        if len(parts) > 1:
+            time_us = np.concatenate([each.time_us for each in parts])
+            order = np.argsort(time_us, kind="stable")
+            data = np.concatenate([each.data for each in parts])[order]
+            parts = [Rows(*key, data, time_us[order], sum(each.untimed for each in parts))]
+        joined += parts
+    return joined
 
 
 def _message(data: NDArray[np.uint8], position: int) -> tuple[str, bytes]:

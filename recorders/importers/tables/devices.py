@@ -1,0 +1,42 @@
+"""Knows the units and axes of devices that their files do not state, by the names of their columns."""
+
+import numpy as np
+
+from recorders.importers.tables.columns import GuessedColumn, known_of
+from recorders.importers.tables.files import VBOX_UNITS
+
+# The counter of Xsens, and at how many samples a second it is in us, as of a DOT, else in 0.1 ms.
+_XSENS, _DOT_RATES_HZ = "SampleTimeFine", np.array([1, 4, 10, 12, 15, 20, 30, 60, 120])
+# What a VBOX calls its columns in tables.
+_VBOX = (
+    {"sats", "time", "lat", "long", "velocity", "heading", "height"},
+    {"satellites", "time", "latitude", "longitude", "velocity", "heading", "height"},
+)
+# An inertial unit of ArduPilot, whose axes are forward, right, down.
+_ARDUPILOT = ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
+# The largest latitude in deg, and in minutes.
+_LARGEST_LATITUDE = (90.0, 5400.0)
+
+
+def of_device(columns: list[GuessedColumn]) -> list[GuessedColumn]:
+    """Return the columns with the units and axes that those of a device have."""
+    units = {}
+    by_name = {column.name: column for column in columns}
+    if by_name.keys() >= {*_ARDUPILOT} and np.nanmedian(by_name[_ARDUPILOT[-1]].values) < 0:
+        columns = [
+            each._replace(frame="ned") if each.name in _ARDUPILOT[1:] else each for each in columns
+        ]
+    for column in columns:
+        if column.name == _XSENS:
+            steps = np.abs(np.diff(known_of(column)))
+            rate_hz = 1e6 / np.median(steps) if steps.any() else 0.0
+            units[column.name] = (
+                "us" if np.isclose(rate_hz, _DOT_RATES_HZ, rtol=0.01).any() else "0.1 ms"
+            )
+    plain = {column.plain: column for column in columns}
+    if any(names <= plain.keys() for names in _VBOX):
+        latitude = plain.get("lat") or plain["latitude"]
+        if _LARGEST_LATITUDE[0] < np.nanmax(np.abs(latitude.values)) <= _LARGEST_LATITUDE[1]:
+            of_vbox = {name: each for name, each in plain.items() if name in VBOX_UNITS}
+            units |= {each.name: each.unit or VBOX_UNITS[name] for name, each in of_vbox.items()}
+    return [each._replace(unit=units.get(each.name, each.unit)) for each in columns]

@@ -1,0 +1,86 @@
+"""Picks one kind of row out of receivers' logs whose lines begin with what they are."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from recorders.errors import BadInput
+from recorders.importers.tables.blocks import lines_of
+
+_HEADER_LINES = 1000
+_NOVATEL = re.compile(rb"[#%][A-Z0-9]{3,}A,")
+_NMEA = re.compile(rb"[$!](G[A-Z]|BD|QZ|AI|II|HE)[A-Z]{3},")
+_INSPVA = (
+    "week", "seconds_of_week", "latitude", "longitude", "height", "vel_n", "vel_e", "vel_u", "roll",
+    "pitch", "heading", "status",
+)  # fmt: skip
+_NO_SOLUTION = re.compile(
+    rb",(INS_INACTIVE|INS_ALIGNING|WAITING_|DETERMINING_ORIENTATION|MOTION_DETECT|INERTIAL_SOLUTION_NOT)"
+)
+_INSPVA_UNITS = {
+    "seconds_of_week": "s", "latitude": "deg", "longitude": "deg", "height": "m", "vel_n": "m/s",
+    "vel_e": "m/s", "vel_u": "m/s", "roll": "deg", "pitch": "deg", "heading": "deg",
+}  # fmt: skip
+
+
+class Tagged(NamedTuple):
+    """Describes the rows of one kind: how they begin, between which marks, columns and their units.
+
+    `invalid` is found in rows that say that they have no solution.
+    """
+
+    what: str
+    begins: tuple[bytes, ...]
+    after: bytes
+    before: bytes
+    columns: tuple[str, ...]
+    units: dict[str, str]
+    invalid: re.Pattern[bytes] | None = None
+
+    def rows(self, blocks: Iterable[bytes], left_out: Counter[str]) -> Iterator[bytes]:
+        """Yield the cells of this kind's rows, block by block; count the lines of others."""
+        for block in blocks:
+            lines = block.splitlines()
+            own = [line for line in lines if line.startswith(self.begins)]
+            valid = [line for line in own if not (self.invalid and self.invalid.search(line))]
+            if len(own) < len(lines):
+                left_out[f"that are not {self.what}"] += len(lines) - len(own)
+            if len(valid) < len(own):
+                left_out["that say that they have no solution"] += len(own) - len(valid)
+            cells = (line.partition(self.after)[2].partition(self.before)[0] for line in valid)
+            yield b"".join(each + b"\n" for each in cells)
+
+
+def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
+    """Return which rows of a receiver's log are read, by its first lines; None for another file.
+
+    Raises BadInput if it is such a log of other rows.
+    """
+    lines = [line.rstrip() for line in islice(lines_of(file), 1)]
+    first = lines[0] if lines else b""
+    if _NMEA.match(first):
+        raise BadInput(
+            f"{path}: holds sentences of NMEA, which are no table; convert it first, such as by "
+            "gpsbabel -i nmea -f FILE -o unicsv -F track.csv"
+        )
+    if _NOVATEL.match(first):
+        begins = b"#INSPVAA,", b"%INSPVASA,"
+        return Tagged("INSPVAA of NovAtel", begins, b";", b"*", _INSPVA, _INSPVA_UNITS, _NO_SOLUTION)
+    if not first.startswith(b"$FLYS,"):
+        return None
+    said = {
+        tuple(cells[:2]): cells[2:]
+        for line in islice(lines_of(file), _HEADER_LINES)
+        if len(cells := line.decode("utf-8", "replace").strip().split(",")) > 2
+    }
+    names, units = said.get(("$COL", "GNSS")), said.get(("$UNIT", "GNSS"), [])
+    if names is None:
+        raise BadInput(
+            f"{path}: is a log of a FlySight without rows of GNSS; give its TRACK.CSV, or a table of "
+            "one kind of rows with their names above"
+        )
+    of_columns = {name: unit for name, unit in zip(names, units, strict=False) if unit}
+    return Tagged("GNSS of a FlySight", (b"$GNSS,",), b",", b"\r", tuple(names), of_columns)
