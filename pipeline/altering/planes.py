@@ -7,7 +7,7 @@ from functools import partial
 from pipeline.altering.changes import Change
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, schemas
-from recorders.log.planes import LATITUDE, Origin, is_framed, is_planar, stated_in
+from recorders.log.planes import LATITUDE, Origin, frame_of, is_planar, stated_in
 from replay.engine.streams.planes import into_plane_of
 
 
@@ -36,7 +36,7 @@ def in_one_plane(
     truths = [each for each in origins if stating[each].schema_name == schemas.TRUTH_STATE.full_name]
     into = origins[[*truths, *origins][0]]
     for topic, own in stating.items():
-        silent = LATITUDE not in own.metadata and not is_framed(own.metadata)
+        silent = LATITUDE not in own.metadata and not frame_of(own.metadata)
         if silent and is_planar(own.schema_name, own.metadata):
             first, other = (
                 next(each for each, origin in origins.items() if (origin == into) is wanted)

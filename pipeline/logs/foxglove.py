@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from recorders.extras import extra
 from recorders.log import Companion, Stream, schemas
+from recorders.log.planes import FRAME, body_of
 from replay.engine.streams.measurements import PLANE, covariances_of
 from replay.judging.errors.evaluation import Floats
 from replay.judging.errors.trajectory_streams import trajectory_of
@@ -107,7 +108,8 @@ def _poses(
         if quaternions is not None:
             transforms = FrameTransforms()
             turned = transforms.transforms.add(
-                parent_frame_id=pose.frame_id, child_frame_id=_child_of(stream)
+                parent_frame_id=pose.frame_id,
+                child_frame_id=body_of(stream.topic, stream.metadata),
             )
             turned.timestamp.CopyFrom(pose.timestamp)
             _set_vector(turned.translation, places[row])
@@ -259,18 +261,8 @@ def _padded(places: Floats) -> Floats:
 
 
 def _frame_of(stream: Stream) -> str:
-    """Return the frame that a stream states; what a sensor detects is in that of its case."""
-    is_seen = stream.schema.full_name == schemas.DETECTION.full_name
-    return stream.metadata.get("frame_id") or (_case_of(stream) if is_seen else WORLD)
-
-
-def _child_of(stream: Stream) -> str:
-    return stream.metadata.get("child_frame_id") or _case_of(stream)
-
-
-def _case_of(stream: Stream) -> str:
-    """Name a frame by what a topic is of: its name without the last part."""
-    return stream.topic.strip("/").rpartition("/")[0] or stream.topic.strip("/")
+    """Return the frame that a stream states, else that of the log."""
+    return stream.metadata.get(FRAME) or WORLD
 
 
 _MAKERS: dict[str, Callable[[Stream], Made]] = {

@@ -22,6 +22,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from recorders.common_streams import truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
+from recorders.log.planes import in_frame
 from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.parsing import parse_json
@@ -288,7 +289,14 @@ def _sensor_streams(
     make: Callable[..., Stream] = make_stream
     clocks = {"publish_time_ns": scans.time_ns[owner], "log_time_ns": scans.arrival_ns[owner]}
     if seen.shape[1] == 2:
-        yield make(f"{prefix}/detection", schemas.DETECTION, **clocks, scan_id=scan_id, position_m=seen)
+        yield make(
+            f"{prefix}/detection",
+            schemas.DETECTION,
+            **clocks,
+            metadata=in_frame(prefix.strip("/")),
+            scan_id=scan_id,
+            position_m=seen,
+        )
     else:
         yield make(
             f"{prefix}/bearing", schemas.SCAN_BEARING, **clocks, scan_id=scan_id, bearing_rad=seen[:, 0]

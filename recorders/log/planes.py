@@ -1,6 +1,7 @@
-"""Reads the planes that positions are in: east, north, up of an origin, as channels state it.
+"""Reads the planes and frames that positions are in, as channels state them.
 
-A channel that states no origin is in the plane of its log, unless it names a frame of its own.
+A plane is east, north, up of an origin. A channel that states no origin is in the plane of its log,
+unless it names a frame of its own.
 """
 
 import math
@@ -25,7 +26,7 @@ LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
     "origin_longitude_deg",
     "origin_altitude_m",
 )
-FRAME = "frame_id"
+FRAME, BODY = "frame_id", "child_frame_id"
 EXAMPLE = "latitude and longitude in deg, and altitude in m, such as 49.01,8.4,115"
 _STATES = (TRUTH_STATE.full_name, GAUSSIAN_ESTIMATE.full_name)
 _PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_FIX, GEODETIC_FIX)}
@@ -82,9 +83,29 @@ def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
     return schema_name in _PLANAR
 
 
-def is_framed(metadata: Mapping[str, str]) -> bool:
-    """Tell whether a channel names a frame of its own, and does not state where on earth that is."""
-    return LATITUDE not in metadata and bool(metadata.get(FRAME))
+def frame_of(metadata: Mapping[str, str]) -> str:
+    """Return the frame of its own that a channel names; empty for the plane of the log."""
+    return "" if LATITUDE in metadata else metadata.get(FRAME, "")
+
+
+def in_frame(frame: str) -> dict[str, str]:
+    """Return what the channel of positions in a frame states; nothing for the plane of the log."""
+    return {FRAME: frame} if frame else {}
+
+
+def body_of(topic: str, metadata: Mapping[str, str]) -> str:
+    """Name the frame whose pose the states of a topic are: as stated, else the topic's namespace.
+
+    >>> body_of("/radar/truth", {})
+    'radar'
+    """
+    name = topic.strip("/")
+    return metadata.get(BODY) or name.rpartition("/")[0] or name
+
+
+def frame_in_words(frame: str) -> str:
+    """Name a frame as `frame_of` gives it."""
+    return f"frame {frame}" if frame else "the plane of the log"
 
 
 def plane_in_words(metadata: Mapping[str, str]) -> str:

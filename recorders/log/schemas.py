@@ -283,7 +283,7 @@ TWIST = _declare(
 )
 DETECTION = _declare(
     "Detection",
-    "One element of an unordered scan, in the sensor's frame.",
+    "One element of an unordered scan, in the frame that the channel names, else in the log's plane.",
     _identifier("scan_id"),
     _vector("position_m"),
 )

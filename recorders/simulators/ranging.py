@@ -14,6 +14,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
+from recorders.log.planes import in_frame
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
@@ -138,6 +139,7 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
                 "/tags",
                 schemas.BODY_POINT,
                 np.repeat(start_ns, len(tags)),
+                metadata=in_frame("trolley"),
                 point_id=np.arange(len(tags)),
                 position_m=tags,
             ),

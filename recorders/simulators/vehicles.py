@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from recorders.common_streams import prior_stream, stated_numbers, truth_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
+from recorders.log.planes import FRAME, body_of
 from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import into_frame, turn
@@ -332,6 +333,8 @@ def _scan_streams(
         "detection_probability": repr(sensor.detection_probability),
         "clutter_per_m2": repr(sensor.clutter_per_scan / parameters.field_area_m2),
     }
+    if isinstance(sensor, Infrastructure):
+        stated[FRAME] = body_of(f"{prefix}/truth", {})
     return [
         make_stream(
             f"{prefix}/scan",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import schemas
-from recorders.log.planes import Origin
+from recorders.log.planes import Origin, frame_of
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
@@ -40,15 +40,15 @@ from replay.judging.metrics.measuring import (
 )
 from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
-from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.sets.errors import SetErrors, set_errors, unjudged_sets
 from replay.judging.tracks.errors import SOME_ARE_KNOWN
 from replay.judging.tracks.errors import Judged as Targets
-from replay.judging.tracks.evaluation import targets_of, track_blocks
+from replay.judging.tracks.evaluation import targets_of, track_blocks, unjudged_tracks
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TRACK = schemas.TRACK_ESTIMATE.full_name
+TRACK, SIZE = schemas.TRACK_ESTIMATE.full_name, schemas.ESTIMATE_SIZE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 # A table has at most so many steps; of more, neighbours share a row.
@@ -96,7 +96,7 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
-        self._targets: list[Targets | None] | None = None
+        self._targets: dict[str, list[Targets | None]] = {}
         self._of_targets: list[str] = []
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
@@ -146,14 +146,28 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
-        if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
-            if self._targets is None:
-                self._targets = [targets_of(source) for source in self._sources]
-                if any(targets is not None and targets.is_partial for targets in self._targets):
-                    self._of_targets = [SOME_ARE_KNOWN]
-            for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
-                self._measured.add(topic, tracks)
+        self._find_targets(outputs)
+        for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
+            self._measured.add(topic, tracks)
         return judged
+
+    def _find_targets(self, outputs: Mapping[str, Ragged]) -> None:
+        """Find what new sets and tracks are judged by, and which cannot be judged."""
+        for topic, rows in outputs.items():
+            schema, base = rows.stream.schema.full_name, topic.rpartition("/")[0]
+            is_set = schema == SIZE and f"{base}/element" in outputs
+            if topic in self._unjudged or not (is_set or schema == TRACK):
+                continue
+            unjudged = unjudged_sets if is_set else unjudged_tracks
+            why = unjudged(rows.stream, self._sources)
+            what = " ".join(filter(None, split_topic(topic)))
+            self._unjudged[topic] = f"{what}: not judged: {why}" if why else ""
+            frame = frame_of(rows.stream.metadata)
+            if schema == TRACK and not why and frame not in self._targets:
+                found = [targets_of(source, frame) for source in self._sources]
+                self._targets[frame] = found
+                if any(targets is not None and targets.is_partial for targets in found):
+                    self._of_targets = [SOME_ARE_KNOWN]
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
         begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
@@ -190,7 +204,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._targets, self._on_errors = (), [], None, None
+        self._sources, self._truths, self._targets, self._on_errors = (), [], {}, None
         self._steps.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))

@@ -163,6 +163,7 @@ def seen() -> list[Stream]:
             "/radar/detections",
             schemas.DETECTION,
             twice,
+            metadata={"frame_id": "radar"},
             scan_id=np.repeat([1, 2, 3], 2),
             position_m=spots,
         ),

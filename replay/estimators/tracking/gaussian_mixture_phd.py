@@ -16,6 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
+from recorders.log.planes import frame_of, in_frame
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.distributions import chi2
@@ -173,7 +174,8 @@ def advance(given: Filtering, before: Mixture, block: Block) -> tuple[Mixture, l
     """Filter a block; see `replay.engine.api.functions.recursive`."""
     scans = scans_of(*block.streams.values())
     after, sets = filter_scans(before, scans, given.setup)
-    return after, _outputs(f"/estimates/{given.name}", scans, sets, before, after)
+    frame = frame_of(given.topics["detection"].metadata)
+    return after, _outputs(f"/estimates/{given.name}", frame, scans, sets, before, after)
 
 
 def scans_of(scan: Ragged, detection: Ragged) -> Scans:
@@ -188,7 +190,9 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
 
 
-def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture) -> list[Ragged]:
+def _outputs(
+    topic: str, frame: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture
+) -> list[Ragged]:
     """Return per scan the set's size and the expected number, its elements, and the runs that failed."""
     reported = np.flatnonzero(sets.is_reported)
     offsets = np.searchsorted(reported, scans.offsets)
@@ -199,7 +203,7 @@ def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixtu
     )
     ends = np.concatenate([[0], np.cumsum(elements)])
     rows = np.repeat(sets.room[reported] - ends[:-1], elements) + np.arange(ends[-1])
-    state = state_metadata(PLANE_MOTION)
+    state = {**state_metadata(PLANE_MOTION), **in_frame(frame)}
     size = make_stream(f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=state, elements=elements)
     element = make_stream(
         f"{topic}/element",
@@ -230,7 +234,7 @@ def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
 
 
 def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Iterator[Binding]:
-    """Find every sensor with scans and detections; priors of things start the filters of all."""
+    """Find every sensor with scans and detections; priors of things start all filters in their frame."""
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
         found["prior"].name: found["prior"]
@@ -239,8 +243,10 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Ite
     }
     for sensor, found in bindings(topics, {"scan": schemas.SCAN, "detection": schemas.DETECTION}):
         if not parameters.sensor or sensor.strip("/") == parameters.sensor.strip("/"):
+            frame = frame_of(found["detection"].metadata)
+            own = {name: each for name, each in priors.items() if frame_of(each.metadata) == frame}
             settings = settings_of(parameters, found["scan"])
-            yield Binding(found, priors, sensor, dict.fromkeys(priors, components), settings)
+            yield Binding(found, own, sensor, dict.fromkeys(own, components), settings)
 
 
 GM_PHD = recursive(

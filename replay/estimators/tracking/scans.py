@@ -19,12 +19,16 @@ ORIGIN = "origin"
 
 
 class SensorTopics(NamedTuple):
-    """Names a log's sensors: kind, scans, detections, and each one's topic of own positions or ""."""
+    """Names a log's sensors: kinds, topics, and the frames that they measure in.
+
+    `origins` are the topics of their own positions, empty for a sensor that states none.
+    """
 
     kinds: tuple[int, ...]
     scans: tuple[str, ...]
     detections: tuple[str, ...]
     origins: tuple[str, ...]
+    frames: tuple[str, ...]
 
     @property
     def sensors(self) -> list[str]:
@@ -53,7 +57,7 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
     place_of = np.empty(starts[-1], np.int64)
     place_of[block.events.source] = np.arange(starts[-1])
     parts, places, first = [], [], 0
-    for sensor, (kind, scan, seen, origin) in enumerate(zip(*found, strict=True)):
+    for sensor, (kind, scan, seen, origin, _) in enumerate(zip(*found, strict=True)):
         scans, detections = block.streams[scan], block.streams[seen]
         order, bounds = by_scan(scans, detections)
         own = np.zeros((len(scans), 2))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import make_stream, schemas
+from recorders.log.planes import in_frame
 from replay.engine.arrays import Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import reason_stream
@@ -38,7 +39,7 @@ def track_outputs(
     """
     topic = f"/estimates/{name}"
     return [
-        *_of_tracks(topic, stage, scans, tracked),
+        *_of_tracks(topic, found, stage, scans, tracked),
         _associations(topic, found, scans, tracked),
         *_of_scans(topic, scans, tracked, repeated),
         *_modes(topic, stage, scans, tracked),
@@ -62,9 +63,12 @@ def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
     return np.repeat(scans.time_ns[used], tracked.confirmed[used])
 
 
-def _of_tracks(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
+def _of_tracks(
+    topic: str, found: SensorTopics, stage: Stage, scans: Scans, tracked: TrackOutputs
+) -> Iterator[Ragged]:
     """Tell after every scan how many tracks there are, which, and how probably each exists."""
-    metadata, ends = named(stage.model.state), tracked.end[:, 0]
+    metadata = {**named(stage.model.state), **in_frame(found.frames[0])}
+    ends = tracked.end[:, 0]
     used = np.flatnonzero(tracked.confirmed != NEVER)
     size = make_stream(
         f"{topic}/set",

@@ -25,6 +25,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
+from recorders.log.planes import frame_in_words, frame_of
 from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.api.functions import Advance, recursive
@@ -229,7 +230,8 @@ class TrackerParameters(Parameters):
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTopics:
     """Return the sensors with scans and places, bearings, or both range and bearing.
 
-    Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
+    Raises BadInput where one that is wanted is not there, its own position is not, none sees places, or
+    they are in several frames.
     """
     rows = []
     _check_scans(topics, wanted)
@@ -242,11 +244,14 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
         for number, kind in enumerate(KINDS):
             seen = topics.get(f"{prefix}/{kind.leaf}")
             if seen is not None and seen.schema_name == kind.schema.full_name:
-                rows.append((number, scan.name, seen.name, scan.metadata.get(ORIGIN, "")))
+                origin = scan.metadata.get(ORIGIN, "")
+                # a sensor whose own position is known measures along the axes that this is given in
+                frame = frame_of(topics.get(origin, seen).metadata)
+                rows.append((number, scan.name, seen.name, origin, frame))
     missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
     if missing:
         raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
-    found = SensorTopics(*zip(*rows, strict=True)) if rows else SensorTopics((), (), (), ())
+    found = SensorTopics(*zip(*rows, strict=True)) if rows else SensorTopics((), (), (), (), ())
     for scan_name, origin in zip(found.scans, found.origins, strict=True):
         if origin and (
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
@@ -255,6 +260,13 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
                 f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
                 "which is "
                 "missing; record the position of the sensor"
+            )
+    for seen_name, frame in zip(found.detections, found.frames, strict=True):
+        if frame != found.frames[0]:
+            raise BadInput(
+                f"topic {seen_name} is in {frame_in_words(frame)}, {found.detections[0]} in "
+                f"{frame_in_words(found.frames[0])}, and tracks are in one frame; name the sensors "
+                "of one frame with --set sensors=..."
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from recorders.errors import BadInput, choices
 from recorders.log import Schema, Topic, schemas
-from recorders.log.planes import FRAME, is_framed, plane_in_words, stated_in
+from recorders.log.planes import FRAME, frame_of, plane_in_words, stated_in
 from replay.engine.arrays import Floats
 from replay.engine.streams.channels import resolved
 from replay.engine.streams.geodetic import GEODETIC, stated_origin
@@ -344,7 +344,7 @@ def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, To
             f"with --set {topic.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or leave one of them out with "
             f"--set topics.{other[0].topic}= or --set topics.{sensor.topic}="
         )
-    if found.has_prior and is_framed(found.prior.metadata) and found.geodetic and "x_m" in model.state:
+    if found.has_prior and frame_of(found.prior.metadata) and found.geodetic and "x_m" in model.state:
         raise BadInput(
             f"estimator {label}: {found.geodetic[0].name} says where on earth, {found.prior.name} in "
             f"{plane_in_words(found.prior.metadata)}; state where on earth that is with --set "

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from recorders.log import Topic, schemas
-from recorders.log.planes import FRAME
+from recorders.log.planes import in_frame
 from recorders.log.streams import computed_stream
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Function, Integers
@@ -374,8 +374,7 @@ class Filter:
     @cached_property
     def state_metadata(self) -> Mapping[str, str]:
         """Return what the channel of the states says."""
-        frame = {FRAME: self.found.frame} if self.found.frame else {}
-        return {**named(self.stage.model.state), "truth": self.truth, **frame}
+        return {**named(self.stage.model.state), "truth": self.truth, **in_frame(self.found.frame)}
 
     @cached_property
     def measured(self) -> Mapping[str, str]:

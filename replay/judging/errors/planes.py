@@ -5,7 +5,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from recorders.log import Stream, schemas
-from recorders.log.planes import FRAME, Origin, is_planar, plane_in_words, stated_in
+from recorders.log.planes import (
+    FRAME,
+    Origin,
+    frame_in_words,
+    frame_of,
+    is_planar,
+    plane_in_words,
+    stated_in,
+)
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.geodetic import origins_of
 from replay.engine.streams.sources import Source
@@ -49,7 +57,7 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
         sources: the runs.
         first: see `first_fixes`.
     """
-    topic = stream.metadata.get("truth", "")
+    topic, frame = stream.metadata.get("truth", ""), frame_of(stream.metadata)
     if not is_planar(stream.schema.full_name, stream.metadata) or ALIGNED in stream.metadata:
         return ""
     for source, own in zip(sources, planes_of(stream, len(sources), first), strict=True):
@@ -57,7 +65,6 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
         if truth is None or not is_planar(truth.schema_name, truth.metadata):
             continue
         is_first = own is not None and stated_in(stream.topic, stream.metadata) is None
-        frame = stream.metadata.get(FRAME)
         if stated_in(topic, truth.metadata) is None:
             if own is not None and (is_first or truth.metadata.get(FRAME)):
                 at = "the first fix" if is_first else "their origin"
@@ -65,6 +72,13 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
                     f"{topic} does not state the origin of its plane, and the estimates are east and "
                     f"north of {own}, {at}; state it with --set {topic}.plane=LATITUDE,LONGITUDE,HEIGHT "
                     "or bring one to the other with fuselog evaluate --align se2"
+                )
+            of_truth = frame_of(truth.metadata)
+            if own is None and frame != of_truth:
+                own_frame, other = frame_in_words(frame), frame_in_words(of_truth)
+                return (
+                    f"they are in {own_frame}, {topic} is in {other}; bring one to the other with "
+                    "fuselog evaluate --align se2"
                 )
         elif own is None and frame:
             return (

@@ -11,10 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
+from recorders.log.planes import frame_of
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import Components
 from replay.judging.errors.evaluation import POSITION, reference, split_topic
+from replay.judging.errors.frames import not_comparable, seen_in
 from replay.judging.errors.truths import Truths
 from replay.judging.metrics.measuring import Sums, metric_of_sums
 from replay.judging.sets.distances import gospa, ospa
@@ -60,7 +63,9 @@ def set_errors(
 ) -> dict[str, SetErrors]:
     """Judge every set estimate, by its topic, among a replay's outputs, or a block of them.
 
-    Left out are those whose targets have no truths in some run; `first_run` is the number of the first.
+    Targets are taken into the frame of the estimates. Left out are those whose targets have no truths in
+    some run, or are in a frame that has no known pose in it (see `unjudged_sets`); `first_run` is the
+    number of the first.
     """
     found = {}
     for topic, sizes in outputs.items():
@@ -68,8 +73,9 @@ def set_errors(
         if sizes.stream.schema.full_name != schemas.ESTIMATE_SIZE.full_name or elements is None:
             continue
         components = sizes.stream.components
-        targets = [_targets(each, components) for each in truths]
-        if components and all(targets):
+        sources = [each.source for each in truths]
+        targets = [targets_in(each, components) for each in sources]
+        if components and all(targets) and not unjudged_sets(sizes.stream, sources):
             judge = partial(_judge_run, cutoff_m=cutoff_m, gap_limit_s=gap_limit_s)
             runs = [
                 judge(sizes.of_run(run), elements.of_run(run), targets[run], truths[run])
@@ -86,14 +92,22 @@ def set_errors(
     return found
 
 
-def _targets(truths: Truths, components: Sequence[str]) -> list[str]:
+def targets_in(source: Source, components: Sequence[str]) -> list[str]:
     """Return the topics of targets whose truths have exactly these components."""
-    stated = truths.source.topics
     return [
         topic
-        for topic in truths.topics
-        if sorted(stated[topic].metadata.get("components", "").split(",")) == sorted(components)
+        for topic in topics_of(source.topics, schemas.TRUTH_STATE)
+        if sorted(source.topics[topic].metadata.get("components", "").split(",")) == sorted(components)
     ]
+
+
+def unjudged_sets(sizes: Stream, sources: Sequence[Source]) -> str:
+    """Explain why sets cannot be compared with the targets of some run; empty if they can."""
+    reasons = (
+        not_comparable(sizes.metadata, targets_in(source, sizes.components), source.topics)
+        for source in sources
+    )
+    return next(filter(None, reasons), "")
 
 
 def _judge_run(
@@ -108,7 +122,13 @@ def _judge_run(
     """Return rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
-    states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in targets]
+    frame, at_ns = frame_of(sizes.metadata), sizes.publish_time_ns
+    states = [
+        seen_in(
+            frame, truths, topic, reference(truths, topic, state, sizes, gap_limit_s), at_ns, gap_limit_s
+        )
+        for topic in targets
+    ]
     true = np.stack(states, axis=1)
     columns = [sizes.components.index(name) for name in place]
     ends = np.cumsum(sizes["elements"].astype(np.int64))

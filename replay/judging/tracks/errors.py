@@ -10,13 +10,13 @@ By default every track counts. If the metadata of a truth says that truths cover
 with a truth are counted separately, as unreferenced, and figures without them have names of their own.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Stream, schemas
+from recorders.log import Stream, Topic, schemas, topics_of
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
@@ -87,17 +87,24 @@ class Judged(NamedTuple):
         return bool(np.isfinite(self.unreferenced_m))
 
 
+def target_topics(topics: Mapping[str, Topic]) -> list[str]:
+    """Return the truths that are positions of targets; the pose of a sensor that scans is not one."""
+    return [
+        topic
+        for topic in topics_of(topics, schemas.TRUTH_STATE)
+        if {*PLANE} <= {*topics[topic].metadata.get("components", "").split(",")}
+        and f"{topic.rpartition('/')[0]}/scan" not in topics
+    ]
+
+
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
     """Return instants from a while after the epoch to the scans' end or that of the first truth to end.
 
     Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
     they are over before the first instant.
     """
-    of: dict[str, list[str]] = {schemas.SCAN.full_name: [], schemas.TRUTH_STATE.full_name: []}
-    for topic in source.topics.values():
-        if topic.schema_name in of:
-            of[topic.schema_name].append(topic.name)
-    scans, truths = (source.read(topics) for topics in of.values())
+    scans = source.read(topics_of(source.topics, schemas.SCAN))
+    truths = source.read(target_topics(source.topics))
     if not scans or not truths:
         raise BadInput(
             f"{source.name}: has no scans or no truths, and tracks are judged by both; give a log with "

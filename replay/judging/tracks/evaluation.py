@@ -11,12 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Stream, schemas, topics_of
+from recorders.log import Stream, schemas
+from recorders.log.planes import frame_of
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import split_topic
+from replay.judging.errors.frames import not_comparable, seen_in
+from replay.judging.errors.truths import Truths
 from replay.judging.metrics.measuring import Metric
 from replay.judging.tracks.clear_mot import NONE
 from replay.judging.tracks.errors import (
@@ -26,6 +29,7 @@ from replay.judging.tracks.errors import (
     Judged,
     TracksAt,
     figures_of_whole_tracks,
+    target_topics,
     track_errors,
     track_figures,
     tracks_at,
@@ -47,26 +51,34 @@ class TrackBlock(NamedTuple):
     first_run: int = 0
 
 
-def targets_of(source: Source) -> Judged | None:
-    """Return a run's targets in the plane at its instants, NaN where one is not there; None without any.
+def targets_of(source: Source, frame: str) -> Judged | None:
+    """Return a run's targets in a frame at its instants, NaN where one is not there; None without any.
 
-    A target is a truth with `x_m` and `y_m`. Instants are PERIOD_S apart, from BURN_IN_S after the epoch
-    to the end of the last truth.
+    Instants are PERIOD_S apart, from BURN_IN_S after the epoch to the end of the last truth.
     """
-    topics = [
-        topic
-        for topic in topics_of(source.topics, schemas.TRUTH_STATE)
-        if {*PLANE} <= {*source.topics[topic].metadata.get("components", "").split(",")}
-    ]
-    truths = [truth for truth in source.read(topics).values() if len(truth)]
+    topics = target_topics(source.topics)
+    truths = {topic: truth for topic, truth in source.read(topics).items() if len(truth)}
     if not truths:
         return None
-    last_ns = max(int(truth.publish_time_ns[-1]) for truth in truths)
-    burn_in_s = min(BURN_IN_S, BURN_IN_SHARE * (last_ns - source.epoch_ns) * 1e-9)
+    last_ns = max(int(truth.publish_time_ns[-1]) for truth in truths.values())
+    span_s = (last_ns - source.epoch_ns) * 1e-9
+    burn_in_s = min(BURN_IN_S, BURN_IN_SHARE * span_s)
     first_ns = source.epoch_ns + round(burn_in_s * 1e9)
     at_ns = np.arange(first_ns, last_ns + 1, round(PERIOD_S * 1e9))
-    places = np.stack([_places(truth, at_ns) for truth in truths])
-    return Judged(at_ns, places, unreferenced_m(truths))
+    places = [
+        seen_in(frame, Truths(source), topic, _places(truth, at_ns), at_ns, span_s)
+        for topic, truth in truths.items()
+    ]
+    return Judged(at_ns, np.stack(places), unreferenced_m(truths.values()))
+
+
+def unjudged_tracks(tracks: Stream, sources: Sequence[Source]) -> str:
+    """Explain why tracks cannot be compared with the targets of some run; empty if they can."""
+    reasons = (
+        not_comparable(tracks.metadata, target_topics(source.topics), source.topics)
+        for source in sources
+    )
+    return next(filter(None, reasons), "")
 
 
 def _places(truth: Stream, at_ns: Integers) -> Floats:
@@ -78,15 +90,21 @@ def _places(truth: Stream, at_ns: Integers) -> Floats:
 
 
 def track_blocks(
-    outputs: Mapping[str, Ragged], targets: Sequence[Judged | None], first_run: int
+    outputs: Mapping[str, Ragged], targets: Mapping[str, Sequence[Judged | None]], first_run: int
 ) -> dict[str, TrackBlock]:
-    """Return the sets of tracks among a replay's outputs, or a block of them, by the topic of sizes."""
+    """Return the sets of tracks among a replay's outputs, or a block of them, by the topic of tracks.
+
+    `targets` are those of the runs, by the frame that they are seen in; tracks in no such frame are left
+    out.
+    """
     found = {}
     for topic, tracks in outputs.items():
         sizes = outputs.get(f"{topic.rpartition('/')[0]}/set")
         is_track = tracks.stream.schema.full_name == schemas.TRACK_ESTIMATE.full_name
-        if is_track and sizes is not None and {*PLANE, *VELOCITY} <= {*tracks.stream.components}:
-            found[topic] = TrackBlock(*split_topic(topic), sizes, tracks, targets, first_run)
+        if not is_track or sizes is None or not {*PLANE, *VELOCITY} <= {*tracks.stream.components}:
+            continue
+        if (seen := targets.get(frame_of(tracks.stream.metadata))) is not None:
+            found[topic] = TrackBlock(*split_topic(topic), sizes, tracks, seen, first_run)
     return found
 
 

@@ -20,12 +20,13 @@ from scipy.spatial import cKDTree
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
+from recorders.log.planes import frame_of
 from replay.engine.arrays import Integers
 from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
 from replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
 from replay.judging.errors.evaluation import Floats
 from replay.judging.tracks.clear_mot import NONE
-from replay.judging.tracks.errors import TrackErrors, instants_of, track_errors, tracks_at
+from replay.judging.tracks.errors import TrackErrors, instants_of, target_topics, track_errors, tracks_at
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
 from replay.timeline.drawing.events import Happened, above_events, draw_events
 from replay.timeline.drawing.plane import (
@@ -247,6 +248,8 @@ def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers,
     except BadInput:
         return np.empty(0, np.int64), {}
     sizes = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))
+    topics = scene.source.topics
+    frames = {frame_of(topics[topic].metadata) for topic in target_topics(topics)}
     return judged.time_ns, {
         name: track_errors(
             tracks_at(sizes[name], tracks, judged.time_ns),
@@ -254,6 +257,7 @@ def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers,
             unreferenced_m=judged.unreferenced_m,
         )
         for name, tracks in trackers
+        if frames == {frame_of(tracks.metadata)}
     }
 
 
