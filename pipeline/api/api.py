@@ -4,7 +4,7 @@ Everything raises BadInput as the commands do, with the same sentences. docs/pyt
 it; `pipeline.api.replays` has the replay.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.api import catalog
-from pipeline.api.catalog import Entry
+from pipeline.api.catalog import LISTS, Entries, Entry
+from pipeline.api.lists import listed
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
 from pipeline.output.summary import summary_table
@@ -268,17 +268,17 @@ def _pool(
 class Catalog(Mapping[str, Entry]):
     """Holds what there is of a kind, by name; for another name raises `UnknownName` with a near one."""
 
-    def __init__(self, kind: str, list_entries: Callable[[], list[Entry]]) -> None:
-        self._kind, self._list = kind, list_entries
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
 
     @cached_property
-    def _entries(self) -> dict[str, Entry]:
-        return {entry.name: entry for entry in self._list()}
+    def _entries(self) -> Entries:
+        return LISTS[self._kind]()
 
     def __getitem__(self, name: str) -> Entry:
         if name not in self._entries:
             raise UnknownName(f"no {self._kind} '{name}'; {choices(name, self._entries)}")
-        return self._entries[name]
+        return self._entries[name]()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
@@ -288,11 +288,11 @@ class Catalog(Mapping[str, Entry]):
 
     def __repr__(self) -> str:
         width = max(map(len, self), default=0)
-        return "\n".join(f"{name:{width}}  {entry.what}" for name, entry in self.items())
+        return "\n".join(f"{name:{width}}  {what}" for name, what in listed(f"{self._kind}s").items())
 
 
-scenarios = Catalog("scenario", catalog.scenarios)
-estimators = Catalog("estimator", catalog.estimators)
-models = Catalog("model", catalog.models)
-metrics = Catalog("metric", catalog.metrics)
-experiments = Catalog("experiment", catalog.experiments)
+scenarios = Catalog("scenario")
+estimators = Catalog("estimator")
+models = Catalog("model")
+metrics = Catalog("metric")
+experiments = Catalog("experiment")

@@ -44,57 +44,62 @@ class Entry:
     prefix: str = ""
 
 
-def scenarios() -> list[Entry]:
+Entries = dict[str, Callable[[], Entry]]  # by name, each made when it is asked for
+
+
+def scenarios() -> Entries:
     """List recorders, and the scenario files that ship."""
-    files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
-    return _registered("recorders", Recorder, _recorder) + files
+    return _registered("recorders", Recorder, _recorder) | _files("scenarios", _scenario)
 
 
-def estimators() -> list[Entry]:
+def estimators() -> Entries:
     """List estimators with what they need of a log."""
     return _registered("estimators", Estimator, _estimator)
 
 
-def models() -> list[Entry]:
+def models() -> Entries:
     """List models with what they are made of, and the methods that estimate them."""
     return _registered("models", Model, _model)
 
 
-def metrics() -> list[Entry]:
+def metrics() -> Entries:
     """List the metrics that judge estimates."""
     return _registered("metrics", Metric, _metric)
 
 
-def experiments() -> list[Entry]:
+def experiments() -> Entries:
     """List the experiments that ship."""
-    files = shipped("experiments").items()
-    return [_entry(name, partial(_experiment, name, path)) for name, path in files]
+    return _files("experiments", _experiment)
 
 
-def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print a list, or all about one of its entries."""
+LISTS: dict[str, Callable[[], Entries]] = {
+    "scenario": scenarios,
+    "estimator": estimators,
+    "model": models,
+    "metric": metrics,
+    "experiment": experiments,
+}
+
+
+def show(kind: str, name: str | None, *, as_json: bool) -> None:
+    """Print all about one entry of a list, or the whole list as JSON."""
+    known = LISTS[kind]()
     if name is not None:
-        known = {entry.name: entry for entry in entries}
         if kind == "estimator" and name.partition(":")[0] in known:
-            known[name] = _estimator(name, *find_estimator(name))
+            known[name] = lambda: _estimator(name, *find_estimator(name))
         if name not in known:
             raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
-        entries = [known[name]]
+        known = {name: known[name]}
+    entries = [make() for make in known.values()]
     if as_json:
         print_json([_as_json(entry) for entry in entries])
-    elif name is None:
-        print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
-        say(f"For all about one of them: fuselog {kind}s NAME")
     else:
         _print_details(entries[0])
 
 
-def show_models(name: str | None, *, as_json: bool) -> None:
-    """Print the models and the methods that estimate each, or all about one of them."""
-    show(models(), "model", name, as_json=as_json)
-    if name is None and not as_json:
-        rows = [[name, *_methods_of(model).values()] for name, model in registered_models().items()]
-        print_table(["model", *METHODS], rows, "Methods that estimate them")
+def methods() -> dict[str, dict[str, str]]:
+    """Say of every model which methods estimate it, or what it lacks for them."""
+    return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
 def show_formulas(name: str | None, *, as_json: bool) -> None:
@@ -114,13 +119,19 @@ def _methods_of(model: Model) -> dict[str, str]:
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
 
-def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
+def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> Entries:
     """Return an entry for every registered name."""
 
     def make(name: str) -> Entry:
         return described(name, load(kind, name, expected))
 
-    return [_entry(name, partial(make, name)) for name in available(kind)]
+    return {name: partial(_entry, name, partial(make, name)) for name in available(kind)}
+
+
+def _files(kind: str, described: Callable[[str, Path], Entry]) -> Entries:
+    """Return an entry for every file that ships."""
+    files = shipped(kind).items()
+    return {name: partial(_entry, name, partial(described, name, path)) for name, path in files}
 
 
 def _entry(name: str, make: Callable[[], Entry]) -> Entry:

@@ -12,11 +12,20 @@ def _listing(kind: str, text: str, example: str) -> click.Command:
     @click.argument("name", required=False)
     @json_option
     def listing(name: str | None, as_json: bool) -> None:
-        from pipeline.api import catalog
-
-        catalog.show(getattr(catalog, f"{kind}s")(), kind, name, as_json=as_json)
+        _show(kind, name, as_json=as_json)
 
     return listing
+
+
+def _show(kind: str, name: str | None, *, as_json: bool) -> None:
+    if name is None and not as_json:
+        from pipeline.api.lists import show_list
+
+        show_list(f"{kind}s")
+    else:
+        from pipeline.api import catalog
+
+        catalog.show(kind, name, as_json=as_json)
 
 
 scenarios = _listing(
@@ -38,12 +47,12 @@ experiments = _listing("experiment", "List the shipped experiments, or all about
 @json_option
 def models(name: str | None, formulas: bool, as_json: bool) -> None:
     """List the models and whether each method can estimate them or why not, or all about NAME."""
-    from pipeline.api.catalog import show_formulas, show_models
-
     if formulas:
+        from pipeline.api.catalog import show_formulas
+
         show_formulas(name, as_json=as_json)
     else:
-        show_models(name, as_json=as_json)
+        _show("model", name, as_json=as_json)
 
 
 @command(

@@ -141,7 +141,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     for name, method in METHODS.items():
         if not method.lacks(model):
             try:
-                parameters = combined(model, method)()
+                parameters = combined(model, method).model_construct()  # the defaults need no check
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))

@@ -213,12 +213,9 @@ def metric_tables(
 def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
     """Return the mean of the runs' NEES with its 95 % interval, by estimator and case.
 
-    Runs are independent, so that the interval is Student's; fewer than `FEWEST_RUNS` have none. A study
-    may have a table of runs without NEES.
+    Fewer than `FEWEST_RUNS` have none. A study may have a table of runs without NEES.
     """
-    from scipy.stats import sem, t
-
-    from replay.judging.errors.differences import FEWEST_RUNS
+    from replay.judging.errors.differences import FEWEST_RUNS, mean_interval
 
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}
@@ -226,11 +223,10 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
     for (estimator, case), rows in runs.groupby(["estimator", "case"]):
         nees = rows["nees"].dropna()
         if len(nees) >= FEWEST_RUNS:
-            mean = float(nees.mean())
-            low, high = t.interval(0.95, len(nees) - 1, loc=mean, scale=sem(nees))
+            low, high = mean_interval(nees.to_numpy())
             components = rows.filter(regex="^rmse_").notna().any().sum()
             intervals[str(estimator), str(case)] = (
-                f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
+                f"{nees.mean():.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
             )
     return intervals
 

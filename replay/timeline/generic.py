@@ -11,7 +11,6 @@ from itertools import cycle
 
 import numpy as np
 import rerun.blueprint as rrb
-from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.log import Field, Stream, schemas
@@ -243,6 +242,8 @@ def _draw_field(
 
 def _euler_deg(quaternions: Floats) -> Floats:
     """Return roll, pitch, yaw (n, 3), turned about z, y, x in this order; NaN where no rotation is."""
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     angles = np.full((len(quaternions), 3), np.nan)
     known = np.linalg.norm(quaternions, axis=1) > 0.0
     turned = Rotation.from_quat(quaternions[known], scalar_first=True)

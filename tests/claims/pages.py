@@ -24,7 +24,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from pipeline.api.catalog import scenarios
+from pipeline.api.lists import listed
 from pipeline.output.claims import Verdict
 from pipeline.output.results import MetricValue, Result, read_result
 from pipeline.runs.experiment import load_experiment
@@ -163,7 +163,7 @@ class Catalogue:
             of = load_experiment(name, {}, {})[1].import_
             if of is not None:
                 experiments.setdefault(of.parameters.get("mapping", of.source), []).append(name)
-        summaries = {entry.name: entry.what for entry in scenarios()} | _mappings()
+        summaries = listed("scenarios") | _mappings()
         rows = [
             f"| {summaries[source]} | `fuselog run {first} --data PATH`"
             f"{''.join(f'; `{name}`' for name in others)} |"

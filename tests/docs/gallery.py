@@ -4,7 +4,8 @@ import re
 from functools import cache
 from pathlib import Path
 
-from pipeline.api.catalog import Entry, experiments
+import fuselog as fl
+from pipeline.api.catalog import Entry
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEAD = """---
@@ -24,7 +25,7 @@ to the page that says what it shows.
 @cache
 def gallery() -> str:
     """The text of the page."""
-    return HEAD + "\n".join([_card(each) for each in experiments()]) + "\n</div>\n"
+    return HEAD + "\n".join([_card(each) for each in fl.experiments.values()]) + "\n</div>\n"
 
 
 def page_of(experiment: str) -> Path:

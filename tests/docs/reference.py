@@ -2,12 +2,12 @@
 
 import ast
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import groupby
 from pathlib import Path
 
-from pipeline.api import catalog
+import fuselog as fl
 from pipeline.api.catalog import Entry
 from recorders.log.schemas import SCHEMAS, Field, Schema
 from recorders.parameters import describe, explain
@@ -29,23 +29,23 @@ ROOMS = {
     "recorders": "Streams and recorders",
     "replay": "Models, estimators, metrics, timelines",
 }
-KINDS: dict[str, tuple[Callable[[], list[Entry]], str]] = {
+KINDS: dict[str, tuple[Mapping[str, Entry], str]] = {
     "scenarios": (
-        catalog.scenarios,
+        fl.scenarios,
         "What can be recorded or imported. `--set NAME=VALUE` changes a parameter, whose name "
         "ends in its unit, such as `_m` or `_radps`.",
     ),
     "models": (
-        catalog.models,
+        fl.models,
         "What a state is made of, how it moves and what sensors measure of it. The "
         "[methods](estimators.md) that estimate it are those with a check mark.",
     ),
     "estimators": (
-        catalog.estimators,
+        fl.estimators,
         "All that `-e NAME` takes. The methods among them estimate any [model](models.md), whose "
         "parameters they take besides their own; the others have mathematics of their own.",
     ),
-    "metrics": (catalog.metrics, "What estimates are judged by."),
+    "metrics": (fl.metrics, "What estimates are judged by."),
 }
 PLACES = [f"reference/{name}.md" for name in ("commands", "python", "messages", "speed", *KINDS)]
 TYPES = {
@@ -59,7 +59,7 @@ TYPES = {
 @cache
 def reference() -> dict[str, str]:
     """The text of each page, by its place in the site."""
-    kinds = (_kind(kind, entries(), what) for kind, (entries, what) in KINDS.items())
+    kinds = (_kind(kind, [*entries.values()], what) for kind, (entries, what) in KINDS.items())
     return dict(zip(PLACES, [COMMANDS, _python(), _messages(), _speed(), *kinds], strict=True))
 
 

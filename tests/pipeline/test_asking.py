@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from pydantic import BaseModel
 
-from pipeline.api import catalog
+import fuselog as fl
 from pipeline.command_line.process import main
 from pipeline.logs.constraints import ConstraintParameters
 from pipeline.runs.experiment import Experiment, Study
@@ -22,8 +22,8 @@ OTHERS = (ConstraintParameters, Experiment, LogMapping, Mapping, Matchers, OBSER
 
 
 def _registered() -> Iterator[type[BaseModel]]:
-    for entries in (catalog.scenarios, catalog.models, catalog.estimators):
-        yield from filter(None, (entry.parameters for entry in entries()))
+    for entries in (fl.scenarios, fl.models, fl.estimators):
+        yield from filter(None, (entry.parameters for entry in entries.values()))
     yield from (method.parameters for method in METHODS.values())
     yield from (load("studies", name, Study).options for name in available("studies"))
     yield from OTHERS

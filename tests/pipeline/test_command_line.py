@@ -18,8 +18,10 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.api.lists import KEPT
 from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from tests.lists import lists
 from tests.pipeline.conftest import heeding_interrupts
 from tests.replay.foreign.test_isolation import SANE, run_with
 from tests.replay.foreign.test_programs import FAIL, PROGRAM, python
@@ -277,6 +279,11 @@ def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuse
     assert fuselog(kind, name, "--json").json == [row for row in listed if row["name"] == name]
 
 
+def test_lists_that_are_kept_are_what_modules_and_files_say() -> None:
+    """`python -m tests.lists` keeps them."""
+    assert json.loads(KEPT.read_text(encoding="utf-8")) == lists()
+
+
 def test_the_formulas_of_a_model_are_printed(fuselog: Fuselog) -> None:
     assert fuselog("models", "vehicle", "--formulas").out == fl.formulas("vehicle") + "\n"
     told = fuselog("models", "vehicle", "--formulas", "--json").json
@@ -402,10 +409,13 @@ def test_a_thread_at_work_does_not_spoil_the_end(is_daemon: bool) -> None:
 # What takes long to import, and is for drawing, for tables or for one family alone.
 HEAVY = (
     *("matplotlib", "rerun", "pandas", "pyarrow", "sklearn", "h5py", "rosbags.typesys", "rich.progress"),
-    *("scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.spatial"),
+    "scipy",
 )
 # What compiles and loads kernels.
 KERNELS = ("replay.engine.compiling.kernel_cache", "replay.engine.compiling.inlining")
+
+# What a list needs nothing of: what it lists.
+LISTED = (*HEAVY, *KERNELS, "recorders.simulators.landmarks", "replay.inference", "pipeline.studies")
 
 
 @pytest.mark.paper
@@ -414,13 +424,15 @@ KERNELS = ("replay.engine.compiling.kernel_cache", "replay.engine.compiling.inli
     [
         # in one process, one after the other: each may import what those before it may not
         {
-            "info log.mcap": (*HEAVY, *KERNELS, "scipy.special", "concurrent.futures.process"),
-            "models": (*HEAVY, *KERNELS, "scipy.special"),
-            "metrics": (*HEAVY, *KERNELS, "scipy.special"),
-            "scenarios": (*KERNELS, "matplotlib", "rerun", "sklearn", "scipy.stats", "h5py"),
-            "estimators": (*KERNELS, "matplotlib", "rerun", "sklearn", "scipy.stats"),
+            **dict.fromkeys(["scenarios", "estimators", "models", "metrics", "experiments"], LISTED),
+            "info log.mcap": (*HEAVY, *KERNELS, "concurrent.futures.process"),
+            "scenarios landmarks": HEAVY,
+            "estimators ekf": (),
         },
-        {"replay log.mcap -e ekf -e ukf": (*HEAVY, "pipeline.runs.experiment")},
+        {
+            "replay log.mcap -e ekf -e ukf": (*HEAVY, "pipeline.runs.experiment"),
+            "replay log.mcap -e ekf --save drawn.rrd": ("matplotlib", "scipy"),
+        },
     ],
     ids=("what there is", "replay"),
 )

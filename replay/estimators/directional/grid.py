@@ -4,11 +4,10 @@ They approximate no density, only the domain, and show what any filter of the sa
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from recorders.models.headings import turn_together
 from replay.distributions import bingham, wrapped_normal
@@ -17,6 +16,9 @@ from replay.distributions.wrapped_normal_kernels import UNIFORM
 from replay.engine.arrays import Floats, Integers
 from replay.estimators.directional.bingham import BinghamNoise, Steps
 from replay.estimators.directional.torus import HeadingModel, Motion
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # Cells that a transition reaches with less than this part of its peak are left out.
 _NEGLIGIBLE = 1e-12
@@ -128,8 +130,10 @@ def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
     return wrapped_normal.density(seen, grid) * (2.0 * np.pi) ** missing.sum(axis=1, keepdims=True)
 
 
-def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> sparse.csr_array:
+def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.csr_array":
     """Compute the probabilities of the next cell (rows) given the last one (columns)."""
+    from scipy import sparse  # which takes long to import
+
     moved = np.stack(motion(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
     reached = np.stack(
         [wrapped_normal.density(WrappedNormal(each, model.system), grid) for each in moved], axis=1

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
@@ -85,6 +84,8 @@ def judge_sets(
 def _judge(
     sizes: Ragged, sets: Ragged, faults: int, sources: Sequence[Source], gap_limit_s: float
 ) -> JudgedSets:
+    from matplotlib.path import Path  # which takes long to import
+
     run = run_of_rows(sizes.offsets)
     topic = sizes.stream.metadata["truth"]
     truth = [

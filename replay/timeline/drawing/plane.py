@@ -12,7 +12,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 
 from recorders.log import schemas
 from replay.distributions import chi2
@@ -89,12 +88,21 @@ def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places:
     canvas.fix(f"{entity}/numbers", names)
 
 
-def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
-    """Group the rows of points whose labels would overlap."""
-    if len(places) == 1:
-        return [np.arange(1)]
-    group = fcluster(linkage(places, "complete"), LABEL_SHARE * extent_of(places), "distance")
-    return [np.flatnonzero(group == each) for each in np.unique(group)]
+def _neighbours(places: Floats) -> list[list[int]]:
+    """Group the rows of points whose labels would overlap: a point joins the first group it is close to.
+
+    It is close to a group if it is to all points of it.
+    """
+    farthest = LABEL_SHARE * extent_of(places)
+    groups: list[list[int]] = []
+    for row, place in enumerate(places):
+        for group in groups:
+            if (np.linalg.norm(places[group] - place, axis=1) <= farthest).all():
+                group.append(row)
+                break
+        else:
+            groups.append([row])
+    return groups
 
 
 def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -225,6 +224,8 @@ def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
 
 
 def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
+    import matplotlib as mpl  # which takes long to import
+
     assert track.covariances is not None
     usable = np.linalg.eigvalsh(track.covariances)[:, 0] > 0.0
     time_ns = track.time_ns[usable]

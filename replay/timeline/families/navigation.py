@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy.spatial.transform import Rotation
 
 from recorders.log import Stream, schemas
 from replay.engine.arrays import Floats
@@ -189,6 +188,8 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
     """Draw ellipsoids of two standard deviations along the path; as wires, as a viewer may be in one."""
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
     reach = SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[rows])[:, -1].clip(0.0))
     kept = [0]
@@ -273,6 +274,8 @@ def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
     if component in ANGLES:
         if not set(ORIENTATION) <= set(body.names):
             return None
+        from scipy.spatial.transform import Rotation
+
         turned = Rotation.from_quat(body.columns(ORIENTATION), scalar_first=True)
         angles = turned.as_euler("ZYX", degrees=True)[:, ::-1]
         return angles[:, ANGLES.index(component)], None

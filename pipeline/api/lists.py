@@ -1,0 +1,57 @@
+"""Lists what there is to choose from, without importing it.
+
+What our modules and files say of themselves is kept in `data/lists.json`, which
+`python -m tests.lists` writes and a test compares. If another package registers a name, all are
+imported.
+"""
+
+import json
+from typing import Any
+
+from pipeline.output.terminal import print_table, say
+from pipeline.runs.inputs import SHIPPED, shipped
+from recorders.registry import available
+
+KEPT = SHIPPED / "lists.json"
+# In which group the names of a list are registered; scenarios and experiments are files, too.
+GROUPS = {
+    "scenarios": "recorders",
+    "estimators": "estimators",
+    "models": "models",
+    "methods": "models",
+    "metrics": "metrics",
+    "experiments": "",
+}
+
+
+def show_list(kind: str) -> None:
+    """Print the names of a kind ("scenarios", say) with a line on each."""
+    print_table([kind.removesuffix("s"), "what"], list(listed(kind).items()))
+    say(f"For all about one of them: fuselog {kind} NAME")
+    if kind == "models":
+        methods = listed("methods")
+        rows = [[name, *answers.values()] for name, answers in methods.items()]
+        print_table(["model", *next(iter(methods.values()))], rows, "Methods that estimate them")
+
+
+def listed(kind: str) -> dict[str, Any]:
+    """Return a line on each name; for the methods, their answers by model."""
+    kept, places = json.loads(KEPT.read_text(encoding="utf-8"))[kind], places_of(kind)
+    if kept.keys() >= {*places.values()}:
+        return {name: kept[place] for name, place in places.items()}
+    return told(kind)
+
+
+def told(kind: str) -> dict[str, Any]:
+    """Return what is listed as all that is listed says it, which imports all."""
+    from pipeline.api import catalog
+
+    if kind == "methods":
+        return catalog.methods()
+    return {name: make().what for name, make in catalog.LISTS[kind.removesuffix("s")]().items()}
+
+
+def places_of(kind: str) -> dict[str, str]:
+    """Return where each name comes from: its entry point, or a file that has its name."""
+    registered = available(GROUPS[kind]).items()
+    return {name: entry.value for name, entry in registered} | {name: name for name in shipped(kind)}
