@@ -7,10 +7,8 @@ from typing import NamedTuple
 import rerun.blueprint as rrb
 
 from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import PALETTE, Canvas, Times, entity_path
+from replay.timeline.drawing.canvas import PALETTE, Board, Canvas, Times, entity_path
 from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
-
-Board = rrb.Container | rrb.View
 
 
 class Fan(NamedTuple):
@@ -37,5 +35,5 @@ def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Contain
         own = [fan for fan in fans if fan.estimate == estimate]
         for fan, colour in zip(own, cycle(PALETTE), strict=False):
             draw_curve(canvas, plot, fan.copy, colour, fan.time_ns, fan.sigmas, LINE)
-        plots.append(plot_view(plot, f"{estimate}: sigmas between the estimate and each copy"))
+        plots.append(plot_view(plot, f"{estimate}: from the estimate to each copy", "sigma"))
     return rrb.Vertical(layout, rrb.Tabs(*plots), row_shares=[4.0, 1.0])

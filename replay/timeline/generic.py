@@ -20,7 +20,9 @@ from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.about import draw_about
 from replay.timeline.drawing.canvas import (
     PALETTE,
+    Board,
     Canvas,
+    Colour,
     Scene,
     Timeline,
     beside,
@@ -41,6 +43,7 @@ from replay.timeline.drawing.plane import (
     extent_of,
     plane_view,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import (
     POINTS,
@@ -49,6 +52,7 @@ from replay.timeline.drawing.plots import (
     draw_curve,
     draw_modes,
     draw_quality,
+    in_strips,
     plot_view,
     shown_unit,
 )
@@ -67,7 +71,6 @@ FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name
 GEODETIC, ORIENTATION = schemas.GEODETIC_FIX.full_name, schemas.ORIENTATION.full_name
 ANGLES = ("roll", "pitch", "yaw")
-Board = rrb.Container | rrb.View
 
 
 def draw(canvas: Canvas, scene: Scene) -> Board:
@@ -99,7 +102,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     turned = [each for each in sensed if each.schema.full_name == ORIENTATION]
     boards: list[Board] = [*_draw_space(canvas, case, turned), *_draw_sensors(canvas, case, sensed)]
     components = draw_components(canvas, scene, case)
-    state: list[Board] = [rrb.Vertical(*components, name="state")] if components else []
+    state: list[Board] = [in_strips(components, "state")] if components else []
     # what is estimated is seen first, on a map where it has a place
     is_estimated = bool(scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE))
     is_placed = bool(in_space) or any(each.name != "truth" for each in tracks_of(scene, case))
@@ -110,7 +113,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
         boards.append(rrb.Vertical(*modes, name="modes"))
     events = draw_events(canvas, scene, case, _not_drawn(sensed))
     board = above_events(rrb.Tabs(*boards), events, 4.0)
-    return beside(board, draw_quality(canvas, scene, case), case)
+    return beside(board, draw_quality(canvas, scene, case, legend=not is_placed), case)
 
 
 def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
@@ -141,9 +144,10 @@ def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) 
 
 def _draw_plane(
     canvas: Canvas, scene: Scene, case: str, frame: str, sensed: list[Stream]
-) -> list[rrb.Spatial2DView]:
+) -> list[Board]:
     """Draw the places of one frame; truths and estimates are in the log's own, which has no name."""
     root, shown, paths = entity_path(ROOT, case), [], []
+    named: dict[str, Colour] = {}
     if frame:
         root = entity_path("frames", frame, case)
         turn_up(canvas, root)
@@ -153,9 +157,12 @@ def _draw_plane(
             shown.append(track.poses[:, :2])
             paths.append(draw_track(canvas, root, track, extent_of(shown[-1])))
         draw_clouds(canvas, scene, case, root)
-        draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
+        named = {track.name: track.stroke.colour for track in tracks}
+        named |= draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
     for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
         entity, stroke = f"{root}/{_name(stream, case)}", Stroke(colour)
+        if stream.schema.full_name != LANDMARK:  # which is numbered
+            named[_name(stream, case)] = colour
         rows = thin(stream.publish_time_ns)
         time_ns, places = stream.publish_time_ns[rows], stream["position_m"][rows, :2]
         if stream.schema.full_name == LANDMARK:
@@ -173,8 +180,11 @@ def _draw_plane(
             draw_dots(canvas, entity, time_ns, places, stroke)
             paths.append(entity)
         shown.append(places)
+    if not shown:
+        return []
     name = f"Frame {frame}" if frame else "Map"
-    return [plane_view(canvas, root, [], paths, np.concatenate(shown), name=name)] if shown else []
+    view = plane_view(canvas, root, [], paths, np.concatenate(shown), name=name)
+    return [with_legend(canvas, root, named, view)]
 
 
 def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
@@ -211,11 +221,14 @@ def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[r
         if stream.schema.full_name in NOT_SENSED:
             continue
         name = _name(stream, case)
-        plots = [_draw_field(canvas, case, stream, *curves) for curves in curves_of(stream)]
+        plots = {
+            field.name: _draw_field(canvas, case, stream, field, curves)
+            for field, curves in curves_of(stream)
+        }
         about = draw_about(canvas, entity_path("about", case, name), stream)
         if about:
             turn_up(canvas, entity_path("about", case, name))
-        columns: list[Board] = [*about, *([rrb.Vertical(*plots)] if plots else [])]
+        columns: list[Board] = [*about, *([in_strips(plots, name)] if plots else [])]
         if columns:
             yield rrb.Horizontal(*columns, name=name)
 
@@ -235,9 +248,9 @@ def _draw_field(
         named = stream.components
     for curve, values, colour in zip(named, scale * curves, cycle(PALETTE), strict=False):
         draw_curve(canvas, plot, curve, colour, stream.publish_time_ns, values, POINTS, most=KEPT_ROWS)
-    title = f"{quantity.capitalize()} ({unit})"
-    extent = below_legend(list(scale * curves)) if len(curves) > 1 else None
-    return plot_view(plot, title, extent, legend=len(curves) > 1, zoom_lock=False)
+    is_legend = len(curves) > 1
+    extent = below_legend(list(scale * curves)) if is_legend else None
+    return plot_view(plot, quantity.capitalize(), unit, extent, legend=is_legend, zoom_lock=False)
 
 
 def _euler_deg(quaternions: Floats) -> Floats:

@@ -12,10 +12,8 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from replay.judging.errors.evaluation import Errors, Floats
-from replay.timeline.drawing.canvas import Canvas, Scene, entity_path, escaped
+from replay.timeline.drawing.canvas import Board, Canvas, Scene, entity_path, escaped
 from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
-
-Board = rrb.Container | rrb.View
 
 
 def draw_side_by_side(
@@ -60,18 +58,20 @@ def _draw_differences(
     """Plot how much larger the errors of others are than the first's, at the stamps that both have."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
-    plot, drawn = entity_path("plots", case, "difference"), False
+    plot, unit, drawn = entity_path("plots", case, "difference"), "-", False
     for estimator in estimators[1:]:
         other = found.get(estimator)
         if first is None or other is None:
             continue
         time_ns, here, there = np.intersect1d(first.time_ns, other.time_ns, return_indices=True)
         larger = _sizes(other)[there] - _sizes(first)[here]
+        quantity, columns, _ = first.main
+        unit = quantity.rpartition("_")[2] if "_" in first.components[columns[0]] else "-"
         name = f"{estimator} - {estimators[0]}"
         draw_curve(canvas, plot, name, scene.colour(estimator), time_ns, larger, LINE)
         drawn = drawn or len(time_ns) > 0
     title = " ".join(filter(None, (case, "difference of the errors' size")))
-    return [plot_view(plot, title)] if drawn else []
+    return [plot_view(plot, title, unit)] if drawn else []
 
 
 def _sizes(errors: Errors) -> Floats:

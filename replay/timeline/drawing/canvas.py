@@ -20,6 +20,7 @@ from recorders.log import Schema, Stream, schemas, topics_of
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import Errors, Floats, split_topic
 
+Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]
 
@@ -32,6 +33,8 @@ PALETTE: tuple[Colour, ...] = (
     (240, 228, 66),
     (0, 114, 178),
 )
+# How wide a line is, in pixels.
+WIDTH = 1.5
 TRUTH: Colour = (200, 200, 200)
 MUTED: Colour = (130, 130, 130)
 WRONG: Colour = (230, 60, 40)
@@ -78,6 +81,20 @@ class Scene:
     def colour(self, estimator: str) -> Colour:
         """Return the one colour that `estimator` has everywhere."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
+
+    def width(self, estimator: str) -> float:
+        """Return how wide lines of `estimator` are, in pixels, so that one on another shows both.
+
+        The viewer draws entities in the order of their names, so the first ones are the widest.
+        """
+        above = len(self.estimators) - 1 - sorted(self.estimators).index(estimator)
+        return WIDTH * (1.0 + min(above, 2.0 * above / max(len(self.estimators) - 1, 1)))
+
+    def colours(self, case: str) -> dict[str, Colour]:
+        """Return the colours of the truth of `case` and of its estimators, by name."""
+        named = {"truth": TRUTH} if self.truths_of(case) else {}
+        own = {split_topic(topic)[0] for topic in self.outputs if split_topic(topic)[1] == case}
+        return named | {name: self.colour(name) for name in self.estimators if name in own}
 
     def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
         """Return the non-empty output streams of `case` with this `schema`, and their estimators."""
@@ -234,10 +251,19 @@ def draw_cases(
     return rrb.Tabs(*layouts, active_tab=scene.cases.index(scene.focus or scene.cases[0]))
 
 
-def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
-    """Return a case's board, and to its right its plots if there are any."""
-    columns = [board, rrb.Vertical(*plots)] if plots else [board]
+def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:
+    """Return a case's board, and to its right its plots if there are any, all equally high."""
+    shares = [float(strips_of(plot)) for plot in plots]
+    columns = [board, rrb.Vertical(*plots, row_shares=shares)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
+
+
+def strips_of(board: Board) -> int:
+    """Count the views that are seen one below another in a part of a layout."""
+    if not isinstance(board, rrb.Container):
+        return 1
+    within = [strips_of(each) for each in board.contents if isinstance(each, rrb.Container | rrb.View)]
+    return sum(within) if isinstance(board, rrb.Vertical) else max(within, default=0)
 
 
 def entity_path(*parts: str) -> str:

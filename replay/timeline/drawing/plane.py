@@ -19,6 +19,8 @@ from replay.engine.streams.measurements import PLANE
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.canvas import (
     TRUTH,
+    WIDTH,
+    Board,
     Canvas,
     Colour,
     Scene,
@@ -43,6 +45,8 @@ PARTICLE_PX = 1.5
 MARGIN, LEAST_SIDE = 0.07, 0.3
 # A legend has room for so many entries, one below another; names are centred so far from the left.
 LEGEND_ROWS, LEGEND_INDENT = 14, 0.05
+# A legend's row above a board: its most entries, its height by the width of one and by the board's.
+LEGEND_COLUMNS, LEGEND_ASPECT, LEGEND_SHARE = 6, 0.06, 0.07
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -58,6 +62,14 @@ class Stroke(NamedTuple):
         radius_px = self.radius_px * widen
         radii = rr.Radius.ui_points(radius_px)
         return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - radius_px}
+
+
+TRUE = Stroke(TRUTH, 3.0)
+
+
+def stroke_of(scene: Scene, estimator: str) -> Stroke:
+    """Return how lines of an estimator look, so that one on another shows both."""
+    return Stroke(scene.colour(estimator), 0.25 + 0.75 * scene.width(estimator) / WIDTH)
 
 
 def turn_up(canvas: Canvas, root: str = ROOT) -> None:
@@ -373,6 +385,36 @@ def draw_legend(canvas: Canvas, entity: str, entries: Mapping[str, Colour], plac
         at, labels=[*entries], colors=[*entries.values()], radii=radii, show_labels=True, draw_order=30.0
     )
     canvas.fix(entity, dots)
+
+
+def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board: Board) -> Board:
+    """Return a board below what its colours stand for: a row of dots with their names.
+
+    Args:
+        canvas: what is drawn on.
+        name: tells this legend from others of the layout.
+        colours: by name; none leaves the board alone.
+        board: a scene, or several of the same colours.
+    """
+    if not colours:
+        return board
+    number = np.arange(len(colours))
+    columns = min(max(len(colours), 4), LEGEND_COLUMNS)
+    row_height, rows = LEGEND_ASPECT * columns, -(-len(colours) // columns)
+    at = np.stack([number % columns + 0.5, row_height * (number // columns)], axis=1)
+    radii = rr.Radius.ui_points(5.0)
+    dots = rr.Points2D(at, labels=[*colours], colors=[*colours.values()], radii=radii, show_labels=True)
+    entity = f"legend/{name}"
+    canvas.fix(entity, dots)
+    view = rrb.Spatial2DView(
+        origin=escaped(entity),
+        name="Legend",
+        titlebar=False,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(0.0, columns), y_range=(-0.3 * row_height, (rows - 0.3) * row_height)
+        ),
+    )
+    return rrb.Vertical(view, board, row_shares=[LEGEND_SHARE * rows, 1.0])
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:

@@ -4,7 +4,7 @@ Every function sends its columns and returns the views that show them. A band is
 which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import compress, cycle
 from typing import NamedTuple
@@ -21,6 +21,8 @@ from replay.timeline.drawing.canvas import (
     MUTED,
     PALETTE,
     TRUTH,
+    WIDTH,
+    Board,
     Canvas,
     Colour,
     Scene,
@@ -28,11 +30,15 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     escaped,
     nice,
+    strips_of,
     thin,
     thin_curve,
 )
 
 SIGMAS = 2.0
+_TITLES = {"NEES": "NEES of this run,", "NIS": "NIS of"}
+# So many plots are seen one below another at most, and so many of them in one tab.
+MOST_STRIPS, TAB_STRIPS = 8, 4
 # What a legend takes of a plot's height: for itself, for each entry, and at most.
 LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
 # The same in the low panels of NEES and NIS.
@@ -43,8 +49,19 @@ WHOLE_RUN = rrb.TimeAxis(
     view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
 )
 Style = Callable[..., rr.AsComponents]
-LINE: Style = partial(rr.SeriesLines, widths=[1.5])
-POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
+
+
+def line(width: float) -> Style:
+    """Return a curve's look as a line so wide, in pixels."""
+    return partial(rr.SeriesLines, widths=[width])
+
+
+def dots(size: float) -> Style:
+    """Return a curve's look as points so large, in pixels."""
+    return partial(rr.SeriesPoints, marker_sizes=[size])
+
+
+LINE, POINTS, SINGLE = line(WIDTH), dots(WIDTH), dots(5.0)
 
 
 class Squares(NamedTuple):
@@ -60,26 +77,81 @@ class Squares(NamedTuple):
     values: Floats
 
 
-def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw errors, NEES, NIS and effective particles of a case: no plots without anything to judge."""
-    parts = (draw_errors, draw_nees, draw_nis, draw_effective)
-    return [view for part in parts for view in part(canvas, scene, case)]
+def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True) -> list[Board]:
+    """Draw errors, NEES, NIS and effective particles of a case, at most `MOST_STRIPS` at once.
+
+    If there are more, errors are in tabs by quantity, and the others too if they are still too many.
+    There are no plots without anything to judge. `legend` is False if a scene names the colours.
+    """
+    errors = draw_errors(canvas, scene, case)
+    others = {
+        "NEES": draw_nees(canvas, scene, case, legend=legend),
+        "NIS": draw_nis(canvas, scene, case, legend=legend),
+        "particles": draw_effective(canvas, scene, case),
+    }
+    strips: list[Board] = [view for views in others.values() for view in views]
+    if len(errors) + len(strips) <= MOST_STRIPS:
+        return [*errors.values(), *strips]
+    in_tabs = _tabs(_by_quantity(errors), TAB_STRIPS)
+    room = MOST_STRIPS - strips_of(in_tabs)
+    return [in_tabs, *(strips if len(strips) <= room else [_tabs(others, room)])]
 
 
-def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Tabs]:
-    """Draw NEES and errors of a case of many components: of each kind of plot one at a time."""
-    kinds = (draw_nees(canvas, scene, case)[::-1], draw_errors(canvas, scene, case))
-    return [rrb.Tabs(*views) for views in kinds if views]
+def in_strips(views: Mapping[str, rrb.View], name: str) -> rrb.Container:
+    """Return views of components one below another; in tabs by quantity if they are too many."""
+    if len(views) <= MOST_STRIPS:
+        return rrb.Vertical(*views.values(), name=name)
+    return _tabs(_by_quantity(views), TAB_STRIPS, name)
 
 
-def draw_errors(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw one plot per component of a case: each estimator's error inside its band of +-2 sigma."""
+def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None = None) -> rrb.Tabs:
+    """Return a tab of at most so many strips for each group, several for a larger one."""
+    return rrb.Tabs(
+        *(
+            rrb.Vertical(*views[first : first + most], name=title)
+            for title, views in groups.items()
+            for first in range(0, len(views), most)
+        ),
+        name=name,
+    )
+
+
+def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
+    """Group views by component: the axes of a vector together, single numbers up to a tab's strips."""
+    groups: dict[str, list[rrb.View]] = {}
+    for component, view in views.items():
+        groups.setdefault(_vector_of(component), []).append(view)
+    tabs: list[tuple[list[str], list[rrb.View]]] = []
+    for name, own in groups.items():
+        if tabs and len(tabs[-1][1]) + len(own) <= TAB_STRIPS:
+            tabs[-1] = ([*tabs[-1][0], name], [*tabs[-1][1], *own])
+        else:
+            tabs.append(([name], own))
+    return {
+        (", ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]}"): own
+        for names, own in tabs
+    }
+
+
+def _vector_of(component: str) -> str:
+    """Name the quantity that a component is an axis of: position, target 1 velocity, gyro bias."""
+    quantity, unit, _ = shown_unit(component)
+    *words, axis = quantity.split()
+    if axis in ("vx", "vy", "vz"):
+        return " ".join([*words, "velocity"])
+    if axis in ("w", "x", "y", "z"):
+        return " ".join([*words, "position"]) if unit == "m" else " ".join(words) or quantity
+    return quantity
+
+
+def draw_errors(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:
+    """Draw a plot for each component of a case: each estimator's error inside its band of +-2 sigma."""
     found = scene.errors_of(case)
     components = dict.fromkeys(name for errors in found for name in errors.components)
-    return [
-        _draw_error(canvas, scene, case, name, [each for each in found if name in each.components])
+    return {
+        name: _draw_error(canvas, scene, case, name, [each for each in found if name in each.components])
         for name in components
-    ]
+    }
 
 
 def _draw_error(
@@ -95,22 +167,37 @@ def _draw_error(
         bound = scale * SIGMAS * np.sqrt(np.maximum(errors.covariance[rows, column, column], 0.0))
         extents.append(np.quantile(np.maximum(np.abs(error), bound), 0.99))
         zero = np.zeros(len(rows))
+        entity, colour = f"{plot}/{errors.estimator}", scene.colour(errors.estimator)
+        if len(rows) == 1:
+            _draw_point(canvas, entity, errors, colour, float(error[0]), float(bound[0]))
+            continue
         columns = rr.Measurements.columns(
             values=np.stack([error, zero], axis=1).ravel(),
             variances=np.stack([zero, bound**2], axis=1).ravel(),
         )
-        entity = f"{plot}/{errors.estimator}"
         canvas.send(entity, errors.time_ns[rows], columns.partition([2] * len(rows)))
         names = [errors.estimator, f"{errors.estimator} band"]
-        colour = scene.colour(errors.estimator)
         style = rr.Measurements.from_fields(
-            names=names, colors=[colour, (*colour, 150)], widths=[1.5, 0.0]
+            names=names, colors=[colour, (*colour, 150)], widths=[scene.width(errors.estimator), 0.0]
         )
         canvas.fix(entity, style)
     # the most accurate estimator sets the range; one that drifts away leaves the picture
     extent = nice(1.2 * max(float(min(extents)), np.finfo(float).tiny))
-    name = f"Error of {quantity} ({unit}), bands ±{SIGMAS:g} sigma"
-    return plot_view(plot, name, (-1.1 * extent, 1.1 * extent), legend=False)
+    note = f", axis to ±{extent:g}, bands ±{SIGMAS:g} sigma"
+    return plot_view(plot, f"Error of {quantity}", unit, (-extent, extent), note=note, legend=False)
+
+
+def _draw_point(
+    canvas: Canvas, entity: str, errors: Errors, colour: Colour, error: float, bound: float
+) -> None:
+    """Draw the error of a single estimate as a point between the ends of its band."""
+    marks = rr.Scalars.columns(scalars=[error, -bound, bound])
+    canvas.send(entity, errors.time_ns, marks.partition([3]))
+    names = [errors.estimator, *(f"{errors.estimator} band" for _ in range(2))]
+    style = rr.SeriesPoints(
+        names=names, colors=[colour] * 3, markers=["Circle", "Up", "Down"], marker_sizes=[5.0, 4.0, 4.0]
+    )
+    canvas.fix(entity, style)
 
 
 def draw_nees(
@@ -122,10 +209,12 @@ def draw_nees(
         for errors in scene.errors_of(case)
         if not errors.is_bound
     ]
-    return _draw_squares(canvas, scene, case, "NEES", found, LINE, legend=legend)
+    return _draw_squares(canvas, scene, case, "NEES", found, line, legend=legend)
 
 
-def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+def draw_nis(
+    canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
+) -> list[rrb.TimeSeriesView]:
     """Draw each estimator's NIS, a point per measurement; one plot per set of measured components."""
     found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
@@ -139,7 +228,7 @@ def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView
             of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
             squares = innovations.time_ns[rows], innovations.squared[rows]
             found.append(Squares(own, of, estimator, *squares))
-    return _draw_squares(canvas, scene, case, "NIS", found, POINTS)
+    return _draw_squares(canvas, scene, case, "NIS", found, dots, legend=legend)
 
 
 def _draw_squares(
@@ -148,7 +237,7 @@ def _draw_squares(
     case: str,
     name: str,
     found: Sequence[Squares],
-    style: Style,
+    style: Callable[[float], Style],
     *,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
@@ -173,15 +262,16 @@ def _draw_squares(
         counted = []
         for _, _, estimator, time_ns, values in alike:
             colour = scene.colour(estimator)
-            draw_curve(canvas, plot, estimator, colour, time_ns, values, style)
+            draw_curve(canvas, plot, estimator, colour, time_ns, values, style(scene.width(estimator)))
             above = values > end
             if above.any():
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
                 counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
-        title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
-        title += f"; 95 % are below {high:.3g}" if high < 0.2 * end else ""
-        title += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
-        views.append(plot_view(plot, title, (-0.1 * end, end), legend=legend, zoom_lock=not counted))
+        note = f"; 95 % are below {high:.3g}" if high < 0.2 * end or not legend else ""
+        note += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
+        title = f"{_TITLES[name]} {of or f'{degrees} component' + 's' * (degrees != 1)}"
+        extent, locked = (-0.1 * end, end), not counted
+        views.append(plot_view(plot, title, "-", extent, note=note, legend=legend, zoom_lock=locked))
     return views
 
 
@@ -215,9 +305,8 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
         curves = zip(stream.components, stream["probability"].T, cycle(PALETTE), strict=False)
         for mode, probability, colour in curves:
             draw_curve(canvas, plot, mode, colour, stream.publish_time_ns, probability, LINE)
-        views.append(
-            plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, SHARES))
-        )
+        title = f"{name.replace('_', ' ').capitalize()} of {estimator}"
+        views.append(plot_view(plot, title, "probability", (-0.05, SHARES)))
     return views
 
 
@@ -226,26 +315,28 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
     plot, found = entity_path("plots", case, "effective"), False
     for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
         share, found = stream["effective"] / stream["particles"], True
-        draw_curve(canvas, plot, estimator, scene.colour(estimator), stream.publish_time_ns, share, LINE)
-    return [plot_view(plot, "Effective share of the particles", (-0.05, SHARES))] if found else []
+        look = (scene.colour(estimator), stream.publish_time_ns, share, line(scene.width(estimator)))
+        draw_curve(canvas, plot, estimator, *look)
+    return [plot_view(plot, "Effective particles", "share", (-0.05, SHARES))] if found else []
 
 
-def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+def draw_components(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:
     """Draw one plot per component of a case's Gaussian estimates: estimators' means, and the truth."""
-    found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
+    found = [("truth", TRUTH, LINE, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
-        found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
+        style = line(scene.width(estimator))
+        found.append((estimator, scene.colour(estimator), style, stream, stream["mean"]))
     drawn: dict[str, list[Floats]] = {}
-    for name, colour, stream, values in found:
+    for name, colour, style, stream, values in found:
         for column, component in enumerate(stream.components):
             scale, plot = shown_unit(component)[2], entity_path("plots", case, component)
             drawn.setdefault(component, []).append(scale * values[:, column])
-            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, drawn[component][-1], LINE)
-    views = []
+            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, drawn[component][-1], style)
+    views = {}
     for component, curves in drawn.items():
         quantity, unit, _ = shown_unit(component)
-        plot, title = entity_path("plots", case, component), f"{quantity.capitalize()} ({unit})"
-        views.append(plot_view(plot, title, below_legend(curves), zoom_lock=False))
+        plot, extent = entity_path("plots", case, component), below_legend(curves)
+        views[component] = plot_view(plot, quantity.capitalize(), unit, extent, zoom_lock=False)
     return views
 
 
@@ -277,26 +368,31 @@ def draw_curve(
         canvas: what is drawn on.
         plot, name, colour: of the curve.
         time_ns, values: (n,), in order of time.
-        style: as a line or as points.
+        style: as a line or as points; a single value is a point.
         most: at most so many values, peaks kept.
     """
     rows = thin_curve(time_ns, values, most)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
-    canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
+    canvas.fix(f"{plot}/{name}", (style if len(rows) > 1 else SINGLE)(names=[name], colors=[colour]))
 
 
 def plot_view(
     entity: str,
-    name: str,
+    quantity: str,
+    unit: str,
     extent: tuple[float, float] | None = None,
     *,
+    note: str = "",
     legend: bool = True,
     zoom_lock: bool = True,
 ) -> rrb.TimeSeriesView:
-    """Plot everything below an entity, over the whole run; a stated range stays by default."""
+    """Plot everything below an entity, over the whole run, under its quantity and unit, and a note.
+
+    A stated range stays by default.
+    """
     return rrb.TimeSeriesView(
         origin=escaped(entity),
-        name=name,
+        name=f"{quantity} ({unit}){note}",
         axis_x=WHOLE_RUN,
         axis_y=rrb.ScalarAxis(range=extent, zoom_lock=zoom_lock and extent is not None),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),

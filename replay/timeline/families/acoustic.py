@@ -23,7 +23,7 @@ from replay.timeline.drawing.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.drawing.plots import draw_quality_in_tabs
+from replay.timeline.drawing.plots import draw_quality
 
 CASE = "shooter"
 MUZZLE_BLAST = (150, 150, 150, 160)
@@ -57,7 +57,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
         _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator), 1.5), stream, cone)
     board = above_events(plane_view(canvas, ROOT, [], [], shown), draw_events(canvas, scene, CASE))
-    return beside(board, draw_quality_in_tabs(canvas, scene, CASE), CASE)
+    return beside(board, draw_quality(canvas, scene, CASE), CASE)
 
 
 def _place(scene: Scene, sensor: int) -> Floats:

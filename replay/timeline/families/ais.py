@@ -85,7 +85,7 @@ def _draw_live(canvas: Canvas, scene: Scene, tracks: list[tuple[str, Stream]]) -
         rows = thin(at_ns)
         _send_curve(canvas, f"plots/live/{name}", at_ns[rows], live[rows])
         canvas.fix(f"plots/live/{name}", LINE(names=[name], colors=[colour]))
-    return plot_view("plots/live", f"Heard within {LIVE_S / 60:g} min")
+    return plot_view("plots/live", f"Heard within {LIVE_S / 60:g} min", "number")
 
 
 def _send_curve(canvas: Canvas, entity: str, time_ns: Times, values: NDArray) -> None:

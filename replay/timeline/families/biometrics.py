@@ -52,7 +52,7 @@ def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> r
     of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
     _draw_probes(canvas, f"{root}/scores", fused, time_ns)
     return rrb.Horizontal(
-        plot_view(f"{root}/scores", f"{of_probe} of each probe"),
+        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-"),
         _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
         name=estimator,
     )
@@ -67,7 +67,7 @@ def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
         last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
         canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
         canvas.fix(f"{plot}/{estimator}", LINE(names=[estimator], colors=[scene.colour(estimator)]))
-    return plot_view(plot, "Wrong decisions so far (%)")
+    return plot_view(plot, "Wrong decisions so far", "%")
 
 
 def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> None:
@@ -148,7 +148,7 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
         _draw_probes(
             canvas, plot, Fused(score, probe, gallery, None, None, False), stream.publish_time_ns
         )
-        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe"))
+        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe", "-"))
     return views
 
 

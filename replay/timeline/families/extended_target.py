@@ -5,9 +5,19 @@ import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas, topics_of
 from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import TRUTH, WRONG, Canvas, Scene, Timeline, beside
+from replay.timeline.drawing.canvas import WRONG, Canvas, Scene, Timeline, beside
 from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import ROOT, Stroke, draw_dots, draw_outlines, plane_view, turn_up
+from replay.timeline.drawing.plane import (
+    ROOT,
+    TRUE,
+    Stroke,
+    draw_dots,
+    draw_outlines,
+    plane_view,
+    stroke_of,
+    turn_up,
+    with_legend,
+)
 from replay.timeline.drawing.plots import draw_components, draw_quality
 
 TARGET = ("half_x_m", "half_y_m", "x_m", "y_m")
@@ -23,13 +33,16 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         draw_dots(canvas, points, stream.publish_time_ns, stream["position_m"], Stroke(WRONG))
         shown.append(stream["position_m"])
     for stream in filter(_is_target, scene.truths_of("")):
-        _draw_target(canvas, "truth", stream, stream["state"], Stroke(TRUTH, 2.0))
+        _draw_target(canvas, "truth", stream, stream["state"], TRUE)
     for estimator, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE):
         if _is_target(stream):
-            _draw_target(canvas, estimator, stream, stream["mean"], Stroke(scene.colour(estimator)))
+            _draw_target(canvas, estimator, stream, stream["mean"], stroke_of(scene, estimator))
     plane = plane_view(canvas, ROOT, [], [points], np.concatenate(shown))
-    board = above_events(plane, draw_events(canvas, scene, ""))
-    plots = [*draw_components(canvas, scene, "")[:2], *draw_quality(canvas, scene, "")]
+    colours = scene.colours("") | {"measured": WRONG}
+    board = with_legend(canvas, ROOT, colours, plane)
+    board = above_events(board, draw_events(canvas, scene, ""))
+    sizes = [*draw_components(canvas, scene, "").values()][:2]
+    plots = [*sizes, *draw_quality(canvas, scene, "", legend=False)]
     return beside(board, plots, "")
 
 

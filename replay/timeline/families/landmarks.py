@@ -11,9 +11,9 @@ from recorders.log import Stream, schemas
 from replay.engine.streams.measurements import PLANE, covariances_of
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.canvas import (
-    TRUTH,
     WRONG,
     Canvas,
+    Colour,
     Scene,
     Timeline,
     Times,
@@ -25,6 +25,7 @@ from replay.timeline.drawing.canvas import (
 from replay.timeline.drawing.events import above_events, draw_events
 from replay.timeline.drawing.plane import (
     ROOT,
+    TRUE,
     Stroke,
     draw_clouds,
     draw_ellipses,
@@ -34,7 +35,9 @@ from replay.timeline.drawing.plane import (
     draw_poses,
     extent_of,
     plane_view,
+    stroke_of,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import draw_quality
 from replay.timeline.families.sets import draw_sets
@@ -88,18 +91,19 @@ def _draw_robot(
     shown = np.concatenate([landmarks.to_numpy(), *(each.poses[:, :2] for each in tracks[:1])])
     paths = [draw_track(canvas, root, track, extent_of(shown)) for track in tracks]
     draw_clouds(canvas, scene, robot, root)
-    draw_sights(canvas, scene, robot, tracks, landmarks)
+    sights = draw_sights(canvas, scene, robot, tracks, landmarks)
     _, areas = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
-    board = above_events(plane, draw_events(canvas, scene, robot))
-    return beside(board, [*draw_quality(canvas, scene, robot), *areas], robot)
+    board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
+    board = above_events(board, draw_events(canvas, scene, robot))
+    return beside(board, [*draw_quality(canvas, scene, robot, legend=False), *areas], robot)
 
 
 def tracks_of(scene: Scene, robot: str) -> list[Track]:
     """Return the truth and every estimate that says where the robot is, thinned to what is drawn."""
-    found = [("truth", Stroke(TRUTH, 2.0), each, each["state"]) for each in scene.truths_of(robot)]
+    found = [("truth", TRUE, each, each["state"]) for each in scene.truths_of(robot)]
     for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
-        found.append((estimator, Stroke(scene.colour(estimator)), stream, stream["mean"]))
+        found.append((estimator, stroke_of(scene, estimator), stream, stream["mean"]))
     tracks = [_track(*each) for each in found if set(PLANE) <= set(each[2].components)]
     return [track for track in tracks if len(track.time_ns)]
 
@@ -133,8 +137,8 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
 
 def draw_sights(
     canvas: Canvas, scene: Scene, robot: str, tracks: list[Track], landmarks: pd.DataFrame
-) -> None:
-    """Draw lines from the robot to landmarks that it sees; what an estimator's gate kept out is red."""
+) -> dict[str, Colour]:
+    """Draw lines from the robot to landmarks that it sees, red if rejected; return names of colours."""
     sensors = [
         scene.read(topic)
         for topic in scene.topics_near(robot)
@@ -149,6 +153,8 @@ def draw_sights(
     known = np.isfinite(lines).all(axis=(1, 2))
     colours = np.where(gated[:, None], GATED, SEEN).astype(np.uint8)
     draw_lines(canvas, entity_path(ROOT, robot, "sights"), time_ns[known], lines[known], colours[known])
+    named = {"measured": (SEEN, known & ~gated), "rejected": (GATED, known & gated)}
+    return {name: colour[:3] for name, (colour, rows) in named.items() if rows.any()}
 
 
 def _pairs(streams: list[Stream]) -> pd.MultiIndex:

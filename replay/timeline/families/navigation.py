@@ -229,16 +229,16 @@ def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
     )
 
 
-def _groups(bodies: Sequence[Body]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield what is plotted together: a name, a title, components."""
+def _groups(bodies: Sequence[Body]) -> Iterator[tuple[str, str, str, list[str]]]:
+    """Yield what is plotted together: a name, a title with its unit, components."""
     names = dict.fromkeys(name for body in bodies for name in body.names)
     if set(VELOCITY) <= set(names):
-        yield "velocity", "Velocity (m/s)", list(VELOCITY)
-    yield "attitude", "Attitude (deg)", list(ANGLES)
+        yield "velocity", "Velocity", "m/s", list(VELOCITY)
+    yield "attitude", "Attitude", "deg", list(ANGLES)
     for stem, title in BIASES:
         own = [name for name in names if name.startswith(stem)]
         if own:
-            yield f"{stem}plot".removesuffix("_plot"), f"{title} ({shown_unit(own[0])[1]})", own
+            yield f"{stem}plot".removesuffix("_plot"), title, shown_unit(own[0])[1], own
 
 
 def _draw_group(
@@ -247,6 +247,7 @@ def _draw_group(
     bodies: Sequence[Body],
     name: str,
     title: str,
+    unit: str,
     components: Sequence[str],
     outages: Times,
 ) -> rrb.TimeSeriesView:
@@ -266,7 +267,7 @@ def _draw_group(
             largest = max(largest, float(np.quantile(np.abs(values), 0.995)))
     extent = nice(1.2 * max(largest, np.finfo(float).tiny))
     _draw_shades(canvas, f"{plot}/without_fixes", outages, extent)
-    return plot_view(plot, title, (-extent, extent), legend=False)
+    return plot_view(plot, title, unit, (-extent, extent), legend=False)
 
 
 def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:

@@ -35,7 +35,7 @@ from replay.timeline.drawing.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.drawing.plots import draw_errors, draw_nees
+from replay.timeline.drawing.plots import draw_errors, draw_nees, in_strips
 
 GRAPH = f"{ROOT}/graph"
 PLACE = ("x_m", "y_m")
@@ -61,7 +61,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     if not cases:
         return board
     nees = [view for case in cases for view in _draw_nees(canvas, scene, case, legend=case == cases[-1])]
-    errors = [rrb.Vertical(*draw_errors(canvas, scene, case), name=case) for case in cases]
+    errors = [in_strips(draw_errors(canvas, scene, case), case) for case in cases]
     plots = rrb.Tabs(rrb.Vertical(*nees, name="NEES"), *errors)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 

@@ -30,7 +30,7 @@ from replay.timeline.drawing.canvas import (
     nice,
 )
 from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plots import draw_quality_in_tabs
+from replay.timeline.drawing.plots import draw_quality
 
 ROOT = "space"
 SENSOR: Colour = (240, 228, 66)
@@ -66,7 +66,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     name = f"Scene; 95 % ellipsoids {' '.join(f'x{each:g}' for each in dict.fromkeys(shown))}"
     space = rrb.Spatial3DView(origin=ROOT, name=name if shown else "Scene")
     board = above_events(space, draw_events(canvas, scene, ""))
-    return beside(board, draw_quality_in_tabs(canvas, scene, ""), "")
+    return beside(board, draw_quality(canvas, scene, ""), "")
 
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:

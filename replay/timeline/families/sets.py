@@ -30,6 +30,7 @@ from replay.timeline.drawing.plane import (
     draw_polygons,
     plane_view,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import draw_curve, plot_view
 
@@ -58,7 +59,8 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
         shown.append(places)
     reach, plots = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], np.concatenate([*shown, reach]))
-    board = above_events(plane, draw_events(canvas, scene, robot), 4.0)
+    board = with_legend(canvas, root, scene.colours(robot), plane)
+    board = above_events(board, draw_events(canvas, scene, robot), 4.0)
     return beside(board, plots, robot)
 
 
@@ -83,7 +85,7 @@ def draw_sets(
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     low, high = np.moveaxis(np.array(corners), 1, 0)
     reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
-    return reach, [plot_view(plot, "Area of the set (m²)")]
+    return reach, [plot_view(plot, "Area of the set", "m²")]
 
 
 TIMELINE = Timeline(draw)

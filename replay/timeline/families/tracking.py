@@ -268,7 +268,7 @@ def _draw_gospa(
     for name, of_tracker in errors.items():
         draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
     extent = below_legend([of_tracker.gospa for of_tracker in errors.values()])
-    return plot_view("plots/gospa", "GOSPA (m), c = 20 m", extent, zoom_lock=False)
+    return plot_view("plots/gospa", "GOSPA", "m", extent, note=", c = 20 m", zoom_lock=False)
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
@@ -278,7 +278,8 @@ def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
         counts = sizes["elements"].astype(float)
         draw_curve(canvas, "plots/count", name, scene.colour(name), sizes.publish_time_ns, counts, LINE)
         drawn.append(counts)
-    return plot_view("plots/count", "Confirmed tracks", below_legend(drawn), zoom_lock=False)
+    extent = below_legend(drawn)
+    return plot_view("plots/count", "Confirmed tracks", "number", extent, zoom_lock=False)
 
 
 def _draw_existence(
@@ -294,7 +295,7 @@ def _draw_existence(
             time_ns, values = tracks.publish_time_ns[rows], existence[name]["existence"][rows]
             entity = "plots/existence"
             draw_curve(canvas, entity, f"track{number}", (red, green, blue), time_ns, values, POINTS)
-    return plot_view("plots/existence", "Existence", (0.0, 1.0), legend=False)
+    return plot_view("plots/existence", "Existence", "probability", (0.0, 1.0), legend=False)
 
 
 TIMELINE = Timeline(draw)

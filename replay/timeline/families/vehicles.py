@@ -35,7 +35,7 @@ from replay.timeline.drawing.events import draw_events
 from replay.timeline.drawing.geodetic import degrees_of, draw_fixes, map_view
 from replay.timeline.drawing.plane import (
     ROOT,
-    Stroke,
+    TRUE,
     clouds_of,
     draw_cloud,
     draw_clouds,
@@ -44,6 +44,7 @@ from replay.timeline.drawing.plane import (
     draw_path,
     draw_scans,
     plane_view,
+    stroke_of,
     turn_up,
 )
 from replay.timeline.drawing.plots import (
@@ -209,11 +210,11 @@ def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str
     """Draw paths of truth and estimators, fixes without identity, and registered detections."""
     root = f"{ROOT}/map"
     for n in range(vehicles.number):
-        stroke = Stroke(TRUTH, 2.5)
+        stroke = TRUE
         draw_path(canvas, f"{root}/truth/{n}", vehicles.time_ns, vehicles.places[:, n], stroke)
         for name, places in tracks.items():
             known = np.isfinite(places[:, n, 0])
-            stroke = Stroke(scene.colour(name))
+            stroke = stroke_of(scene, name)
             draw_path(canvas, f"{root}/{name}/{n}", vehicles.time_ns[known], places[known, n], stroke)
         draw_clouds(canvas, scene, f"vehicle{n + 1}", f"{root}/vehicle{n + 1}")
     draw_scans(canvas, f"{root}/fixes", *_points(scene, "/network/detection"), FIX, 4.0)
@@ -294,7 +295,7 @@ def _draw_ellipse(
         stream.publish_time_ns[shown],
         apart[shown] + centre,
         covariance[shown],
-        Stroke(scene.colour(name)),
+        stroke_of(scene, name),
     )
 
 
@@ -326,8 +327,8 @@ def _draw_errors(
             colour = scene.colour(found.estimator)
             draw_curve(canvas, "plots/gospa", found.estimator, colour, found.time_ns, found.gospa, LINE)
     return [
-        plot_view("plots/error", "Error of all vehicles together (m)", (0.0, 4.0)),
-        plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m (m)", (0.0, 4.0), legend=False),
+        plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0)),
+        plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0), legend=False),
     ]
 
 

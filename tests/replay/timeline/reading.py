@@ -3,11 +3,14 @@
 `compare` holds it against what it should show; `check_views` against what all families have in common.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import UUID
 
 import numpy as np
+import pytest
 import rerun.chunk as rc
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -17,6 +20,9 @@ from replay.judging.errors.evaluation import Errors, Floats, chi_square_interval
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
 from tests.replay.timeline.test_timeline import Columns, read, told
 
+# Kinds of containers, as Rerun numbers them, and the view that names colours.
+VERTICAL, GRID = 3, 4
+LEGEND = "Legend"
 SIGMA_95 = chi2.ppf(0.95, 2)
 # How a unit of a component is shown, and how many of that one of its own is.
 UNITS = {"m": ("m", 1.0), "rad": ("deg", 180 / np.pi), "mps": ("m/s", 1.0), "-": ("-", 1.0)}
@@ -27,7 +33,10 @@ Titles = set[tuple[str, str]]
 
 
 class View(NamedTuple):
-    """A view of the layout: what it shows is below its roots, without a slash before them."""
+    """A view of the layout: what it shows is below its roots, without a slash before them.
+
+    Its height is a share of the layout's.
+    """
 
     kind: str
     name: str
@@ -35,15 +44,22 @@ class View(NamedTuple):
     span: list[float] | None
     bounds: dict[str, list[float]] | None
     trails: list[str]
+    has_legend: bool
+    height: float
 
 
 class Picture(NamedTuple):
-    """All of a file; `shared` has for each part that shares its room how much of it which views get."""
+    """All of a file; `shared` has for each part that shares its room how much of it which views get.
+
+    Legends are views as well, but in no part of `shared`. `strips` is the largest number of
+    plots that are one below another at the same time.
+    """
 
     moving: dict[str, Columns]
     still: dict[str, Columns]
     views: list[View]
     shared: list[list[tuple[float, set[str]]]]
+    strips: int
 
 
 class Wanted(NamedTuple):
@@ -60,9 +76,15 @@ def picture_of(path: Path) -> Picture:
     parts: dict[str, dict[str, list]] = {}
     containers: dict[str, dict[str, list]] = {}
     trails: dict[str, list[str]] = {}
+    root = ""
     for chunk in reader.stream(store=reader.blueprints()[0]):
         kind, _, rest = chunk.entity_path.strip("/").partition("/")
         number, _, detail = rest.partition("/")
+        if kind == "viewport":
+            batch = chunk.to_record_batch()
+            if "ViewportBlueprint:root_container" in batch.schema.names:
+                [held] = batch.column("ViewportBlueprint:root_container")[0].as_py()
+                root = str(UUID(bytes=bytes(held)))
         if kind in ("view", "container"):
             batch = chunk.to_record_batch()
             named = {name: batch.column(name)[0].as_py() for name in batch.schema.names}
@@ -70,6 +92,7 @@ def picture_of(path: Path) -> Picture:
             overridden = detail.removeprefix("ViewContents/overrides/").removesuffix("/visualizers")
             if overridden != detail:
                 trails.setdefault(number, []).append(f"/{overridden}")
+    heights = _heights(root, containers)
     views = []
     for number, part in parts.items():
         [origin], query = part["ViewBlueprint:space_origin"], part["ViewContents:query"]
@@ -78,19 +101,54 @@ def picture_of(path: Path) -> Picture:
         span, bounds = (
             (part.get(each) or [None])[0] for each in ("ScalarAxis:range", "VisualBounds2D:range")
         )
-        views.append(View(kind, name, roots, span, bounds, trails.get(number, [])))
+        has_legend = part.get("PlotLegend:visible", [True]) != [False]
+        own = (trails.get(number, []), has_legend, heights[number])
+        views.append(View(kind, name, roots, span, bounds, *own))
     kinds = {number: part["ViewBlueprint:class_identifier"][0] for number, part in parts.items()}
+    legends = {n for n, part in parts.items() if part["ViewBlueprint:display_name"] == [LEGEND]}
     shared = [
         [
             (share, _kinds_of(each, kinds, containers))
             for share, each in zip(shares, contents, strict=True)
+            if each.partition("/")[2] not in legends
         ]
         for container in containers.values()
         if (contents := container["ContainerBlueprint:contents"])
         for axis in ("col", "row")
         if (shares := container.get(f"ContainerBlueprint:{axis}_shares"))
     ]
-    return Picture(read(path), read(path, static=True), views, shared)
+    strips = _strips_below(root, kinds, containers)
+    return Picture(read(path), read(path, static=True), views, shared, strips)
+
+
+def _heights(root: str, containers: Mapping[str, Any], height: float = 1.0) -> dict[str, float]:
+    """How high each view within a container is, by its number."""
+    if root not in containers:
+        return {root: height}
+    part = containers[root]
+    within, [kind] = part["ContainerBlueprint:contents"], part["ContainerBlueprint:container_kind"]
+    rows = len(within) if kind == VERTICAL else 1
+    if kind == GRID:
+        columns = part.get("ContainerBlueprint:grid_columns") or [np.ceil(len(within) ** 0.5)]
+        rows = int(np.ceil(len(within) / columns[0]))
+    shares = part.get("ContainerBlueprint:row_shares") or [1.0] * rows
+    found: dict[str, float] = {}
+    for number, each in enumerate(within):
+        row = number if kind == VERTICAL else number // -(-len(within) // rows)
+        found |= _heights(each.partition("/")[2], containers, height * shares[row] / sum(shares))
+    return found
+
+
+def _strips_below(root: str, kinds: Mapping[str, str], containers: Mapping[str, Any]) -> int:
+    """How many plots over time are one below another at once."""
+    if root not in containers:
+        return int(kinds[root] == "TimeSeries")
+    part = containers[root]
+    within = [
+        _strips_below(each.partition("/")[2], kinds, containers)
+        for each in part["ContainerBlueprint:contents"]
+    ]
+    return sum(within) if part["ContainerBlueprint:container_kind"] == [VERTICAL] else max(within)
 
 
 def _kinds_of(part: str, kinds: Mapping[str, str], containers: Mapping[str, Any]) -> set[str]:
@@ -190,6 +248,9 @@ OF_NO_ESTIMATOR = {
     *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle"),
     "without_fixes",
 }
+# What a view has beside its data, and the names of columns that are data.
+FRAMES = ("grid", "bounds", "circle", "cells", "names", "numbers", "threshold")
+VALUES = ("scalars", "values", "strips", "positions", "centers", "vectors", "text", "buffer", "instance")
 SIZES = ("LineStrips2D:strips", "Points2D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips")
 
 
@@ -248,7 +309,7 @@ def quality(errors: Sequence[Errors], case: str) -> tuple[dict[str, Wanted], Tit
         plot = f"{plots}nees_{count}"
         wanted[f"{plot}/{each.estimator}"] = Wanted("curve", time_ns, each.nees)
         wanted[f"{plot}/bounds"] = consistent(count, time_ns)
-        titles.add((f"NEES of {count} component{'s' * (count > 1)}", plot[1:]))
+        titles.add((f"NEES of this run, {count} component{'s' * (count > 1)} (-)", plot[1:]))
     return wanted, titles
 
 
@@ -264,7 +325,8 @@ def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("
         if is_space[0]:
             assert shares[0][0] == max(share for share, _ in shares)
     drawn = {*picture.moving, *picture.still}
-    named = [(view.name.partition(", grid")[0], view.roots[0]) for view in picture.views]
+    shown = [view for view in picture.views if view.name != LEGEND]
+    named = [(_title_of(view), view.roots[0]) for view in shown]
     assert sorted(named) == sorted(titles), {*named} ^ titles
     for view in picture.views:
         for root in view.roots:
@@ -281,6 +343,91 @@ def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("
             _check_span(picture, view)
     for entity, columns in picture.still.items():
         _check_style(entity, columns, estimators)
+
+
+def check_first_view(picture: Picture) -> None:
+    """No view is empty, plots are high enough to be read and name units, every colour has a name."""
+    assert picture.strips <= 8
+    names: dict[int, str] = {}
+    for view in picture.views:
+        shown = _shown(picture, view)
+        names |= _legend_of(view, shown)
+        if view.name == LEGEND:
+            continue
+        assert any(_has_data(entity, columns) for entity, columns in shown.items()), view
+        assert 1000 * view.height >= 60, view
+        if view.kind == "TimeSeries":
+            assert re.search(r"\([^)]+\)", view.name), view
+            assert "NEES" not in view.name or "NEES of this run" in view.name
+    for view in picture.views:
+        for entity, columns in _shown(picture, view).items():
+            assert _is_named(entity, columns, view, names), (view, entity, names)
+
+
+def _legend_of(view: View, shown: Mapping[str, Columns]) -> dict[int, str]:
+    """What colours stand for by a view: a legend, or a plot that shows its own."""
+    if view.name == LEGEND:
+        kinds = [("Points2D:colors", "Points2D:labels")]
+    elif view.kind == "TimeSeries" and view.has_legend:
+        kinds = [(f"{each}:colors", f"{each}:names") for each in ("SeriesLines", "SeriesPoints")]
+    else:
+        return {}
+    return {
+        colour >> 8: name
+        for columns in shown.values()
+        for colours, labels in kinds
+        if colours in columns
+        for colour, name in zip(columns[colours][0], columns[labels][0], strict=True)
+    }
+
+
+def _shown(picture: Picture, view: View) -> dict[str, Columns]:
+    """What a view shows of all entities, what moves with what stays."""
+    hidden = [root.removeprefix("- ") for root in view.roots if root.startswith("- ")]
+
+    def is_below(entity: str, roots: Sequence[str]) -> bool:
+        return any(f"{entity}/".startswith(f"/{root}/".replace("//", "/")) for root in roots)
+
+    entities = [*picture.still, *(each for each in picture.moving if each not in picture.still)]
+    return {
+        entity: picture.still.get(entity, {}) | picture.moving.get(entity, {})
+        for entity in entities
+        if is_below(entity, view.roots) and not is_below(entity, hidden)
+    }
+
+
+def _has_data(entity: str, columns: Columns) -> bool:
+    """Whether an entity is something to see, and no frame for it."""
+    if entity.rpartition("/")[2] in FRAMES:
+        return False
+    values = [name for name in columns if name.partition(":")[2] in VALUES]
+    return any(each for name in values for each in columns[name])
+
+
+def _is_named(entity: str, columns: Columns, view: View, names: Mapping[int, str]) -> bool:
+    """Whether an entity's colours are in a legend, it is in the title, or labels stand beside it."""
+    rows = [row or [] for name, row in columns.items() if name.endswith(":colors") for row in row]
+    labels = [row for name, rows in columns.items() if name.endswith(":show_labels") for row in rows]
+    words = [part.replace("\\", "") for part in entity.split("/") if part]
+    return (
+        words[-1] in FRAMES
+        or [True] in labels
+        or {colour >> 8 for row in rows for colour in row} <= set(names)
+        or any(word in view.name for word in words)
+    )
+
+
+def _title_of(view: View) -> str:
+    """The title of a view without the numbers in it, which are right."""
+    title = view.name.partition(", grid")[0]
+    found = re.search(r", axis to ±([^,]+)", title)
+    if found:
+        assert view.span is not None
+        assert float(found[1]) == view.span[1] == -view.span[0]
+    below = re.search(r"(\d+) components? \(-\); 95 % are below ([^;]+)", title)
+    if below:
+        assert float(below[2]) == pytest.approx(chi_square_interval(int(below[1]), 1)[1], rel=1e-2)
+    return re.sub(r", axis to ±[^,]+|; 95 % are below [^;]+", "", title)
 
 
 def _check_bounds(picture: Picture, view: View) -> None:

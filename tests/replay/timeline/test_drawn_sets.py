@@ -75,11 +75,11 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
         abs=width / 30,
     )
     titles = {
-        ("Log-likelihood ratio of each probe", "fusion/finger/one/scores"),
+        ("Log-likelihood ratio of each probe (-)", "fusion/finger/one/scores"),
         ("Scores so far", "fusion/finger/one/distribution"),
         ("Wrong decisions so far (%)", "errors/finger"),
-        ("left: score of each probe", "matchers/finger/left"),
-        ("right: score of each probe", "matchers/finger/right"),
+        ("left: score of each probe (-)", "matchers/finger/left"),
+        ("right: score of each probe (-)", "matchers/finger/right"),
     }
     check_views(run.picture, titles)
 
@@ -110,7 +110,7 @@ def test_reports_are_where_they_were_and_vessels_are_counted(tmp_path: Path) -> 
     assert [colours.index(each) for each in colours] == [0, 1, 0, 3, 1]
     views = [(view.name.partition(",")[0], view.roots[0]) for view in run.picture.views]
     assert sorted(views) == [
-        ("Heard within 10 min", "plots/live"),
+        ("Heard within 10 min (number)", "plots/live"),
         ("Map", "map/one"),
         ("OpenStreetMap", "geodetic/one"),
         ("Vessels in tracks of one", "vessels"),
@@ -156,7 +156,7 @@ def test_two_stand_side_by_side_above_how_much_farther_off_the_second_is(tmp_pat
         {plot: curve},
     )
     titles = {view.name: view.roots for view in picture.views}
-    assert titles["robot1 difference of the errors' size"] == [plot[1:]]
+    assert titles["robot1 difference of the errors' size (m)"] == [plot[1:]]
     for name, other in (ESTIMATORS, ESTIMATORS[::-1]):
         [roots] = [roots for title, roots in titles.items() if title.startswith(f"{name}: Map, grid")]
         assert roots[0] == "map/robot1"

@@ -94,14 +94,14 @@ def test_what_is_above_a_panel_is_marked_and_counted(tmp_path: Path) -> None:
     above = found["/plots/nis_1/ekf\\ above"]
     assert above["sim_time"] == STAMPS[40:].tolist()
     assert np.ravel(above["Scalars:scalars"]) == pytest.approx(0.98 * 2.5 * BAND)
-    assert f"NIS of 1 component; above {2.5 * BAND:.3g}: ekf 10 of 50" in views(path)
+    assert f"NIS of 1 component (-); above {2.5 * BAND:.3g}: ekf 10 of 50" in views(path)
     assert range_of(path, "plots/nis_1")[1] == pytest.approx(2.5 * BAND)
 
 
 def test_a_panel_ends_above_what_is_beyond_the_band_throughout(tmp_path: Path) -> None:
     path = a_room(tmp_path / "nis.rrd", inside=5)
     assert "/plots/nis_1/ekf\\ above" not in read(path)
-    assert f"NIS of 1 component; 95 % are below {BAND:.3g}" in views(path)
+    assert f"NIS of 1 component (-); 95 % are below {BAND:.3g}" in views(path)
     assert range_of(path, "plots/nis_1")[1] == 10_000.0
 
 

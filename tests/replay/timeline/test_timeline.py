@@ -200,8 +200,8 @@ def test_vehicles_have_their_particles_and_a_tab_for_their_modes(tmp_path: Path)
             probability = outputs[f"/estimates/imm/{case}/{topic}"]["probability"]
             curve = found[f"/plots/{case}/{topic}/imm/stand"]["Scalars:scalars"]
             assert np.array_equal(np.ravel(curve), probability[:, 2])
-        tabs = {f"Modes of imm, {case}", f"Smoothed modes of imm, {case}"}
-        tabs.add(f"Effective share of the particles, {case}")
+        kinds = ("Modes of imm (probability)", "Smoothed modes of imm (probability)")
+        tabs = {f"{kind}, {case}" for kind in (*kinds, "Effective particles (share)")}
         assert tabs <= views(tmp_path / "run.rrd")
     assert 0 < left_out < 250
 

@@ -80,8 +80,12 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     empty = [len(row) == 0 for row in picture.moving["/map/scans/radar"]["Points2D:positions"]]
     assert np.flatnonzero(empty).tolist() == [15]
     assert picture.still["/map/legend"]["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
-    titles = {("GOSPA (m), c = 20 m", "plots/gospa"), ("Confirmed tracks", "plots/count")}
-    titles |= {("Existence", "plots/existence"), ("Events", "events"), ("jipda", "map/jipda")}
+    titles = {("GOSPA (m), c = 20 m", "plots/gospa"), ("Confirmed tracks (number)", "plots/count")}
+    titles |= {
+        ("Existence (probability)", "plots/existence"),
+        ("Events", "events"),
+        ("jipda", "map/jipda"),
+    }
     check_views(picture, titles, [])
 
 
