@@ -65,6 +65,7 @@ from replay.timeline.families.landmarks import (
     landmarks_of,
     tracks_of,
 )
+from replay.timeline.families.moving_sights import draw_moving_sights
 from replay.timeline.families.navigation import draw_navigation
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
@@ -94,6 +95,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     sensed = [stream for stream in sensed if len(stream)]
     earth = [each for each in sensed if each.schema.full_name == GEODETIC]
     in_space = draw_navigation(canvas, scene, case, sensed)
+    in_space += draw_moving_sights(canvas, scene, case, sensed)
     places: list[Board] = [
         *in_space,
         *_draw_planes(canvas, scene, case, sensed),

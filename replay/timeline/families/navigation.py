@@ -21,6 +21,7 @@ from replay.timeline.drawing.canvas import (
     MUTED,
     PALETTE,
     TRUTH,
+    WIDTH,
     WRONG,
     Canvas,
     Colour,
@@ -33,7 +34,8 @@ from replay.timeline.drawing.canvas import (
     thin,
     thin_curve,
 )
-from replay.timeline.drawing.geodetic import by_deviation
+from replay.timeline.drawing.geodetic import POOR, QUALITIES, by_deviation
+from replay.timeline.drawing.plane import with_legend
 from replay.timeline.drawing.plots import LINE, SIGMAS, draw_curve, plot_view, shown_unit
 
 PLACE = ("x_m", "y_m", "z_m")
@@ -45,12 +47,17 @@ BIASES = (("gyro_bias_", "Gyro bias"), ("accelerometer_bias_", "Accelerometer bi
 FORWARD: tuple[Colour, ...] = ((230, 60, 40), (0, 158, 115), (0, 114, 178))
 # Ellipsoids along a path, which overlap to a tube: at most so many, so far apart for their size.
 TUBE, TUBE_STEP = 300, 0.5
+# No tube is drawn where it would be thinner than this share of the scene, and hide the path.
+TUBE_SHARE = 0.005
+# By how much a vector's axes differ in brightness where several bodies are plotted.
+SHADES = (1.0, 0.75, 0.5)
 
 
 class Body(NamedTuple):
     """States where a body is thought to be, or truly is.
 
     Attributes:
+        width: of its lines, in pixels.
         time_ns: (n,).
         values: (n, components), by `names`.
         deviations: (n, tangent components) by `tangent`, None for the truth.
@@ -59,6 +66,7 @@ class Body(NamedTuple):
 
     label: str
     colour: Colour
+    width: float
     time_ns: Times
     names: list[str]
     values: Floats
@@ -74,7 +82,7 @@ class Body(NamedTuple):
 def draw_navigation(
     canvas: Canvas, scene: Scene, case: str, sensed: Sequence[Stream]
 ) -> list[rrb.Container]:
-    """Draw a scene in space above plots of the state, where an estimate has place and orientation."""
+    """Draw a scene in space and plots of the motion, if an estimate has position and orientation."""
     bodies = list(_bodies(scene, case))
     if all(body.deviations is None for body in bodies):
         return []
@@ -87,14 +95,11 @@ def draw_navigation(
     for body in bodies:
         _draw_body(canvas, f"{root}/{body.label}", body, outages)
     plots = [_draw_group(canvas, case, bodies, *group, outages) for group in _groups(bodies)]
-    return [
-        rrb.Vertical(
-            _space(root, bodies),
-            rrb.Grid(*plots, grid_columns=2),
-            row_shares=[3.0, 2.0],
-            name="navigation",
-        )
-    ]
+    colours = {body.label: body.colour for body in bodies} | _fix_colours(fixes)
+    if len(outages):
+        colours["without fixes"] = WRONG
+    board = with_legend(canvas, root, colours, _space(root, bodies))
+    return [rrb.Vertical(board, name="navigation"), rrb.Grid(*plots, grid_columns=2, name="motion")]
 
 
 def _bodies(scene: Scene, case: str) -> Iterator[Body]:
@@ -106,6 +111,7 @@ def _bodies(scene: Scene, case: str) -> Iterator[Body]:
             yield Body(
                 "truth",
                 TRUTH,
+                2.0 * WIDTH,
                 truth.publish_time_ns[rows],
                 truth.components,
                 truth["state"][rows],
@@ -126,6 +132,7 @@ def _bodies(scene: Scene, case: str) -> Iterator[Body]:
         yield Body(
             estimator,
             scene.colour(estimator),
+            scene.width(estimator),
             stream.publish_time_ns[rows],
             names,
             stream["mean"][rows],
@@ -159,14 +166,22 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
     rows = thin(stream.publish_time_ns)
     place = stream["position_m"][rows].astype(np.float32)
     colours = by_deviation(stream["covariance_m2"][rows], MUTED)
-    canvas.fix(entity, rr.Points3D(place, colors=colours, radii=rr.Radius.ui_points(3.0)))
+    canvas.fix(entity, rr.Points3D(place, colors=colours, radii=rr.Radius.ui_points(2.0)))
+
+
+def _fix_colours(fixes: Sequence[tuple[str, Stream]]) -> dict[str, Colour]:
+    """Name the colours of fixes, by the standard deviation that they state."""
+    drawn = [by_deviation(stream["covariance_m2"], MUTED) for _, stream in fixes]
+    found = {tuple(colour) for colours in drawn for colour in np.unique(colours, axis=0).tolist()}
+    named = {f"fixes to {limit:g} m": colour for limit, colour in QUALITIES}
+    named |= {f"fixes beyond {QUALITIES[-1][0]:g} m": POOR, "fixes": MUTED}
+    return {name: colour for name, colour in named.items() if colour in found}
 
 
 def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
     """Draw the whole path with its tube, red where fixes are silent, and the axes at the cursor."""
-    place = body.columns(PLACE)
-    thin_line = rr.Radius.ui_points(1.5)
-    canvas.fix(f"{entity}/path", rr.LineStrips3D([place], colors=[body.colour], radii=thin_line))
+    place, radii = body.columns(PLACE), rr.Radius.ui_points(body.width)
+    canvas.fix(f"{entity}/path", rr.LineStrips3D([place], colors=[body.colour], radii=radii))
     if body.covariance is not None:
         _draw_tube(canvas, f"{entity}/tube", place, body.covariance, body.colour)
         inside = [
@@ -187,7 +202,10 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
-    """Draw ellipsoids of two standard deviations along the path; as wires, as a viewer may be in one."""
+    """Draw ellipsoids of two standard deviations along the path, where they are larger than its line.
+
+    They are wires, because a viewer may be in one.
+    """
     from scipy.spatial.transform import Rotation  # which takes long to import
 
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
@@ -197,6 +215,7 @@ def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, c
         if np.linalg.norm(here - place[rows[kept[-1]]]) > TUBE_STEP * reach[kept[-1]]:
             kept.append(row)
     rows = rows[kept]
+    rows = rows[reach[kept] > TUBE_SHARE * _extent(place)]
     values, vectors = np.linalg.eigh(covariance[rows])
     vectors[np.linalg.det(vectors) < 0, :, 0] *= -1.0  # a rotation, no reflection
     canvas.fix(
@@ -219,12 +238,12 @@ def _extent(place: Floats) -> float:
 def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
     """Show the scene from south-west and above."""
     place = np.concatenate([body.columns(PLACE) for body in bodies])
-    centre, extent = np.median(place, axis=0), _extent(place)
+    centre, extent = 0.5 * (place.min(axis=0) + place.max(axis=0)), _extent(place)
     return rrb.Spatial3DView(
         origin=escaped(root),
-        name=f"Scene, tubes of {SIGMAS:g} sigma; red without fixes",
+        name=f"Scene, tubes of {SIGMAS:g} sigma",
         eye_controls=rrb.EyeControls3D(
-            position=centre + extent * np.array([-0.4, -0.8, 0.6]), look_target=centre, eye_up=(0, 0, 1)
+            position=centre + extent * np.array([-0.5, -1.0, 0.75]), look_target=centre, eye_up=(0, 0, 1)
         ),
     )
 
@@ -254,7 +273,8 @@ def _draw_group(
     """Plot some components of all bodies, biases with their bands, shades where fixes are silent."""
     plot, largest = entity_path("plots", case, "motion", name), 0.0
     for body in bodies:
-        colours = cycle(PALETTE) if len(bodies) == 1 else cycle([body.colour])
+        shades = [_shaded(body.colour, share) for share in SHADES]
+        colours = cycle(PALETTE if len(bodies) == 1 else shades)
         for component, colour in zip(components, colours, strict=False):
             found = _curve(body, component)
             if found is None:
@@ -267,7 +287,12 @@ def _draw_group(
             largest = max(largest, float(np.quantile(np.abs(values), 0.995)))
     extent = nice(1.2 * max(largest, np.finfo(float).tiny))
     _draw_shades(canvas, f"{plot}/without_fixes", outages, extent)
-    return plot_view(plot, title, unit, (-extent, extent), legend=False)
+    return plot_view(plot, title, unit, (-extent, extent))
+
+
+def _shaded(colour: Colour, share: float) -> Colour:
+    red, green, blue = (round(share * part) for part in colour)
+    return red, green, blue
 
 
 def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:

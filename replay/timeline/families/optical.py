@@ -108,7 +108,7 @@ def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> No
     for sensor in sensors:
         rays = _rays(sensor, sensor.sights, np.zeros(3), length_m)
         times_ns = sensor.sights.publish_time_ns
-        _draw_rays(canvas, f"measured/{sensor.number}", times_ns, times_ns, rays, WRONG)
+        draw_rays(canvas, f"{ROOT}/measured/{sensor.number}", times_ns, times_ns, rays, WRONG)
 
 
 def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floats:
@@ -118,16 +118,16 @@ def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floa
     return np.stack([np.broadcast_to(sensor.place, unit.shape), sensor.place + length_m * unit], axis=1)
 
 
-def _draw_rays(
-    canvas: Canvas, name: str, shown_ns: Times, time_ns: Times, rays: Floats, colour: Colour
+def draw_rays(
+    canvas: Canvas, entity: str, shown_ns: Times, time_ns: Times, rays: Floats, colour: Colour
 ) -> None:
     """Draw rays (n, 2, 3), each at its time, which is one of those when some are shown; both sorted."""
     times = np.unique(shown_ns)
     sizes = np.bincount(np.searchsorted(times, time_ns), minlength=len(times))
     columns = rr.LineStrips3D.columns(strips=rays.astype(np.float32))
-    canvas.send(f"{ROOT}/{name}", times, columns.partition(sizes))
+    canvas.send(entity, times, columns.partition(sizes))
     radii = rr.Radius.ui_points(0.75)
-    canvas.fix(f"{ROOT}/{name}", rr.LineStrips3D.from_fields(colors=[colour], radii=radii))
+    canvas.fix(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=radii))
 
 
 def _draw_estimates(
@@ -143,7 +143,7 @@ def _draw_estimates(
     count = sum(name.startswith("target_") for name in components) // 3
     covariances = stream["covariance"].reshape(len(stream), len(components), -1)
     blocks = np.stack([covariances[:, i : i + 3, i : i + 3] for i in range(0, 3 * count, 3)], axis=1)
-    half_axes, turns = _ellipsoids(blocks.reshape(-1, 3, 3))
+    half_axes, turns = ellipsoids(blocks.reshape(-1, 3, 3))
     scale = max(1.0, nice(ELLIPSOID_SHARE * extent / float(np.median(half_axes.max(axis=1)))))
     columns = rr.Ellipsoids3D.columns(
         centers=stream["mean"][:, : 3 * count].reshape(-1, 3),
@@ -164,12 +164,12 @@ def _draw_estimates(
         batch = np.searchsorted(times_ns, sensor.sights.publish_time_ns)
         known = batch < len(times_ns)
         rays = _rays(sensor, sensor.sights.take(known), bias[batch[known]], BEYOND * extent)
-        name = f"{estimator}/corrected/{sensor.number}"
-        _draw_rays(canvas, name, times_ns, times_ns[batch[known]], rays, colour)
+        name = f"{ROOT}/{estimator}/corrected/{sensor.number}"
+        draw_rays(canvas, name, times_ns, times_ns[batch[known]], rays, colour)
     return scale
 
 
-def _ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
+def ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
     """Return half axes (n, 3) and orientations (n, 4) of what holds Gaussians (n, 3, 3) with 95 %."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -148,7 +148,7 @@ def test_every_panel_is_called_by_what_it_shows(drawn: Picture):
     for first in ("x_m, y_m, z_m", "vx_mps, vy_mps, vz_mps"):
         plot = f"plots/nis_3_{first.partition(',')[0]}"
         titles.add((f"NIS of {first} (-)", plot))
-    titles |= {("Scene, tubes of 2 sigma; red without fixes", "navigation"), ("Events", "events")}
+    titles |= {("Scene, tubes of 2 sigma", "navigation"), ("Events", "events")}
     check_views(drawn, titles, ["ekf"])
     velocities = {"vx_mps": 0.0, "vy_mps": 2.0, "vz_mps": 0.0}
     wanted = {name: Wanted("curve", STAMPS, np.full(60, at)) for name, at in velocities.items()}
