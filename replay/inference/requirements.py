@@ -45,7 +45,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
     """
     for name, model in models.items():
         control = model.control
-        if control is None or control.topic in names or topics_of(model, topics, names):
+        if control is None or control.topic in names:
             continue
         others = [
             each for each, topic in topics.items() if topic.schema_name == control.schema.full_name
@@ -54,7 +54,8 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
         priors = [each for each in topics if each.endswith(end)]
         for prior in priors:
             place = resolved(control.topic, prior.rpartition("/")[0])
-            if others and place not in topics and names_state(topics[prior], model, exactly=True):
+            is_of_model = names_state(topics[prior], model, exactly=True)
+            if others and place not in topics and is_of_model and not topics_of(model, topics, names):
                 return (
                     f"{prior} is of model {name}, which needs {place} ({control.schema.full_name}); the "
                     f"log has {', '.join(others)} of that type: choose one, as with "

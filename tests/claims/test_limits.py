@@ -37,6 +37,7 @@ def test_every_claim_has_a_limit() -> None:
         assert any(name.startswith(known) for name in names), f"{known} has a limit now"
 
 
+@pytest.mark.paper
 def test_between_the_sides_of_a_limit_nothing_is_shown() -> None:
     """An interval on one side of a limit decides as the number does; one about it decides nothing."""
     count = 0

@@ -84,8 +84,8 @@ def test_the_gallery_has_every_experiment() -> None:
 def test_the_reference_has_every_name() -> None:
     pages = reference.reference()
     for kind, (entries, _) in reference.KINDS.items():
-        for name in entries:
-            assert f"\n## {name}\n" in pages[f"reference/{kind}.md"]
+        for entry in entries.values():
+            assert f"\n## {entry.name}\n" in pages[f"reference/{kind}.md"]
     robot = pages["reference/models.md"].partition("## robot\n")[2].partition("\n## ")[0]
     assert "    | `gate_probability` | `0.999` |  | number > 0 <= 1 | a measurement" in robot
     odometry = pages["reference/messages.md"].partition("## Odometry\n")[2]

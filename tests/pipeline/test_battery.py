@@ -81,12 +81,14 @@ def test_the_fault_is_named_first(cell: battery.Cell) -> None:
 NOISIEST = [each for each in consistent.all_ratios() if each.to_compass in (1.0, 10.0)]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("ratios", NOISIEST, ids=str)
 def test_the_noise_of_the_wheels_is_no_cause(ratios: consistent.Ratios) -> None:
     """It is as large as what the compass errs by, or ten times: shifted stamps would average it."""
     assert not consistent.tried(ratios, 1003)["cause"]
 
 
+@pytest.mark.paper
 def test_a_delay_beside_noisy_wheels_is_found() -> None:
     noise = consistent.Ratios(10.0, 10.0).noise
     log = recorded(late(0.3)(drive(SEED, noise=noise)), has_prior=True)

@@ -256,6 +256,7 @@ def driven(
     return memory_source(Recording(streams), RunMetadata("driven", epoch_ns=0))
 
 
+@pytest.mark.paper
 def test_a_lever_arm_is_found_from_a_start_at_which_the_filter_diverges() -> None:
     """It turns on the spot for 20 s, then drives; without the lever arm NIS is above 100."""
     time_s = 0.05 * np.arange(2400)
@@ -270,6 +271,7 @@ def test_a_lever_arm_is_found_from_a_start_at_which_the_filter_diverges() -> Non
     assert (first.kind, first.topic) == ("parameter", "lever_x_m")
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("delay_s", [0.0, 0.15])
 def test_a_delay_is_in_its_interval_beside_noisy_wheels(delay_s: float) -> None:
     """Fixes are at stamps of the wheels: by half a step later they average the noise of two."""

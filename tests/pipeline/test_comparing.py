@@ -81,6 +81,7 @@ def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: 
     assert "nees" in {each.quantity for each in found.worse()}
 
 
+@pytest.mark.paper
 def test_a_worse_candidate_fails_a_build(logs: list[Path], fuselog: Fuselog, tmp_path: Path) -> None:
     """A folder of logs is replayed; of too few runs nothing can be said, which is no success either."""
     settings = tmp_path / "settings.toml"

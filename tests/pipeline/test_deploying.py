@@ -239,6 +239,7 @@ def test_vectors_begin_where_the_filter_starts_and_are_refused_if_they_show_noth
     assert not (tmp_path / "after").exists()
 
 
+@pytest.mark.paper
 @needs_compiler
 def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
     """Four or more of each function; `python -m tests.deployed` plants all."""
@@ -252,6 +253,7 @@ def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
     assert [(each.function, each.line) for each in survivors(folder, chosen)] == []
 
 
+@pytest.mark.paper
 @needs_compiler
 @pytest.mark.parametrize(("label", "single"), [("ekf", True), ("sqrt:ukf", False)])
 def test_a_hostile_caller_gets_outcomes_and_finite_states(

@@ -23,7 +23,6 @@ import fuselog as fl
 from pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, typical_time_s
 from pipeline.exploring.curves import Path as Track
 from pipeline.exploring.newest import NewestFirst
-from pipeline.exploring.plots import blank, show_lens
 from pipeline.exploring.session import Session, open_session
 from pipeline.exploring.sliders import SMALLER, in_words
 from pipeline.exploring.verdict import numbers_of
@@ -180,6 +179,8 @@ def test_nothing_drawn_is_lost(session: Session) -> None:
 
 def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
     pytest.importorskip("bokeh")
+    from pipeline.exploring.plots import blank, show_lens
+
     plot, scene = blank("lens", ""), blank("scene", "")
     shown = plot.source(0, "truth", "x", "y")
     seconds = np.arange(60.0)

@@ -74,6 +74,7 @@ def test_the_page_works_as_written(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.search(r"/robot1/odometry +600 fuselog.Odometry", capsys.readouterr().out)
 
 
+@pytest.mark.paper
 def test_estimates_last_as_long_as_any_of_them_is_referred_to() -> None:
     """Also in one line, where nothing refers to the replay; the folder goes with the last of them."""
     log = fl.record("landmarks", seed=3, duration_s=2.0)
@@ -397,6 +398,7 @@ def test_what_cannot_be_used_is_one_sentence(
     assert list(Path().iterdir()) == []
 
 
+@pytest.mark.paper
 def test_estimates_are_kept_as_long_as_the_replay(
     recordings: list[fl.MemorySource], caplog: pytest.LogCaptureFixture
 ) -> None:

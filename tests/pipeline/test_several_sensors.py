@@ -102,6 +102,7 @@ def test_each_topic_has_its_own_parameters(drive: fl.MemorySource) -> None:
     assert nis_of(drive, "/gps2/fix", found)[0] < 3.0
 
 
+@pytest.mark.paper
 def test_lever_arms_and_offsets_are_found(drive: fl.MemorySource) -> None:
     """By `calibrate`, each with an interval that holds the true value."""
     found = fl.calibrate(drive, "ekf", set=TAKEN).parameters.set_index("parameter")
@@ -125,6 +126,7 @@ def test_offsets_become_part_of_the_state(drive: fl.MemorySource) -> None:
     assert np.all(sigma < 0.005)
 
 
+@pytest.mark.paper
 def test_what_is_wrong_is_named_by_its_topic(drive: fl.MemorySource) -> None:
     """The advice is the topic's own parameter, and can be set as it stands."""
     wrong = {**TAKEN, **LEVERS, **OFFSETS, "/gps2/fix.lever_x_m": 0.0}

@@ -70,6 +70,7 @@ def test_a_guess_whose_import_fails_leaves_nothing(fuselog: Callable[..., Any], 
         assert (out.exists(), out.with_suffix(".toml").exists()) == 2 * (code == 0,)
 
 
+@pytest.mark.paper
 def test_a_guess_whose_import_is_killed_leaves_no_mapping(
     fuselog: Callable[..., Any], start_fuselog: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:

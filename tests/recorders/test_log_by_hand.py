@@ -290,6 +290,7 @@ def test_the_widths_of_a_topic_are_those_of_its_first_message(tmp_path):
             log.write([value(3)])
 
 
+@pytest.mark.paper
 def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
     """Whole, cut off, and with bytes that are changed, so that lengths are of any size."""
     log = open_log(path)
