@@ -12,7 +12,7 @@ from string import Template
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import PositiveInt, model_validator
 
 from pipeline.output.expressions import (
     NoMetric,
@@ -22,9 +22,10 @@ from pipeline.output.expressions import (
     formatted,
     keys_of,
     names_in,
+    needs_runs,
     truth,
 )
-from pipeline.output.numbers import Value, exactly
+from pipeline.output.numbers import Number, Value, exactly
 from pipeline.output.words import MISSING
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
@@ -105,6 +106,8 @@ class StatedClaim(Parameters):
         given: numbers or expressions by the names that the texts and the comparison have for them.
         optional: whether it is left out where the result lacks one of its metrics, in place of not
             reproducible.
+        least_runs: with fewer runs it is not shown, unless each number that decides it has an interval;
+            by default as many as the file of the experiment states, if it makes runs.
         recording: of which of the experiment's recordings it is claimed, by default of the first; `any`
             for all data there are. Of other data it has its numbers, and no verdict.
     """
@@ -120,6 +123,7 @@ class StatedClaim(Parameters):
     each: dict[str, str | list[Any]] = {}
     given: dict[str, float | str] = {}
     optional: bool = False
+    least_runs: PositiveInt | None = None
     recording: str = ""
 
     @model_validator(mode="after")
@@ -129,6 +133,10 @@ class StatedClaim(Parameters):
         except BadInput as error:
             raise ValueError(str(error)) from None
         return self
+
+    def decided_from(self, runs: int) -> "StatedClaim":
+        """Return the claim with this least number of runs, unless it states one."""
+        return self if self.least_runs else self.model_copy(update={"least_runs": runs})
 
     @property
     def recordings(self) -> set[str]:
@@ -273,6 +281,18 @@ def _as_far_as_known(text: str, values: Values) -> str:
         return text
 
 
+def _few_runs(claim: StatedClaim, values: Values) -> str:
+    """Explain that a claim is of too few runs to be decided without an interval; empty if it is not."""
+    runs, least = values.names.get("runs"), claim.least_runs
+    if not isinstance(runs, Number) or least is None or runs.value >= least:
+        return ""
+    stated = {name: of for name, of in claim.given.items() if isinstance(of, str)}
+    stated |= {"value": claim.value} if claim.value else {}
+    if not any(needs_runs(each, stated, values) for each in (claim.holds, claim.reproducible) if each):
+        return ""
+    return f"of {runs.value:g} runs; without an interval it is decided from {least} on"
+
+
 def _verdict(claim: StatedClaim, values: Values) -> Claim:
     names: dict[str, Value] = dict(values.names)
     values = values._replace(names=names)
@@ -288,6 +308,8 @@ def _verdict(claim: StatedClaim, values: Values) -> Claim:
         unless = "; ".join(filter(None, [unless, "estimates are missing"]))
     elif claim.holds and (not claim.reproducible or truth(claim.reproducible, values) is True):
         verdict = "not shown" if holds is None else "confirmed" if holds else "refuted"
+    if verdict != "not reproducible" and (few := _few_runs(claim, values)):
+        return Claim(sentence, paper, ours, "not shown", few)
     if verdict != "confirmed":
         why = "; ".join(filter(None, [why, unless]))
     return Claim(sentence, paper, ours, verdict, why)

@@ -13,6 +13,7 @@ import ast
 import math
 import re
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from fnmatch import fnmatchcase
 from functools import cache
 from string import Formatter
@@ -148,6 +149,62 @@ def names_in(expression: str) -> set[str]:
     }
     named = [node for node in nodes if isinstance(node, ast.Name)]
     return {node.id for node in named if id(node) not in called | of_metrics}
+
+
+def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:
+    """Tell whether only many runs decide a comparison: chance may carry it across its limit.
+
+    That is so if it reads a metric without an interval, takes one end of an interval, or asks what lies
+    in it, which is the wider the fewer runs there are.
+
+    Args:
+        expression: the comparison.
+        stated: expressions by the names that it has for them.
+        values: what it may name.
+    """
+    tree = _Expanded(stated).visit(deepcopy(parse(expression)))
+    for node in ast.walk(tree):
+        match node:
+            case ast.Call(func=ast.Name(id="value" | "low" | "high"), args=[of]) if _metrics_of(of):
+                return True
+            case ast.Compare(ops=ops, comparators=others):
+                within = [each for op, each in zip(ops, others, strict=True) if isinstance(op, ast.In)]
+                if any(map(_metrics_of, within)):
+                    return True
+    found = [key for each in _metrics_of(tree) for key in keys_of(*each, values.metrics)]
+    return not values.intervals.keys() >= set(found)
+
+
+class _Expanded(ast.NodeTransformer):
+    """Puts expressions in place of the names that stand for them."""
+
+    def __init__(self, stated: Mapping[str, str]) -> None:
+        self.stated = stated
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        if node.id not in self.stated:
+            return node
+        return self.visit(deepcopy(parse(self.stated[node.id])))
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        node.args = [self.visit(each) for each in node.args]
+        return node
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        is_metric = isinstance(node.slice, ast.Constant) and isinstance(node.slice.value, str)
+        if not is_metric:
+            self.generic_visit(node)
+        return node
+
+
+def _metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
+    """Return the metrics that an expression names: quantity, and what stands in brackets."""
+    found = []
+    for node in ast.walk(tree):
+        match node:
+            case ast.Subscript(value=ast.Name(id=quantity), slice=ast.Constant(value=str() as of)):
+                found.append((quantity, of))
+    return found
 
 
 def _value(node: ast.expr, values: Values) -> Value:

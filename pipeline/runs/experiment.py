@@ -207,14 +207,21 @@ class Stated(NamedTuple):
         own = {"estimators": allowed_in(stated, self.folder)} if isinstance(stated, Mapping) else {}
         return {**self.values, **own}
 
+    @property
+    def _as_written(self) -> Experiment:
+        return build(Experiment, self._values, f"experiment {self.source}")
+
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
         """Return the experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
-        own = _settings_of_experiment(build(Experiment, self._values, where), settings)
+        own = _settings_of_experiment(self._as_written, settings)
         experiment = build(Experiment, {**merge(self._values, own), **over}, where)
         if experiment.claims_of:
-            shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
+            shared = read_experiment(experiment.claims_of)._as_written.claims
             experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
+        if not (experiment.import_ or experiment.logs):
+            claims = [each.decided_from(self._as_written.runs) for each in experiment.claims]
+            experiment = experiment.model_copy(update={"claims": claims})
         if experiment.logs is None:
             return experiment
         files = _found(experiment.logs.files, self.folder, where)

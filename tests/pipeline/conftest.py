@@ -23,6 +23,7 @@ from pipeline.output.report.kinds import run_sentences
 from pipeline.output.results import Outcome, Result, write_outcome
 from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
+from tests.claims.few_runs import opposite
 from tests.conftest import without_drawing
 from tests.goldens import keeping
 
@@ -100,6 +101,7 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
         keeping.hold_outcome(name, settings, outcome, in_full=in_full)
+        assert opposite(name, settings, outcome.claims) == []
         result = write_outcome(folder, name, settings, outcome)
         viewed(name, folder)
         return result

@@ -6,10 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import StatedClaim, decide, judged, known, require_names, require_recordings
+from pipeline.output.claims import (
+    Claim,
+    StatedClaim,
+    decide,
+    judged,
+    known,
+    require_names,
+    require_recordings,
+)
 from pipeline.output.expressions import Values, evaluate, formatted, truth
 from pipeline.output.numbers import Number, exactly
-from pipeline.runs.experiment import Experiment, load_experiment
+from pipeline.runs.experiment import Experiment, Stated, load_experiment
 from pipeline.runs.inputs import Recording, holding, shipped
 from recorders.errors import BadInput
 from recorders.parameters import build
@@ -153,6 +161,42 @@ def test_a_claim_is_made_of_each_and_its_limit_stands_once() -> None:
     assert bare.verdict == "not reproducible"
     unmet = claim(value="rmse_m[ekf]", holds="value < 1", reproducible="value > 1")
     assert decide([unmet], METRICS, {}, {})[0].verdict == "not reproducible"
+
+
+@pytest.mark.parametrize(
+    ("stated", "verdict"),
+    [
+        ({"value": "gain[ekf, ukf]", "holds": "value > 0"}, "confirmed"),  # an interval decides
+        ({"given": {"lead": "gain[ekf, ukf]"}, "holds": "lead > 1"}, "refuted"),
+        ({"value": "rmse_m[ekf]", "holds": "value < 1"}, "not shown"),
+        ({"given": {"half": "rmse_m[ekf] / 2"}, "value": "half", "holds": "value < 1"}, "not shown"),
+        ({"holds": "gain[ekf, ukf] > 0 and rmse_m[ekf] < 1"}, "not shown"),
+        ({"holds": "value(gain[ekf, ukf]) > 0"}, "not shown"),
+        (
+            {"value": "nees[ekf, robot1]", "holds": "2 in value"},
+            "not shown",
+        ),  # the fewer runs, the wider
+        ({"holds": "2 in consistent(2, runs) and nees[ekf, robot2] < 4"}, "not shown"),
+        ({"holds": "rmse_m[ekf] < 1", "least_runs": 3}, "confirmed"),
+        ({"holds": "rmse_m[lost] < 1"}, "not reproducible"),
+    ],
+)
+def test_few_runs_decide_by_intervals_or_by_a_stated_number_of_runs(
+    stated: dict[str, object], verdict: str
+) -> None:
+    claims = [{"sentence": "s", "paper": "p", "ours": "-", **stated}]
+    written = Stated("mine", "mine.toml", {"title": "t", "runs": 20, "claims": claims}, Path())
+
+    def decided(runs: int) -> Claim:
+        experiment = written.with_settings({}, {"runs": runs})
+        [found] = decide(experiment.claims, METRICS, INTERVALS, {"runs": experiment.runs})
+        return found
+
+    assert decided(3).verdict == verdict
+    assert ("of 3 runs; without an interval it is decided from 20 on" in decided(3).why) == (
+        verdict == "not shown"
+    )
+    assert (decided(20).verdict == verdict) == (verdict != "not shown")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from pipeline.runs.experiment import load_experiment, run_experiment
+from tests.claims.few_runs import as_of_all
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
@@ -27,7 +28,8 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
 
 def verdict(result: dict[str, Any], start: str) -> str:
     """The verdict on the one claim that begins so."""
-    [found] = [claim["verdict"] for claim in result["claims"] if claim["claim"].startswith(start)]
+    of_all = as_of_all("vehicles-ctm2", result)
+    [found] = [claim.verdict for claim in of_all if claim.claim.startswith(start)]
     return found
 
 

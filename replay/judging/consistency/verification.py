@@ -16,7 +16,7 @@ from recorders.log.streams import concatenate
 from replay.judging.metrics.measuring import Metric, Output
 
 Floats = NDArray[np.float64]
-FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)
+FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)  # also called false match rates (FMR), as FNMR is 1 - GAR
 
 
 class Roc(NamedTuple):
@@ -196,14 +196,20 @@ def _rates(fused: Fused) -> dict[str, float]:
         matrix[fused.probe, fused.gallery] = fused.score
         values["identified_users"] = identified(matrix)
         values["identified_percent"] = 100 * values["identified_users"] / users
-        curve = roc(fused.score, fused.genuine)
-        for rate, accepted in zip(
-            FALSE_ACCEPT_RATES, genuine_accept_at(curve, FALSE_ACCEPT_RATES), strict=True
-        ):
-            values[f"gar_at_far_{100 * rate:g}_percent".replace(".", "p")] = 100 * float(accepted)
-        values["eer_percent"] = 100 * equal_error_rate(curve)
-        if fused.is_ratio:
-            values["cllr_bits"] = cost_of_ratio(fused.score, fused.genuine)
+    if fused.genuine.all() or not fused.genuine.any():
+        return values
+    curve = roc(fused.score, fused.genuine)
+    accepted = 100 * genuine_accept_at(curve, FALSE_ACCEPT_RATES)
+    named = [f"{100 * rate:g}_percent".replace(".", "p") for rate in FALSE_ACCEPT_RATES]
+    if fused.is_complete:
+        values |= {f"gar_at_far_{name}": float(of) for name, of in zip(named, accepted, strict=True)}
+    values["eer_percent"] = 100 * equal_error_rate(curve)
+    impostors = np.count_nonzero(~fused.genuine)
+    for rate, name, of in zip(FALSE_ACCEPT_RATES, named, accepted, strict=True):
+        if impostors * rate >= 1.0:  # fewer do not tell such a rate
+            values[f"fnmr_at_fmr_{name}"] = 100 - float(of)
+    if fused.is_complete and fused.is_ratio:
+        values["cllr_bits"] = cost_of_ratio(fused.score, fused.genuine)
     return values
 
 

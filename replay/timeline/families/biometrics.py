@@ -110,15 +110,19 @@ def _errors_so_far(fused: Fused) -> Floats:
 
 
 def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
-    """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars."""
+    """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars.
+
+    Bars of both stand side by side in a bin, so that neither hides or tints the other.
+    """
     low = np.quantile(fused.score[~fused.genuine], 0.001)
     high = np.median(fused.score[fused.genuine])
     edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
     place = np.clip(np.searchsorted(edges, fused.score) - 1, 0, BINS - 1)
     moments = np.unique(np.linspace(0, len(time_ns) - 1, UPDATES).astype(int))
-    for label, colour, chosen in (
-        ("impostor", IMPOSTOR, ~fused.genuine),
-        ("genuine", GENUINE, fused.genuine),
+    width = 0.5 * (edges[1] - edges[0])
+    for label, colour, chosen, left in (
+        ("impostor", IMPOSTOR, ~fused.genuine, edges[:-1]),
+        ("genuine", GENUINE, fused.genuine, edges[:-1] + width),
     ):
         counts = [
             np.bincount(place[: moment + 1][chosen[: moment + 1]], minlength=BINS) for moment in moments
@@ -126,16 +130,21 @@ def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times
         shares = np.array([count / max(count.sum(), 1) for count in counts])
         for moment, share in zip(moments, shares, strict=True):
             chart = rr.BarChart.columns(
-                values=[share], abscissa=[0.5 * (edges[1:] + edges[:-1])], color=[(*colour, 150)]
+                values=[share],
+                abscissa=[left + 0.5 * width],
+                widths=[np.full(BINS, width, np.float32)],
+                color=[(*colour, 255)],
             )
             canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
     return rrb.BarChartView(
-        origin=escaped(entity), name="Scores so far", plot_legend=rrb.PlotLegend(visible=False)
+        origin=escaped(entity),
+        name="Share of the scores so far",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True),
     )
 
 
 def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
-    """Draw the scores that the case's matchers gave each probe."""
+    """Draw the scores that the case's matchers gave each probe, without failures to enrol."""
     if TOPIC not in scene.source.topics:
         return []
     stream = scene.read(TOPIC)
@@ -144,11 +153,13 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
     for index in subsets_of(matchers).get(case, range(len(matchers))):
         plot = entity_path("matchers", case, matchers[index].name)
         probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
-        score = np.nan_to_num(stream["scores"][:, index])
-        _draw_probes(
-            canvas, plot, Fused(score, probe, gallery, None, None, False), stream.publish_time_ns
-        )
-        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe", "-"))
+        score = stream["scores"][:, index]
+        known = ~np.isnan(score) & (score != matchers[index].failure)
+        fused = Fused(score[known], probe[known], gallery[known], None, None, False)
+        _draw_probes(canvas, plot, fused, stream.publish_time_ns[known])
+        left_out = len(np.unique(probe[~known]))
+        without = f", without {left_out} that it could not enrol" if left_out else ""
+        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe{without}", "-"))
     return views
 
 

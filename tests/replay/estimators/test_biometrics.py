@@ -25,6 +25,7 @@ from replay.estimators.biometrics.pairs import (
 )
 from replay.judging.consistency.verification import (
     Fused,
+    _rates,
     bootstrap_users,
     cost_of_ratio,
     equal_error_rate,
@@ -268,6 +269,22 @@ def test_roc_of_tied_scores_by_hand():
     assert genuine_accept_at(curve, curve.false_accept[3]) == 1.0, "a rate that is met is not above"
     assert equal_error_rate(curve) == pytest.approx(1 / 3)
     assert cost_of_ratio(np.zeros(6), genuine) == pytest.approx(1.0)
+
+
+def test_fusions_of_some_pairs_and_of_all_share_their_error_rates():
+    """Of 100 impostors 1 is above 3 of 4 genuine pairs: 1 % of false matches costs one of these."""
+    users = np.arange(101)
+    probe = np.concatenate([users[:4], users[1:]])
+    gallery = np.concatenate([users[:4], np.zeros(100, int)])
+    score = np.concatenate([[9.0, 8.0, 7.0, 2.0], [8.5], np.linspace(3.0, 0.0, 99)])
+    found = _rates(Fused(score, probe, gallery, None, 0.0, False))
+    assert found["fnmr_at_fmr_1_percent"] == 25.0
+    assert "fnmr_at_fmr_0p1_percent" not in found  # 100 do not tell one in 1000
+    assert found["eer_percent"] == pytest.approx(25.0)
+    pairs = np.indices((20, 20)).reshape(2, -1)
+    complete = _rates(Fused(1.0 * (pairs[0] == pairs[1]), *pairs, None, None, False))
+    assert complete["eer_percent"] == complete["fnmr_at_fmr_1_percent"] == 0.0
+    assert complete["gar_at_far_1_percent"] == 100.0
 
 
 def test_bootstrap_covers_the_rate_of_independent_users():

@@ -55,7 +55,10 @@ def sets(rings: list[Any]) -> MadeRun:
 
 def scores(given: Any, arrivals: Any) -> MadeRun:
     """Scores (users, users, 2) of two fingers, one probe of each user; their sums are what is fused."""
-    matchers = (Matcher(name="left", modality="finger"), Matcher(name="right", modality="finger"))
+    matchers = (
+        Matcher(name="left", modality="finger", failure=-1.0),
+        Matcher(name="right", modality="finger"),
+    )
     users = np.arange(len(given))
     fused = make_stream(
         "/estimates/one/finger/score",

@@ -67,6 +67,8 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
             for name in ("values", "abscissa")
         )
         assert shares.sum() == pytest.approx(1.0)
+        widths = np.array(run.picture.moving[bar]["BarChart:widths"][-1][0])
+        assert widths == pytest.approx(np.diff(at)[0] / 2)  # those of both fill a bin
         means.append(shares @ at)
     low, high = sums[others > 0], np.diag(sums)
     width = np.median(high) - low.min()
@@ -76,12 +78,23 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
     )
     titles = {
         ("Log-likelihood ratio of each probe (-)", "fusion/finger/one/scores"),
-        ("Scores so far", "fusion/finger/one/distribution"),
+        ("Share of the scores so far", "fusion/finger/one/distribution"),
         ("Wrong decisions so far (%)", "errors/finger"),
         ("left: score of each probe (-)", "matchers/finger/left"),
         ("right: score of each probe (-)", "matchers/finger/right"),
     }
     check_views(run.picture, titles)
+
+
+def test_a_failure_to_enrol_is_no_score(tmp_path: Path) -> None:
+    given = np.random.default_rng(1).uniform(0.0, 1.0, (4, 4, 2)) + np.eye(4)[:, :, None]
+    given[1, :, 0] = -1.0
+    run = drawn(tmp_path, *scores(given, SECOND * np.arange(1, 5)))
+    drawn_scores = np.ravel(run.picture.moving["/matchers/finger/left/genuine"]["Scalars:scalars"])
+    assert drawn_scores == pytest.approx(np.diag(given[:, :, 0])[[0, 2, 3]])
+    names = {view.name for view in run.picture.views}
+    assert "left: score of each probe, without 1 that it could not enrol" in names
+    assert "right: score of each probe" in names
 
 
 def test_neighbours_in_number_are_far_apart_in_hue() -> None:

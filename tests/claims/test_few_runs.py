@@ -1,0 +1,40 @@
+"""Claims of few runs: decided by intervals or not at all, and never the other way than those of all."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.output.claims import decide
+from pipeline.runs.experiment import Study, load_experiment, numbers_of, run_experiment
+from recorders.parameters import build
+from recorders.registry import load
+from tests.claims.few_runs import opposite
+from tests.claims.pages import stored
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize(
+    ("name", "runs"), [("bingham-2d", 3), ("bingham-4d", 5), ("ispace-stress", 3), ("los-moving", 3)]
+)
+def test_few_runs_never_say_the_opposite(name: str, runs: int, tmp_path: Path) -> None:
+    """As all shipped experiments that tests of studies run with fewer runs, see their `conftest`."""
+    _, experiment = load_experiment(name, {}, {"runs": runs})
+    result = run_experiment(name, experiment, tmp_path / "few", logs=0)
+    assert result.claims
+    assert opposite(name, result.settings, result.claims) == []
+
+
+def test_no_claim_of_few_runs_is_decided_without_an_interval() -> None:
+    """Of every shipped experiment that makes runs, by its kept metrics without their intervals."""
+    tried = 0
+    for name, kept in stored().items():
+        _, experiment = load_experiment(name, {}, {})
+        if experiment.import_ or experiment.runs <= 3:
+            continue
+        study = load("studies", experiment.study, Study)
+        numbers = numbers_of(experiment, build(study.options, experiment.options, name)) | {"runs": 3.0}
+        claims = [claim for claim in experiment.claims if claim.least_runs == experiment.runs]
+        found = decide(claims, kept.metrics, {}, numbers)
+        assert {each.verdict for each in found} <= {"not shown", "not reproducible"}, name
+        tried += len(found)
+    assert tried > 200
