@@ -49,7 +49,7 @@ class OpticalParameters(Parameters):
     bias_deg: Triples | None = None
     sigma_rad: PositiveFloat = 0.34e-3
     interval_s: PositiveFloat = 1.0
-    passes: PositiveInt = 1
+    passes: PositiveInt = 10
     all_at_once: bool = False
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
     dropout_probability: Annotated[float, Field(ge=0, lt=1)] = 0.0

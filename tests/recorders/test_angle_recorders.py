@@ -47,11 +47,13 @@ def test_nominal_attitude_goes_through_its_quaternion() -> None:
 
 def test_field_of_view_and_a_target_on_a_sensor() -> None:
     """Sensor 2 of scenario 1 spans 68 deg: a narrow view loses targets; none is seen from inside."""
-    assert len(stream(record("optical-los"), "/sensor2/line_of_sight")) == 3
-    narrow = stream(record("optical-los", field_of_view_deg=60.0), "/sensor2/line_of_sight")
+    assert len(stream(record("optical-los", passes=1), "/sensor2/line_of_sight")) == 3
+    narrow = stream(record("optical-los", passes=1, field_of_view_deg=60.0), "/sensor2/line_of_sight")
     assert 0 < len(narrow) < 3
     on_sensor = [(-5500, 950, 15), (0, 8000, 0)]
-    sights = stream(record("optical-los", target_position_m=on_sensor), "/sensor1/line_of_sight")
+    sights = stream(
+        record("optical-los", passes=1, target_position_m=on_sensor), "/sensor1/line_of_sight"
+    )
     assert sights["target_id"].tolist() == [2]
 
 

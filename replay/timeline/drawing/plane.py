@@ -77,8 +77,10 @@ def turn_up(canvas: Canvas, root: str = ROOT) -> None:
     canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
 
 
-def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
-    """Draw fixed points with their numbers; close ones share a label, below the lowest of them.
+def draw_points(
+    canvas: Canvas, entity: str, numbers: NDArray[np.int64 | np.str_], places: Floats
+) -> None:
+    """Draw fixed points with their numbers or names; close ones share a label, below the lowest.
 
     A point that single precision, which viewers draw in, puts at infinity is nowhere to be drawn.
 
@@ -229,6 +231,13 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     segments = np.stack([places[:-1], places[1:]], axis=1).astype(np.float32)
     canvas.send(entity, time_ns[1:], rr.LineStrips2D.columns(strips=segments))
     canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
+
+
+def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
+    """Draw the whole true way of a point (n, 2), faintly: it is there before the path gets to it."""
+    known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
+    style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)]}
+    canvas.fix(entity, rr.LineStrips2D([known], **style))
 
 
 def draw_poses(
@@ -399,8 +408,9 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
     if not colours:
         return board
     number = np.arange(len(colours))
-    columns = min(max(len(colours), 4), LEGEND_COLUMNS)
-    row_height, rows = LEGEND_ASPECT * columns, -(-len(colours) // columns)
+    rows = -(-len(colours) // LEGEND_COLUMNS)
+    columns = max(-(-len(colours) // rows), 4)
+    row_height = LEGEND_ASPECT * columns
     at = np.stack([number % columns + 0.5, row_height * (number // columns)], axis=1)
     radii = rr.Radius.ui_points(5.0)
     dots = rr.Points2D(at, labels=[*colours], colors=[*colours.values()], radii=radii, show_labels=True)

@@ -36,6 +36,7 @@ from replay.timeline.drawing.canvas import (
 )
 
 SIGMAS = 2.0
+_AXES = ("w", "x", "y", "z", "vx", "vy", "vz", "yaw", "pitch", "roll")
 _TITLES = {"NEES": "NEES of this run,", "NIS": "NIS of"}
 # So many plots are seen one below another at most, and so many of them in one tab.
 MOST_STRIPS, TAB_STRIPS = 8, 4
@@ -123,25 +124,26 @@ def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
         groups.setdefault(_vector_of(component), []).append(view)
     tabs: list[tuple[list[str], list[rrb.View]]] = []
     for name, own in groups.items():
-        if tabs and len(tabs[-1][1]) + len(own) <= TAB_STRIPS:
+        is_number = len(own) == 1 and bool(tabs) and len(tabs[-1][0]) == len(tabs[-1][1]) < TAB_STRIPS
+        if is_number:
             tabs[-1] = ([*tabs[-1][0], name], [*tabs[-1][1], *own])
         else:
             tabs.append(([name], own))
     return {
-        (", ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]}"): own
-        for names, own in tabs
+        ", ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]}": own for names, own in tabs
     }
 
 
 def _vector_of(component: str) -> str:
     """Name the quantity that a component is an axis of: position, target 1 velocity, gyro bias."""
     quantity, unit, _ = shown_unit(component)
-    *words, axis = quantity.split()
-    if axis in ("vx", "vy", "vz"):
-        return " ".join([*words, "velocity"])
-    if axis in ("w", "x", "y", "z"):
-        return " ".join([*words, "position"]) if unit == "m" else " ".join(words) or quantity
-    return quantity
+    words = quantity.split()
+    kept = [word for word in words if word not in _AXES]
+    if {"vx", "vy", "vz"} & {*words}:
+        return " ".join([*kept, "velocity"])
+    if len(kept) < len(words) and unit == "m":
+        return " ".join([*kept, "position"])
+    return " ".join(kept) or quantity
 
 
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:

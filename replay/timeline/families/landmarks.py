@@ -33,6 +33,7 @@ from replay.timeline.drawing.plane import (
     draw_path,
     draw_points,
     draw_poses,
+    draw_way,
     extent_of,
     plane_view,
     stroke_of,
@@ -125,6 +126,8 @@ def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
 def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
     """Draw path, arrows and ellipses of a robot in a scene so wide; return the entity of the path."""
     entity = f"{root}/{track.name}"
+    if track.name == "truth":
+        draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
     if np.isfinite(track.poses).all():
         length_m = ARROW_SHARE * extent_m

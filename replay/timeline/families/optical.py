@@ -30,6 +30,7 @@ from replay.timeline.drawing.canvas import (
     nice,
 )
 from replay.timeline.drawing.events import above_events, draw_events
+from replay.timeline.drawing.plane import with_legend
 from replay.timeline.drawing.plots import draw_quality
 
 ROOT = "space"
@@ -38,6 +39,8 @@ SENSOR: Colour = (240, 228, 66)
 ELLIPSOID_SHARE = 0.03
 # Rays go on behind the targets by this share.
 BEYOND = 1.05
+# From where the scene is seen, in sizes of it from its middle.
+EYE = np.array([0.2, 0.5, 1.1])
 
 
 class Sensor(NamedTuple):
@@ -56,17 +59,22 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     targets = _targets(scene)
     places = np.concatenate([np.array([each.place for each in sensors]).reshape(-1, 3), targets])
     extent = float(np.ptp(places, axis=0).max()) if len(places) else 1.0
+    middle = 0.5 * (places.min(axis=0) + places.max(axis=0)) if len(places) else np.zeros(3)
+    eye = rrb.EyeControls3D(position=middle + extent * EYE, look_target=middle, eye_up=(0.0, 1.0, 0.0))
     _draw_points(canvas, "sensors", places[: len(sensors)], SENSOR)
     _draw_points(canvas, "targets", targets, TRUTH)
     _draw_measured(canvas, sensors, BEYOND * extent)
-    shown = [
-        _draw_estimates(canvas, scene.colour(name), name, stream, sensors, extent)
+    shown = {
+        name: _draw_estimates(canvas, scene.colour(name), name, stream, sensors, extent)
         for name, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE)
-    ]
-    name = f"Scene; 95 % ellipsoids {' '.join(f'x{each:g}' for each in dict.fromkeys(shown))}"
-    space = rrb.Spatial3DView(origin=ROOT, name=name if shown else "Scene")
-    board = above_events(space, draw_events(canvas, scene, ""))
-    return beside(board, draw_quality(canvas, scene, ""), "")
+    }
+    larger = ", ".join(f"of {name} {scale:g} times as large" for name, scale in shown.items())
+    space = rrb.Spatial3DView(
+        origin=ROOT, name=f"Scene; 95 % ellipsoids {larger}" if shown else "Scene", eye_controls=eye
+    )
+    colours = scene.colours("") | {"sensors": SENSOR, "measured": WRONG}
+    board = above_events(with_legend(canvas, ROOT, colours, space), draw_events(canvas, scene, ""))
+    return beside(board, draw_quality(canvas, scene, "", legend=False), "")
 
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:

@@ -1,10 +1,11 @@
 """Draws vehicles: a map, the same close up, and errors and GOSPA over time.
 
 Errors are a metre where paths are hundreds, so everything is drawn once more close up: about each
-vehicle's true place, side by side. Detections of the infrastructure sensor are shown raw, in its own
-frame, and registered, where an estimator finds the pose.
+vehicle's true place, side by side. Detections of the infrastructure sensor are in its own frame; the
+map has them by the sensor's true pose, and registered where an estimator finds that pose.
 """
 
+from collections.abc import Iterator, Sequence
 from functools import reduce
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from replay.timeline.drawing.canvas import (
     MUTED,
     TRUTH,
     WRONG,
+    Board,
     Canvas,
     Colour,
     Scene,
@@ -42,17 +44,20 @@ from replay.timeline.drawing.plane import (
     draw_ellipses,
     draw_lines,
     draw_path,
+    draw_points,
     draw_scans,
+    draw_way,
     plane_view,
     stroke_of,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import (
-    LINE,
     draw_curve,
     draw_effective,
     draw_modes,
     draw_nees,
+    line,
     plot_view,
 )
 
@@ -94,12 +99,13 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}
     tracks = {name: places for name, places in tracks.items() if places.shape[1] == vehicles.number}
-    _draw_map(canvas, scene, vehicles, tracks)
-    _draw_close(canvas, scene, vehicles, tracks)
+    unnamed = list(_unnamed(scene))
+    _draw_map(canvas, scene, vehicles, tracks, unnamed)
+    _draw_close(canvas, scene, vehicles, tracks, unnamed)
     raw = _points(scene, "/infrastructure/detection")
     draw_scans(canvas, f"{SENSOR}/raw", *raw, SEEN, 3.0)
     paths = [f"{ROOT}/map/{name}/{n}" for name in ("truth", *tracks) for n in range(vehicles.number)]
-    places = vehicles.places.reshape(-1, 2)
+    places = np.concatenate([vehicles.places.reshape(-1, 2), *(pose[:, :2] for pose in _poses(scene))])
     cells = CELL_M * np.array([[-0.5, -0.5], [vehicles.number - 0.5, 0.5]])
     run_s = (canvas.end_ns - canvas.epoch_ns) * 1e-9
     whole = plane_view(canvas, f"{ROOT}/map", [], paths, places, trail_s=run_s)
@@ -107,18 +113,25 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     close = plane_view(canvas, CLOSE, [], [], cells)
     sensor.name = "Raw detections, sensor's frame"
     close.name = f"Close-up about the true places, {CELL_M:g} m each"
-    board = rrb.Vertical(
+    board: Board = rrb.Vertical(
         rrb.Tabs(whole, sensor, *_geodetic_views(canvas, scene), *draw_events(canvas, scene, "")),
         close,
         row_shares=[3, 1] if scene.outputs else [3, 2],
     )
+    colours = {"truth": TRUTH} | {name: scene.colour(name) for name in scene.estimators}
+    sensed = {"fixes": (FIX, "/network/detection"), "detections": (SEEN, "/infrastructure/detection")}
+    colours |= {name: colour for name, (colour, topic) in sensed.items() if topic in scene.source.topics}
+    if len(_links(scene)[0]):
+        colours["association"] = LINK[:3]
+    board = with_legend(canvas, "vehicles", colours, board)
     if not scene.outputs:
         return board
-    quality = rrb.Tabs(
+    quality = [
         *(view for case in scene.cases for view in _nees(canvas, scene, case)),
         *(view for case in scene.cases for view in _own(canvas, scene, case)),
-    )
-    plots = rrb.Vertical(*_draw_errors(canvas, scene, vehicles, tracks), quality)
+    ]
+    errors = _draw_errors(canvas, scene, vehicles, tracks)
+    plots = rrb.Vertical(*errors, *([rrb.Tabs(*quality)] if quality else []))
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 
 
@@ -126,7 +139,7 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """Plot NEES of a case, named by it."""
     views = draw_nees(canvas, scene, case)
     for view in views:
-        view.name = f"NEES of {case}"
+        view.name = f"{case}: {view.name}"
     return views
 
 
@@ -184,6 +197,35 @@ def _registered(scene: Scene) -> list[tuple[str, Points]]:
     return found
 
 
+def _poses(scene: Scene) -> list[Floats]:
+    """Return the sensor's true poses (n, 3): x, y in m, heading in rad; an empty list without them."""
+    return [
+        truth["state"]
+        for truth in scene.truths_of("infrastructure")
+        if tuple(truth.components) == (*PLANE, "heading_rad")
+    ]
+
+
+def _placed(scene: Scene, points: Points) -> Points:
+    """Return points in the sensor's frame on the map, by its true pose: none where that is unknown."""
+    poses = _poses(scene)
+    if not poses:
+        return Points(points.time_ns[:0], points.places[:0])
+    truth_ns = scene.truths_of("infrastructure")[0].publish_time_ns
+    row = np.searchsorted(truth_ns, points.time_ns).clip(0, len(truth_ns) - 1)
+    return Points(points.time_ns, np.stack(out_of_frame(poses[0][row].T, points.places.T), axis=1))
+
+
+def _unnamed(scene: Scene) -> Iterator[tuple[str, Points]]:
+    """Yield estimated sets of positions, of which none says whose it is, on the map."""
+    for case in ("network", "infrastructure"):
+        sizes = dict(scene.outputs_of(case, schemas.ESTIMATE_SIZE))
+        for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
+            if name in sizes and set(PLANE) <= set(stream.components):
+                points = Points(stream.publish_time_ns, read_vectors(stream, "mean", PLANE))
+                yield name, points if case == "network" else _placed(scene, points)
+
+
 def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
     """Return lines (n, 2, 2) from predicted places to associated fixes, and their vehicles.
 
@@ -206,10 +248,23 @@ def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
     return times[order], lines[order], numbers[order]
 
 
-def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]) -> None:
-    """Draw paths of truth and estimators, fixes without identity, and registered detections."""
+def _draw_map(
+    canvas: Canvas,
+    scene: Scene,
+    vehicles: Vehicles,
+    tracks: dict[str, Floats],
+    unnamed: Sequence[tuple[str, Points]],
+) -> None:
+    """Draw paths of truth and estimators, fixes without identity, the sensor and its detections."""
     root = f"{ROOT}/map"
+    for pose in _poses(scene):
+        draw_points(canvas, f"{root}/sensor", np.array(["sensor"]), pose[:1, :2])
+    placed = _placed(scene, _points(scene, "/infrastructure/detection"))
+    draw_scans(canvas, f"{root}/detections", *placed, SEEN, 3.0)
+    for name, points in unnamed:
+        draw_scans(canvas, f"{root}/{name}/elements", *points, scene.colour(name), 5.0)
     for n in range(vehicles.number):
+        draw_way(canvas, f"{root}/truth/{n}/whole", vehicles.places[:, n])
         stroke = TRUE
         draw_path(canvas, f"{root}/truth/{n}", vehicles.time_ns, vehicles.places[:, n], stroke)
         for name, places in tracks.items():
@@ -224,7 +279,13 @@ def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str
     draw_lines(canvas, f"{root}/links", times, lines, np.tile(LINK, (len(lines), 1)).astype(np.uint8))
 
 
-def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]) -> None:
+def _draw_close(
+    canvas: Canvas,
+    scene: Scene,
+    vehicles: Vehicles,
+    tracks: dict[str, Floats],
+    unnamed: Sequence[tuple[str, Points]],
+) -> None:
     """Draw everything about each vehicle's true place, the vehicles side by side."""
     corners = CELL_M * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
     centres = np.stack([CELL_M * np.arange(vehicles.number), np.zeros(vehicles.number)], axis=1)
@@ -254,6 +315,8 @@ def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[s
     draw_scans(canvas, f"{CLOSE}/fixes", *fixes, FIX, 4.0)
     for name, points in _registered(scene):
         draw_scans(canvas, f"{CLOSE}/{name}/detections", *near(points), SEEN, 3.0)
+    for name, points in unnamed:
+        draw_scans(canvas, f"{CLOSE}/{name}/elements", *near(points), scene.colour(name), 5.0)
     for name in tracks:
         for n in range(vehicles.number):
             stream = scene.outputs[f"/estimates/{name}/vehicle{n + 1}/state"]
@@ -318,18 +381,20 @@ def _draw_errors(
         there, truths = places[known], vehicles.places[known]
         errors = np.sqrt(fixed_squared_error(there, truths))
         gospa = np.sqrt(assigned_squared_error(there, truths, CUTOFF_M))
-        curve = (scene.colour(name), vehicles.time_ns[known])
-        draw_curve(canvas, "plots/error", name, *curve, errors, LINE)
-        draw_curve(canvas, "plots/gospa", name, *curve, gospa, LINE)
+        curve, style = (scene.colour(name), vehicles.time_ns[known]), line(scene.width(name))
+        draw_curve(canvas, "plots/error", name, *curve, errors, style)
+        draw_curve(canvas, "plots/gospa", name, *curve, gospa, style)
     outputs = {topic: gather([stream]) for topic, stream in scene.outputs.items()}
     for found in set_errors(outputs, [Truths(scene.source)]).values():
         if found.case == "network":
             colour = scene.colour(found.estimator)
-            draw_curve(canvas, "plots/gospa", found.estimator, colour, found.time_ns, found.gospa, LINE)
-    return [
-        plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0)),
-        plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0), legend=False),
-    ]
+            curve, style = (colour, found.time_ns), line(scene.width(found.estimator))
+            draw_curve(canvas, "plots/gospa", found.estimator, *curve, found.gospa, style)
+    views = {
+        "error": plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0)),
+        "gospa": plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0)),
+    }
+    return [view for name, view in views.items() if tracks or name == "gospa"]
 
 
 TIMELINE = Timeline(draw)

@@ -37,7 +37,7 @@ BIAS = [(1.0, 1.0, 1.0)] * 3
 
 def test_streams_give_what_the_arrays_give() -> None:
     """The estimate from messages equals the one from the measurements as an array, bit for bit."""
-    run = source("optical-los", bias_deg=BIAS)
+    run = source("optical-los", bias_deg=BIAS, passes=1)
     state = solve([run], "los-biases")["state"].stream
     sights = [run.streams[f"/sensor{s}/line_of_sight"] for s in (1, 2, 3)]
     measured = np.array([np.stack([s["azimuth_rad"], s["elevation_rad"]], axis=-1) for s in sights])
@@ -63,7 +63,7 @@ def test_every_pass_is_a_batch_of_its_own_and_ensembles_equal_single_runs() -> N
 
 
 def test_a_bias_that_is_known_is_not_estimated() -> None:
-    run = source("optical-los", bias_deg=BIAS)
+    run = source("optical-los", bias_deg=BIAS, passes=1)
     state = solve([run], "los-biases", known_bias_deg={"sensor_2_roll": 1.0})["state"].stream
     assert "sensor_2_roll_bias_rad" not in state.components
     assert len(state.components) == 17

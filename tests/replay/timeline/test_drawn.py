@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from recorders.log import make_stream, schemas
 from recorders.models.optical import direction
+from replay.engine.streams.blocks import gather
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.families.landmarks import GATED, SEEN
 from replay.timeline.families.vehicles import SHOWN_M
+from replay.timeline.show import show
 from tests.replay.timeline.making import (
     ESTIMATORS,
     PLANE,
@@ -28,7 +30,7 @@ from tests.replay.timeline.making import (
     record,
     unit,
 )
-from tests.replay.timeline.reading import Titles, Wanted, check_views, compare, consistent
+from tests.replay.timeline.reading import Titles, Wanted, check_views, compare, consistent, picture_of
 
 
 def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> None:
@@ -324,7 +326,7 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
     for case in cases:
         plots, own = run.quality(case)
         wanted |= {entity: each for entity, each in plots.items() if "nees" in entity}
-        titles |= {(f"NEES of {case}", root) for name, root in own if "NEES" in name}
+        titles |= {(f"{case}: {name}", root) for name, root in own if "NEES" in name}
     truths = [run.truth(case) for case in cases[:2]]
     places = np.stack([columns(truth, "state", *PLANE) for truth in truths], axis=1)
     time_ns = truths[0].publish_time_ns
@@ -356,6 +358,10 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
         registered = np.stack([x + turned.real, y + turned.imag], axis=1)
         near[f"{name}/detections"] = raw.publish_time_ns, registered
         wanted[f"/map/map/{name}/detections"] = Wanted("dots", raw.publish_time_ns, registered)
+    x, y, heading = run.truth("infrastructure")["state"][0]
+    turned = (raw["position_m"] @ (1.0, 1j)) * np.exp(1j * heading)
+    placed = np.stack([x + turned.real, y + turned.imag], axis=1)
+    wanted["/map/map/detections"] = Wanted("dots", raw.publish_time_ns, placed)
     for entity, (stamps, found) in near.items():
         apart = found[:, None] - places[np.searchsorted(time_ns, stamps)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2) < 3.8)
@@ -371,3 +377,38 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
     wanted["/map/close/links"] = Wanted("lines", scans[shown], lines)
     compare(run.picture.moving, wanted)
     check_views(run.picture, titles)
+
+
+def test_sets_without_names_are_where_the_vehicles_are_whatever_their_frame(tmp_path: Path) -> None:
+    """One is estimated in the frame of the sensor by the road, which is turned by two radians."""
+    source = record("vehicles", duration_s=3.0, vehicles=2)
+    truths = [source.streams[f"/vehicle{number}/truth"] for number in (1, 2)]
+    outputs = {}
+    for case in ("network", "infrastructure"):
+        seen = source.streams[f"/{case}/detection"]
+        stamps, counts = np.unique(seen.publish_time_ns, return_counts=True)
+        told = {"components": "x_m,y_m", "kinds": "linear,linear"}
+        for leaf, schema, times, columns_of in (
+            ("size", schemas.ESTIMATE_SIZE, stamps, {"elements": counts}),
+            (
+                "element",
+                schemas.DENSITY_ESTIMATE,
+                seen.publish_time_ns,
+                {
+                    "weight": np.ones(len(seen)),
+                    "mean": seen["position_m"],
+                    "covariance": np.tile(np.eye(2).ravel(), (len(seen), 1)),
+                },
+            ),
+        ):
+            topic = f"/estimates/{case}/{case}/{leaf}"
+            stream = make_stream(topic, schema, times, metadata=told, **columns_of)
+            outputs[stream.topic] = gather([stream])
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    moving = picture_of(tmp_path / "run.rrd").moving
+    for name in ("network", "infrastructure"):
+        points = moving[f"/map/map/{name}/elements"]
+        for stamp, places in zip(points["utc"], points["Points2D:positions"], strict=True):
+            states = [truth["state"][np.searchsorted(truth.publish_time_ns, stamp)] for truth in truths]
+            apart = np.array(places)[:, None] - np.array(states)[:, [0, 2]]
+            assert np.linalg.norm(apart, axis=2).min(axis=1).max() < 6.0
