@@ -149,7 +149,7 @@ def _column_distance(
     )
     if before["kept"].shape != after["kept"].shape:
         return about
-    size = np.sqrt(before["sum_of_squares"] / np.maximum(rows - before["missing"], 1))
+    size = _size(before, rows)
     if name == "covariance":
         deviation = np.sqrt(size[:: math.isqrt(len(size)) + 1])
         size = np.outer(deviation, deviation).ravel()
@@ -159,7 +159,9 @@ def _column_distance(
         size = np.where(bounded, np.maximum(size, 1.0), size)
         for key in ("kept", "sum"):
             apart[key] = np.where(angle, wrap_angle(apart[key]), apart[key])
-    sizes = {"kept": size, "sum": rows * size, "sum_of_squares": 2 * rows * size**2, "missing": 1.0}
+    with np.errstate(over="ignore"):
+        squares = 2 * rows * size**2
+    sizes = {"kept": size, "sum": rows * size, "sum_of_squares": squares, "missing": 1.0}
     relative = {key: _relative(apart[key], sizes[key]) for key in sizes}
     largest = float(np.max([np.max(each, initial=0.0) for each in relative.values()]))
     too_far = np.argwhere(~(relative["kept"] <= about.allowed))
@@ -193,9 +195,18 @@ def _floats(values: Any) -> Floats:
     return np.asarray(values, float)
 
 
+def _size(before: Mapping[str, Floats], rows: int) -> Floats:
+    """Compute the root mean square of a column, or its largest number if the squares are infinite."""
+    size = np.sqrt(before["sum_of_squares"] / np.maximum(rows - before["missing"], 1))
+    finite = np.where(np.isfinite(before["kept"]), np.abs(before["kept"]), 0.0)
+    return np.where(np.isinf(size), np.max(finite, axis=0, initial=0.0), size)
+
+
 def _difference(before: Floats, after: Floats) -> Floats:
-    """Subtract; what is missing in both is equal."""
-    return np.where(np.isnan(before) & np.isnan(after), 0.0, after - before)
+    """Subtract; what is infinite or missing in both is equal."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference: Floats = after - before
+    return np.where((before == after) | (np.isnan(before) & np.isnan(after)), 0.0, difference)
 
 
 def _relative(difference: Floats, size: ArrayLike) -> Floats:

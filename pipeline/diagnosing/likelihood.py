@@ -126,7 +126,7 @@ class Likelihood:
                 self.broad |= _foreseen(self.broad, reading, found[_topic(name)])
         self.count = {
             name: max(len(part.get(_topic(name), ())) for part in parts) + scored.beyond.get(name, 0)
-            for name in (each.name for each in bound)
+            for name in dict.fromkeys([*(each.name for each in bound), *map(_name, found)])
         }
         self.volumes = {topic: _extents(stream) for topic, stream in found.items()}
         return found
@@ -282,6 +282,11 @@ def _is_free(bound: Bound) -> bool:
 
 def _topic(name: str) -> str:
     return f"/estimates/{name}/innovation"
+
+
+def _name(topic: str) -> str:
+    """Return whose innovations a topic has; of a program these may be of several that it estimates."""
+    return topic.removeprefix("/estimates/").removesuffix("/innovation")
 
 
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:

@@ -7,11 +7,11 @@ as JSON, beside the SVG picture that is drawn of it here; the report draws it fo
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import PositiveInt, model_validator
+from pydantic import BeforeValidator, PositiveInt, field_validator, model_validator
 
 from recorders.parameters import Parameters
 
@@ -30,10 +30,17 @@ COLOURS = (
 )
 REFERENCE_COLOUR = "#808080"
 OUTSIDE_COLOUR = "#d6336c"
+LARGEST = 1e100  # that is drawn
 
 
-Numbers = list[float | None]
-Places = list[float | None] | list[str]
+def _on_an_axis(value: Any) -> Any:
+    """Leave out what no axis shows: infinite, NaN, or as large as only a filter that diverged says."""
+    return value if not isinstance(value, float) or abs(value) < LARGEST else None
+
+
+Number = Annotated[float | None, BeforeValidator(_on_an_axis)]
+Numbers = list[Number]
+Places = list[Number] | list[str]
 # Triangles are landmarks, an area is closed, what is outside is red.
 Style = Literal["line", "dashed", "markers", "dots", "line+markers", "triangles", "area", "outside"]
 
@@ -52,6 +59,11 @@ class Axis(Parameters):
     log: bool = False
     limits: tuple[float, float] | None = None
     ticks: dict[float, str] = {}
+
+    @field_validator("limits", mode="before")
+    @classmethod
+    def _are_drawn(cls, limits: Sequence[float] | None) -> Sequence[float] | None:
+        return limits and tuple(max(-LARGEST, min(LARGEST, end)) for end in limits)
 
 
 class Drawn(Parameters):

@@ -54,12 +54,6 @@ def tune_logs(
     if not as_json:
         say(f"tuned on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
-
-        def tell(best: Best) -> None:
-            named = zip(best.names, best.point, strict=True)
-            values = ", ".join(f"{name} {value:.4g}" for name, value in named)
-            show(f"{best.evaluations} evaluations; best so far: {values}")
-
         find = search or partial(tune, free=free, by=by, grid=grid)
         found = find(
             [LogSource(open_log(path, recover=recover)) for path in logs],
@@ -71,7 +65,7 @@ def tune_logs(
             gap_limit_s=gap_limit_s,
             workers=workers,
             scheduler=scheduler,
-            on_best=tell,
+            on_best=lambda best: show(progress_of(best)),
         )
     saved = found.save(out)
     parameters = found.parameters.replace({np.nan: None}).to_dict("records")
@@ -119,6 +113,16 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
         )
     if len(beside) > 1:
         warn(f"the {len(beside)} logs tuned on are in one folder with those held out; {mend}")
+
+
+def progress_of(best: Best) -> str:
+    """Say how far a search is: its best values, if the estimator could be replayed with any."""
+    named = zip(best.names, best.point, strict=True)
+    values = ", ".join(f"{name} {value:.4g}" for name, value in named)
+    found = (
+        f"best so far: {values}" if values else "no values so far with which all logs can be replayed"
+    )
+    return f"{best.evaluations} evaluations; {found}"
 
 
 def _in_words(logs: Sequence[Path]) -> str:

@@ -88,7 +88,10 @@ def for_likelihood(settings: Mapping[str, Any]) -> str:
             "results.squared, with their components named in `measured`"
         )
     if kind in ("lib", "exec"):
-        return "a filter of your own names the components of its innovations in its description"
+        return (
+            "a filter of your own describes its `innovation` and gives it, and a program that reads a "
+            "log writes fuselog.Innovation"
+        )
     return ""
 
 

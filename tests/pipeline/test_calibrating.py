@@ -28,6 +28,7 @@ from pipeline.calibrating.car import (
 from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from pipeline.diagnosing.battery.car import arcs
+from pipeline.tuning.command import progress_of
 from pipeline.tuning.information import information
 from pipeline.tuning.objective import Best, in_memory
 from recorders.common_streams import fix_stream, prior_stream
@@ -285,3 +286,10 @@ def test_a_delay_is_in_its_interval_beside_noisy_wheels(delay_s: float) -> None:
     assert row["low"] < delay_s < row["high"]
     assert row["high"] - row["low"] < 0.08
     assert any(each.startswith("the noise of the control") for each in found.notes_of_search)
+
+
+def test_a_search_without_a_usable_value_says_so() -> None:
+    none = Best(3, np.empty(0), np.inf)
+    assert progress_of(none) == "3 evaluations; no values so far with which all logs can be replayed"
+    found = Best(4, np.array([0.25]), 1.0, ["lever_x_m"])
+    assert progress_of(found) == "4 evaluations; best so far: lever_x_m 0.25"

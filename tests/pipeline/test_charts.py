@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from pipeline.comparing.comparing import _chart as difference_chart
-from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
+from pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, draw
 from pipeline.output.report.first_run import first_run
 from pipeline.output.report.scene import nis_chart, plan, tracked
 from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
@@ -33,6 +33,15 @@ def held(chart: Chart) -> dict[str, dict[str, Any]]:
         }
         for panel in Chart.model_validate_json(chart.model_dump_json()).panels
     }
+
+
+def test_what_diverged_is_left_out_of_a_chart(tmp_path: Path) -> None:
+    """Also of one whose values or limits are infinite: matplotlib has no axis for these."""
+    values = [1.0, 1e305, np.inf]
+    y = Axis(label="NEES", log=True, limits=(0.1, np.inf))
+    panel = Panel(y=y, series=[curve("a", TIMES, values), Series(label="b", x=values, y=values)])
+    draw(Chart(panels=[panel])).savefig(tmp_path / "figure.png")
+    assert [each.y for each in panel.series] == [[1.0, None, None]] * 2
 
 
 def same(found: Mapping[str, Any], wanted: Mapping[str, Mapping[str, Any]]) -> None:

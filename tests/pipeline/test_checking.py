@@ -264,6 +264,24 @@ def _stream(mean: np.ndarray, covariance: np.ndarray) -> dict[str, Any]:
     }
 
 
+def _golden_of(mean: np.ndarray) -> dict[str, Any]:
+    streams = {"/estimates/ekf/state": _stream(mean, np.ones((len(mean), 4)))}
+    run = {"input": "same", "recorded": True, "streams": streams}
+    return {"arithmetic": "here", "tolerances": {}, "metrics": {}, "runs": {"a": run}}
+
+
+def test_infinite_numbers_are_equal_and_hide_no_others() -> None:
+    """As of a filter that diverged: -inf as a likelihood, and squares that are infinite."""
+    with np.errstate(over="ignore"):
+        mean = np.array([[1.0, -np.inf], [3e200, 2.0], [4e200, 1.0]])
+        same = Replayed(_golden_of(mean), {"a": {}})
+        assert not list(discrepancies(_golden_of(mean), same))
+        changed = _golden_of(mean + np.array([[0.0, 0.0], [0.0, 1e-3], [1e195, 0.0]]))
+        [one] = discrepancies(_golden_of(mean), Replayed(changed, {"a": {}}))
+    assert one.apart > 1e-6
+    assert one.row == 1
+
+
 @pytest.mark.parametrize(
     ("column", "entry", "by", "apart", "component"),
     [

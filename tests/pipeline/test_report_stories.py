@@ -83,6 +83,17 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
     )
 
 
+def test_who_diverged_is_not_called_overconfident() -> None:
+    """Errors of 10,000 standard deviations and more are no matter of covariances."""
+    quantities = {"position_rmse_m": list(1.0 + NOISE[0]), "nees": list(3.0 + NOISE[1])}
+    lost = {"position_rmse_m": [1e152] * 20, "nees": [1e305] * 20}
+    told = _told({"a": quantities, "b": lost}, {f"{label}.nees": HONEST for label in "ab"})
+    assert told.verdict[-1].startswith("b diverged: its errors are 1.8 ")
+    assert told.cards[1].chip == "Diverged"
+    assert told.doubts[0] == "the estimates of b, which diverged"
+    assert not any("too small" in each for each in told.doubts)
+
+
 def test_a_card_says_what_a_message_cost() -> None:
     """Beside the one to take; nothing of who was given no message."""
     told = _told(

@@ -37,6 +37,7 @@ from recorders.parameters import (
 from replay.engine.replaying.estimator import Bound, Reading, Recursive
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
+from replay.foreign.programs import ProgramParameters
 
 GATE = 0.999
 REOPENS_S, NEVER_S = 1.0, 1e9
@@ -61,16 +62,19 @@ def of_noises(
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
     """Suppose other values of the numbers that an estimator declares; of one whose reading is not known.
 
-    What is a noise, or cannot be below zero, is scaled.
+    What is a noise, or cannot be below zero, is scaled; and so is a number above zero in the command of
+    a program that reads a log, which says no more of it.
     """
-    if bound[0].parameters is None:
+    parameters = bound[0].parameters
+    if parameters is None:
         return
-    kind, told = type(bound[0].parameters), _described(bound)
+    kind, told = type(parameters), _described(bound)
     for name, role in roles_of(kind).items():
         value = _value_of(bound, source, name)
         if role == "setting" or name == "gate_probability" or np.isnan(value):
             continue
-        if value > 0.0 and (role != "parameter" or bounds_of(kind, name)[0] >= 0.0):
+        is_scaled = role != "parameter" or isinstance(parameters, ProgramParameters)
+        if value > 0.0 and (is_scaled or bounds_of(kind, name)[0] >= 0.0):
             yield _scaled(name, told[name].meaning, value, role)
         elif role == "parameter":
             step = STEPS.get(told[name].unit, STEPS[""])

@@ -52,8 +52,11 @@ def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
     """Say whose covariances are not right, by what."""
     states = {label: each.state for label, each in found.of.items()}
     sentences = []
+    diverged = [label for label in found.labels if found.of[label].has_diverged]
+    if diverged:
+        sentences.append(f"the estimates of {named(diverged, len(found.labels))}, which diverged")
     for size, state in (("small", "too sure"), ("large", "too careful")):
-        whose = [label for label in found.labels if states[label] == state]
+        whose = [label for label in found.labels if states[label] == state and label not in diverged]
         if whose:
             of = named(whose, len(found.labels))
             sentences.append(f"the covariances of {of}, which are too {size}")

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.output.alarming import DIVERGED
 from pipeline.output.alarms import Stressing
 from pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
 from pipeline.output.words import is_error, quantity
@@ -22,6 +23,7 @@ from replay.judging.errors.differences import (
     mean_interval,
     paired_difference,
     rms_interval,
+    root_mean_square,
     target_of,
 )
 
@@ -77,6 +79,11 @@ class Consistency:
         return self.factor > FAR
 
     @property
+    def has_diverged(self) -> bool:
+        """Tell whether errors are so large that they are no matter of covariances."""
+        return self.factor**2 > DIVERGED
+
+    @property
     def state(self) -> State:
         """Return what that says of the estimator: by chance over covariances, and over the runs."""
         low, high = self.honest
@@ -125,6 +132,11 @@ class Evidence:
         if self.also is not None and self.consistency is not None and self.consistency.state == "honest":
             return self.also if self.also.state != "honest" else self.consistency
         return self.consistency
+
+    @property
+    def has_diverged(self) -> bool:
+        """Tell whether errors are no matter of covariances."""
+        return self.decisive is not None and self.decisive.has_diverged
 
 
 class Pair(NamedTuple):
@@ -258,8 +270,7 @@ class Findings:
         if not values or len(values) < len(self.cases):
             return None
         squared = "rmse" in self.main
-        mean = float(np.mean(np.square(values) if squared else values))
-        value = math.sqrt(mean) if squared else mean
+        value = root_mean_square(values) if squared else float(np.mean(values))
         each_run = self.by_run(label, self.main).to_numpy(dtype=float)
         low, high = (rms_interval if squared else mean_interval)(each_run)
         return Spread(value, low, high)

@@ -219,8 +219,9 @@ def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
     """Say in a sentence why an estimator is not to be believed."""
     if each.decisive is None or each.decisive.state != "too sure":
         return f"{each.estimator} fails in every run."
-    how = "overconfident" if each.decisive.is_far else "slightly overconfident"
-    sure = f"{each.estimator} is {how}: {_claim(each, 0)}"
+    how = "is overconfident" if each.decisive.is_far else "is slightly overconfident"
+    how = "diverged" if each.has_diverged else how
+    sure = f"{each.estimator} {how}: {_claim(each, 0)}"
     cause = causes.get(each.estimator)
     return f"{sure}. The likeliest cause: {cause.short}." if cause else f"{sure}."
 
@@ -279,6 +280,8 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
     if state == "failed":
         return "broken", "✕", "Fails in every run"
     if state == "too sure":
+        if each.has_diverged:
+            return "broken", "✕", "Diverged"
         is_far = each.decisive is None or each.decisive.is_far
         return ("broken", "✕", "Overconfident") if is_far else ("careful", "✕", "Slightly overconfident")
     if each.estimator in (take, *equal) and len(found.labels) > 1:

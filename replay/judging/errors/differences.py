@@ -14,7 +14,7 @@ from fnmatch import fnmatch
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 # What a metric should be: small, large, near a value; None where neither is better.
@@ -27,6 +27,7 @@ BATCH_NUMBERS = 1 << 22
 MANY_RUNS = 500
 # Of fewer runs, resamples say nothing of what others would give.
 FEWEST_RUNS = 5
+LARGE = 1e100  # whose square may be infinite, in sums
 # The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
 NATS = 100.0
 TARGETS: dict[str, Target] = {
@@ -168,21 +169,37 @@ def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
     runs = len(values)
     if runs < FEWEST_RUNS:
         return math.nan, math.nan
+    values, scale = _with_finite_squares(values)
     half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
-    return float(values.mean()) - half, float(values.mean()) + half
+    return scale * (float(values.mean()) - half), scale * (float(values.mean()) + half)
 
 
 def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
     """Find where the root mean square of runs (n,) lies with 95 %, by bootstrap; NaN of few runs."""
     from scipy.special import ndtr, stdtrit
 
-    runs, squares = len(values), values**2
+    runs = len(values)
     if runs < FEWEST_RUNS:
         return math.nan, math.nan
+    values, scale = _with_finite_squares(values)
+    squares = values**2
     if runs > MANY_RUNS:
         low, high = mean_interval(squares)
-        return math.sqrt(max(low, 0.0)), math.sqrt(high)
+        return scale * math.sqrt(max(low, 0.0)), scale * math.sqrt(high)
     drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
     tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
     low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
-    return float(low), float(high)
+    return scale * float(low), scale * float(high)
+
+
+def root_mean_square(values: ArrayLike) -> float:
+    """Compute the root mean square of numbers (n,), whose squares may be infinite."""
+    values, scale = _with_finite_squares(np.asarray(values, float))
+    return scale * math.sqrt(np.mean(np.square(values)))
+
+
+def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
+    """Return numbers (n,) as multiples of a number, which is one unless an estimator diverged."""
+    largest = float(np.max(np.abs(values), initial=0.0))
+    scale = largest if LARGE < largest < math.inf else 1.0
+    return values / scale, scale
