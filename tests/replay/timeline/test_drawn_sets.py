@@ -94,7 +94,7 @@ def test_a_failure_to_enrol_is_no_score(tmp_path: Path) -> None:
     assert drawn_scores == pytest.approx(np.diag(given[:, :, 0])[[0, 2, 3]])
     names = {view.name for view in run.picture.views}
     assert "left: score of each probe, without 1 that it could not enrol (-)" in names
-    assert "right: score of each probe" in names
+    assert "right: score of each probe (-)" in names
 
 
 def test_neighbours_in_number_are_far_apart_in_hue() -> None:
