@@ -44,7 +44,7 @@ from pipeline.tuning.search import (
     least_of_grid,
     scanned,
 )
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.parameters import bounds_of, field_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
@@ -61,6 +61,7 @@ ROUNDS = 4  # of searches, each from where filters begin with the values of the 
 ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
 
 
+@without_warnings_of_numbers()
 def tune(
     logs: Log | Iterable[Log],
     estimator: Named,
