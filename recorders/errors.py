@@ -1,7 +1,8 @@
 """Defines the one exception for what a user can mend, and what reaches standard error."""
 
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from itertools import islice
 
 # So many names stand in a sentence; among so many, none of them longer, one nearly the same is sought.
@@ -55,6 +56,14 @@ def ignore_warnings_of_numbers() -> None:
     What overflows, or is not a number, is a finding, a doubt or an empty cell, each in its own words.
     """
     warnings.simplefilter("ignore", RuntimeWarning, append=True)
+
+
+@contextmanager
+def without_warnings_of_numbers() -> Iterator[None]:
+    """Ignore them for a while: for a command, or, as a decorator, for a call from Python."""
+    with warnings.catch_warnings():
+        ignore_warnings_of_numbers()
+        yield
 
 
 def printable(text: str) -> str:

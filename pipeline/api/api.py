@@ -30,7 +30,7 @@ from pipeline.runs.experiment import (
 )
 from pipeline.runs.inputs import load_scenario
 from pipeline.runs.sweeps import Over, Sampling, over_of, points_of, run_sweep, settings_at
-from recorders.errors import BadInput, UnknownName, choices
+from recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
 from recorders.log import Stream, write_log
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
@@ -38,6 +38,7 @@ from replay.engine.streams.sources import MemorySource, memory_source
 from replay.foreign.naming import allowed
 
 
+@without_warnings_of_numbers()
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
     """Record a run of a scenario, in memory: it reads and replays like a log, and can be written.
 
@@ -59,6 +60,7 @@ def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters
     return memory_source(*record_run(recorder, merge(values, parameters), seed, run))
 
 
+@without_warnings_of_numbers()
 def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySource:
     """Import real data, as their publishers lay them out, into memory.
 
@@ -75,6 +77,7 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
     return memory_source(*import_run(importer, Path(path), parameters))
 
 
+@without_warnings_of_numbers()
 def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
     """Write a recording, or streams of your own, as a log; it appears whole or not at all.
 
@@ -125,6 +128,7 @@ class ResultFolder:
         return {path.stem: read_table(path) for path in paths}
 
 
+@without_warnings_of_numbers()
 def run(
     experiment: str | Path | Stated,
     /,
@@ -186,6 +190,7 @@ def run(
     return ResultFolder(folder, result)
 
 
+@without_warnings_of_numbers()
 def sweep(
     experiment: str | Path | Stated,
     over: Mapping[str, Iterable[Any]] | Sequence[Over],

@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.api.planning import Log, sources_of
 from pipeline.output.terminal import print_json, say, warn
 from pipeline.runs.settings import split_texts
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.linting.lint import lint as lint_blocks
 from recorders.log import Stream, open_log
 from recorders.log.impossible import main_span_of
@@ -16,6 +16,7 @@ from recorders.plausibility.finding import Finding
 from replay.engine.streams.sources import LogSource, is_sensed
 
 
+@without_warnings_of_numbers()
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
     """Return what is wrong with a log as it is written, the worst first and hints last.
 

@@ -10,7 +10,7 @@ from pipeline.api.planning import Log, sources_of
 from pipeline.output.terminal import print_json, print_table
 from pipeline.runs.initial_states import span_of
 from pipeline.runs.settings import sigmas_of
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.log import open_log
 from recorders.parameters import parse_settings
 from replay.engine.replaying.estimator import bind
@@ -23,6 +23,7 @@ from replay.inference.observability import OBSERVABILITY, Spectrum, in_words, ob
 NAME = "observability"
 
 
+@without_warnings_of_numbers()
 def observability(
     logs: Log | Iterable[Log],
     model: str | Model | None = None,

@@ -10,7 +10,7 @@ from pipeline.api.replays import replay
 from pipeline.output.terminal import print_json, print_table, say
 from pipeline.runs.executors import inline_pool, processes
 from pipeline.runs.inputs import load_scenario, shipped
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.recording import Importer, Recorder, record_run
 from recorders.registry import available, load
 from replay.engine.compiling.cache import cache_folder, is_private, kept_files
@@ -44,6 +44,7 @@ class Precompiled(NamedTuple):
     why_not: str = ""
 
 
+@without_warnings_of_numbers()
 def precompile(
     models: str | Iterable[str] | None = None,
     methods: str | Iterable[str] | None = None,

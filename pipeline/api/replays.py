@@ -30,7 +30,7 @@ from pipeline.output.summary import error_charts, summarise, summary_table
 from pipeline.runs.ensemble import Pass, Settings, judge_logs
 from pipeline.runs.estimates import add_to_hash
 from recorders.atomic import scratch_folder
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.log import open_log, schemas, topics_of
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, MemorySource, Source
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@without_warnings_of_numbers()
 def replay(
     logs: Log | Iterable[Log],
     estimators: Named | Iterable[Named],

@@ -16,7 +16,7 @@ from pipeline.output.charts import Axis, Chart, Panel, curve, path, thinned
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.output.summary import summary_table
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.log import schemas
 from recorders.log.planes import stated_in
 from recorders.trajectories import Trajectory, read_trajectory
@@ -150,6 +150,7 @@ class Evaluation:
         return digest.hexdigest()
 
 
+@without_warnings_of_numbers()
 def evaluate(
     estimate: str | Path | Trajectory,
     /,

@@ -13,7 +13,7 @@ from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import advice
 from pipeline.tuning.outcome import Tuning
 from pipeline.tuning.tuning import tune
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Recursive, bind
 from replay.foreign.naming import allowed
@@ -21,6 +21,7 @@ from replay.foreign.naming import allowed
 OPTIONS = ("by", "free")  # of `tune`, which a calibration chooses itself
 
 
+@without_warnings_of_numbers()
 def calibrate(
     logs: Log | Iterable[Log],
     estimator: Named,

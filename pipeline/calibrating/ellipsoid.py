@@ -20,7 +20,7 @@ from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.sensing.units import unit_of
 from pipeline.tuning.confidence import QUANTILE
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from replay.engine.streams.sources import LogSource, MemorySource
 
 Floats = NDArray[np.float64]
@@ -174,6 +174,7 @@ class Ellipsoid:
             return ResultFolder(place, write_outcome(part, "ellipsoid", settings, outcome))
 
 
+@without_warnings_of_numbers()
 def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
     """Find offsets, scales and cross terms of a magnetometer or an accelerometer that was turned.
 

@@ -11,7 +11,6 @@ import signal
 import sys
 import threading
 import time
-import warnings
 from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -22,7 +21,7 @@ import click
 
 from pipeline.command_line.group import fuselog
 from recorders import environment
-from recorders.errors import BadInput, ignore_warnings_of_numbers, printable
+from recorders.errors import BadInput, printable, without_warnings_of_numbers
 from recorders.processes import keep_off_settings_here
 from replay.engine.compiling.trial import require_processor
 
@@ -37,10 +36,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ours: it collects less garbage, and ends here.
     """
     if arguments is None:
-        gc.set_threshold(
-            50_000, 20, 100
-        )  # collections while libraries are imported find nothing to free
-        _end(_code_of(arguments))
+        gc.set_threshold(50_000, 20, 100)  # while libraries are imported there is nothing to free
+        try:
+            code = _code_of(arguments)
+        except Exception:
+            sys.excepthook(*sys.exc_info())
+            code = 1
+        _end(code)
     return _code_of(arguments)
 
 
@@ -65,8 +67,7 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     if sys.stderr.isatty():  # somebody waits
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
-        with _stopped_by_signals(), warnings.catch_warnings():
-            ignore_warnings_of_numbers()
+        with _stopped_by_signals(), without_warnings_of_numbers():
             keep_off_settings_here()
             environment.check()
             require_processor()

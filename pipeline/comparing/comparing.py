@@ -35,7 +35,7 @@ from pipeline.runs.estimates import hash_files
 from pipeline.stressing.stressing import stress as stress_logs
 from pipeline.stressing.sums import verdicts_of
 from pipeline.stressing.verdicts import Stress
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.log import open_log
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource
@@ -225,6 +225,7 @@ def _chart(rows: pd.DataFrame) -> Chart:
     return Chart(title=title, panels=panels)
 
 
+@without_warnings_of_numbers()
 def compare(
     *candidates: str | Path,
     estimators: Sequence[str | Mapping[str, Kind]] = (),

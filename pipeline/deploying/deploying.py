@@ -18,7 +18,7 @@ from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certific
 from pipeline.deploying.folder import cmake_text, readme_text
 from pipeline.runs.ensemble import Settings
 from recorders.atomic import whole_folder
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from replay.engine.replaying.estimator import Recursive, bind, configure
 from replay.foreign.filters import description_of_library
 from replay.foreign.naming import shorthand
@@ -39,6 +39,7 @@ KINDS = {
 DEPLOYABLE = "ekf, iekf, ukf, lrkf:SAMPLING, sqrt:ekf or sqrt:ukf"
 
 
+@without_warnings_of_numbers()
 def deploy(
     log: str | Path,
     estimator: Named,

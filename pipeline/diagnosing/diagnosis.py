@@ -54,7 +54,7 @@ from pipeline.runs.estimates import (
 )
 from pipeline.tuning.measured import until_last_measured
 from pipeline.tuning.objective import for_likelihood
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.log import Stream, schemas
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import bind
@@ -199,6 +199,7 @@ def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outc
     return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
 
 
+@without_warnings_of_numbers()
 def diagnose(
     log: Log,
     estimator: Named | None = None,

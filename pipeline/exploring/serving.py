@@ -5,6 +5,7 @@ from another origin; the WebSocket needs the page's own. When the last page is c
 """
 
 import asyncio
+import atexit
 import logging
 import secrets
 from collections.abc import Callable, Iterator
@@ -71,9 +72,11 @@ class Explorer:
         self._thread = Thread(target=self._serve, name="fuselog explore, server", daemon=True)
         self._thread.start()
         self._is_up.wait()
+        atexit.register(self.close)  # Python up to 3.13 would break the thread off, which can abort it
 
     def close(self) -> None:
         """End the server and what it is doing."""
+        atexit.unregister(self.close)
         self._stop()
         self._thread.join(timeout=5.0)
 

@@ -27,13 +27,14 @@ from pipeline.logs.rewriting import (
 )
 from pipeline.output.outputs import changed, check_files
 from pipeline.runs.initial_states import span_of
-from recorders.errors import BadInput, UnknownName, choices
+from recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
 from recorders.log import Log, Stream, open_log, read_empty, schemas, topics_of
 from recorders.log.schemas import SCHEMAS
 from recorders.parameters import build
 from replay.engine.streams.sources import LogSource
 
 
+@without_warnings_of_numbers()
 def cut(
     path: str | Path,
     out: str | Path,
@@ -113,6 +114,7 @@ def cut(
     return write_changed(target, run, [read_empty(log, topic) for topic in chosen], thinned, notes)
 
 
+@without_warnings_of_numbers()
 def merge(
     paths: Sequence[str | Path],
     out: str | Path,
@@ -177,6 +179,7 @@ def merge(
     return write_changed(target, run, empty, blocks, notes)
 
 
+@without_warnings_of_numbers()
 def relabel(
     path: str | Path,
     out: str | Path,
@@ -227,6 +230,7 @@ def relabel(
     )
 
 
+@without_warnings_of_numbers()
 def constrain(
     path: str | Path,
     out: str | Path,

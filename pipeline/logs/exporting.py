@@ -13,7 +13,7 @@ from urllib.parse import quote
 from pipeline.logs.mot import mot_files
 from pipeline.output.outputs import Kind, check_files, check_folder
 from recorders.atomic import whole_file, whole_folder
-from recorders.errors import BadInput, UnknownName, choices, some_of
+from recorders.errors import BadInput, UnknownName, choices, some_of, without_warnings_of_numbers
 from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
 from recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from replay.judging.errors.trajectory_streams import trajectory_of
@@ -42,6 +42,7 @@ class Exported(NamedTuple):
     notes: list[str]
 
 
+@without_warnings_of_numbers()
 def export(
     path: str | Path,
     *,

@@ -136,6 +136,8 @@ def _begin_worker() -> None:
     """Give each worker one core; an interrupt is the parent's to deal with, and its end theirs too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_cores(1)
+    import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
+
     threadpool_limits(1)
     ignore_warnings_of_numbers()
     keep_off_settings_here()

@@ -17,7 +17,7 @@ from pipeline.sensing.fitting import choose, profile_interval, walk_below
 from pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
 from pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
 from pipeline.sensing.units import parse_sheet, unit_of
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.log import Stream
 
 Floats = NDArray[np.float64]
@@ -27,6 +27,7 @@ _CLOCKS = "publish_time_ns", "log_time_ns", "position"
 _BLOCK = 1 << 18  # messages that are read at once
 
 
+@without_warnings_of_numbers()
 def noise(
     log: Log,
     topics: str | Iterable[str] = (),

@@ -21,7 +21,7 @@ from pipeline.stressing.changes import (
 )
 from pipeline.stressing.copies import How, compared, replayed, with_parameters
 from pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
-from recorders.errors import BadInput
+from recorders.errors import BadInput, without_warnings_of_numbers
 from recorders.log import RunMetadata
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
@@ -32,6 +32,7 @@ MOST_HALVED, MOST_REPLAYS = 3, 12
 TOGETHER = max(1, RUNS_AT_ONCE // (1 + len(CHANGES)))
 
 
+@without_warnings_of_numbers()
 def stress(
     logs: Log | Iterable[Log],
     estimators: Named | Iterable[Named],

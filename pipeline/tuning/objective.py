@@ -210,6 +210,7 @@ class Objective:
         best: of all points until now.
         held: by the places of noises among the names, the values (k,) that these keep where the cost is
             corrected; see `correct`.
+        left_out: by topic, how many messages `begin_after` left out.
     """
 
     label: str
@@ -222,6 +223,7 @@ class Objective:
     pool: WorkerPool | None = None
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
     held: Mapping[int, float] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
     _counts: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
@@ -278,9 +280,8 @@ class Objective:
                 raise BadInput(
                     f"{self.label}: cannot be sent to another process ({error}); tune it with one worker"
                 ) from error
-        self.best = Best(self.best.evaluations, np.empty(0), np.inf)
-        self._counts, self.runs = [], [self.begun(start, run) for run in self.runs]
-        for run in self.runs:
+        counts, runs = [], [self.begun(start, run) for run in self.runs]
+        for run in runs:
             outputs = self.outputs(start, run)
             failures = _failures(outputs)
             if failures:
@@ -298,7 +299,33 @@ class Objective:
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
                     f"{', or ' if mend else ''}{mend}"
                 )
-            self._counts.append(count)
+            counts.append(count)
+        self.runs, self._counts = runs, counts
+        self.best = Best(self.best.evaluations, start, np.inf, self.names)
+
+    def begin_after(self, start: Floats, reaches_s: Mapping[str, float]) -> None:
+        """Begin without the messages that delays of up to `reaches_s`, by name, put before the start.
+
+        With such delays they give no innovation, so that likelihoods could not be compared.
+        """
+        self.left_out, runs = {}, []
+        for run in self.runs:
+            [source] = run.ensemble
+            streams = dict(source.streams)
+            for each in self._bound(start, run):
+                if not isinstance(each, Recursive) or each.reading is None:
+                    continue
+                first = each.streams if each.initialization else each.priors
+                begin_ns = min(int(streams[topic].publish_time_ns.min()) for topic in first)
+                for topic, name in each.reading().delays.items():
+                    stream, reach_s = streams[topic], reaches_s.get(name, -np.inf)
+                    is_after = stream.publish_time_ns >= begin_ns + 1e9 * reach_s
+                    if is_after.any() and not is_after.all():
+                        streams[topic] = stream.take(is_after)
+                        self.left_out[topic] = self.left_out.get(topic, 0) + int(np.sum(~is_after))
+            runs.append(run._replace(ensemble=Ensemble([replace(source, streams=streams)])))
+        self.runs = runs
+        self.begin(start)
 
     def correct(self, values: Floats) -> None:
         """Correct the cost for the noise of the controls, see `pipeline.tuning.control_noise`.

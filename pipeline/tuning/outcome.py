@@ -214,6 +214,11 @@ class Tuning:
             )
         if self.objective.by != "likelihood":
             yield f"by {self.objective.by} there are no intervals, and other values may do as well"
+        for topic, count in self.objective.left_out.items():
+            yield (
+                f"{topic}: its first messages, {count} in all, were left out of the search, since a "
+                "delay could put them before the start of the filter"
+            )
         beyond = found.coordinates.at_bounds(found.coordinates.of(found.optimum))
         for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
             if each.is_assumed:

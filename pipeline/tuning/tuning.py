@@ -35,6 +35,7 @@ from pipeline.tuning.objective import (
 from pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from pipeline.tuning.search import (
     CURVATURE_STEP,
+    MOVES,
     Coordinates,
     Free,
     coordinates_of,
@@ -43,7 +44,7 @@ from pipeline.tuning.search import (
     least_of_grid,
     scanned,
 )
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, without_warnings_of_numbers
 from recorders.parameters import bounds_of, field_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
@@ -60,6 +61,7 @@ ROUNDS = 4  # of searches, each from where filters begin with the values of the 
 ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
 
 
+@without_warnings_of_numbers()
 def tune(
     logs: Log | Iterable[Log],
     estimator: Named,
@@ -271,12 +273,44 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
 
 
 def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
-    """Find the values of least cost, corrected if the noise of the controls moves it; and no spike."""
-    found = _settled(objective, free, grid)
-    if _is_moved_by_noise(objective, found):
-        objective.begin(np.array([each.start for each in free]))
+    """Find the values of least cost, corrected if the noise of the controls moves it; and no spike.
+
+    Ctrl-C ends it, wherever it is, with the best values so far.
+    """
+    start = np.array([each.start for each in free])
+    try:
         found = _settled(objective, free, grid)
-    return _confirmed(objective, found)
+        if reaches_s := _blocked(objective, found):
+            objective.begin_after(start, reaches_s)
+            found = _settled(objective, free, grid)
+        if _is_moved_by_noise(objective, found):
+            objective.begin(start)
+            objective(np.array([found.optimum]))  # the best so far, also by the cost from here on
+            found = _settled(objective, free, grid)
+        return _confirmed(objective, found)
+    except KeyboardInterrupt as stopped:
+        if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
+            raise
+        coordinates = Coordinates(free, np.ones(len(free)))
+        best = objective.best
+        return SearchOutcome(coordinates, best.point, best.evaluations, was_stopped=True)
+
+
+def _blocked(objective: Objective, found: SearchOutcome) -> dict[str, float]:
+    """Return how far calibrated parameters may reach that beside the optimum give fewer measurements.
+
+    A delay does so if it puts a message before the start.
+    """
+    free = found.coordinates.free
+    if not CRITERIA[objective.by].is_smooth:
+        return {}
+    steps = np.diag([each.useful for each in free])
+    costs = objective(found.optimum + steps)
+    return {
+        each.name: value + float(MOVES[-1]) * each.useful
+        for each, value, cost in zip(free, found.optimum.tolist(), costs, strict=True)
+        if each.useful and not each.is_kept and not np.isfinite(cost)
+    }
 
 
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
@@ -311,18 +345,18 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
     start = np.array([each.start for each in free])
     free, open_ = _held(objective, free, start)
     found = _search(objective, free, grid)._replace(**open_)
-    if not found.was_stopped:
-        nearer, there = _held(objective, free, found.optimum)
-        if nearer != free:
-            free, open_ = nearer, there
-            found = _search(objective, free, grid)._replace(**open_)
+    nearer, there = _held(objective, free, found.optimum)
+    if nearer != free:
+        free, open_ = nearer, there
+        found = _search(objective, free, grid)._replace(**open_)
     for _ in range(ROUNDS - 1):
-        if found.was_stopped or objective.begins_alike(found.optimum):
+        if objective.begins_alike(found.optimum):
             return found
         objective.begin(found.optimum)
+        objective(np.array([found.optimum]))
         point = found.coordinates.of(found.optimum)
         found = _search(objective, free, 1, point)._replace(**open_)
-    return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
+    return found._replace(begins_alike=objective.begins_alike(found.optimum))
 
 
 def _held(
@@ -360,36 +394,30 @@ def _search(
     """
     start = np.array([each.start for each in free])
     coordinates = coordinates_of(objective, free, start)
-    try:
-        if point is None:
-            point = coordinates.of(start)
-        if grid > 1:
-            point = least_of_grid(objective, coordinates, grid)
-        begin = coordinates.values(scanned(objective, coordinates, point))
-        if not np.array_equal(begin, start):  # where a filter diverges, no unit can be told
-            coordinates = coordinates_of(objective, free, begin)
-            point = coordinates.of(begin)
-        is_smooth = CRITERIA[objective.by].is_smooth
-        point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
-        known, at_edge = _confidence_at(objective, coordinates, point)
-        if known is not None and (places := unknown(known, coordinates)):
-            kept = [each.kept if place in places else each for place, each in enumerate(free)]
-            nearer = replace(coordinates, free=kept)
-            low, high = nearer.bounds
-            ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
-            best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
-            if cost - best < ENOUGH:
-                coordinates, point = nearer, ended
-                known, at_edge = _confidence_at(objective, coordinates, point)
-        optimum, evaluations = coordinates.values(point), objective.best.evaluations
-        return SearchOutcome(
-            coordinates, optimum, evaluations, known, has_converged=has_converged, at_edge=at_edge
-        )
-    except KeyboardInterrupt as stopped:
-        if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
-            raise
-        best_yet = objective.best
-        return SearchOutcome(coordinates, best_yet.point, best_yet.evaluations, was_stopped=True)
+    if point is None:
+        point = coordinates.of(start)
+    if grid > 1:
+        point = least_of_grid(objective, coordinates, grid)
+    begin = coordinates.values(scanned(objective, coordinates, point))
+    if not np.array_equal(begin, start):  # where a filter diverges, no unit can be told
+        coordinates = coordinates_of(objective, free, begin)
+        point = coordinates.of(begin)
+    is_smooth = CRITERIA[objective.by].is_smooth
+    point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
+    known, at_edge = _confidence_at(objective, coordinates, point)
+    if known is not None and (places := unknown(known, coordinates)):
+        kept = [each.kept if place in places else each for place, each in enumerate(free)]
+        nearer = replace(coordinates, free=kept)
+        low, high = nearer.bounds
+        ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
+        best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
+        if cost - best < ENOUGH:
+            coordinates, point = nearer, ended
+            known, at_edge = _confidence_at(objective, coordinates, point)
+    optimum, evaluations = coordinates.values(point), objective.best.evaluations
+    return SearchOutcome(
+        coordinates, optimum, evaluations, known, has_converged=has_converged, at_edge=at_edge
+    )
 
 
 def _confidence_at(
@@ -442,7 +470,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
     If that does not find them again but values that explain the logs less, the optimum is a spike of
     the likelihood of a filter that diverges, and has no interval.
     """
-    if found.confidence is None or found.was_stopped or objective.nis(found.optimum) < DIVERGED:
+    if found.confidence is None or objective.nis(found.optimum) < DIVERGED:
         return found
     coordinates = found.coordinates
     moves = [  # none that the scan makes up for

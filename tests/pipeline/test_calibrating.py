@@ -30,7 +30,7 @@ from pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from pipeline.diagnosing.battery.car import arcs
 from pipeline.tuning.command import progress_of
 from pipeline.tuning.information import information
-from pipeline.tuning.objective import Best, in_memory
+from pipeline.tuning.objective import Best, Objective, in_memory
 from recorders.common_streams import fix_stream, prior_stream
 from recorders.log import RunMetadata
 from recorders.models.inertial import from_mounting
@@ -231,12 +231,13 @@ def driven(
     sigma_m: float,
     lever_m: float = 0.0,
     every: int = 2,
+    first: int = 5,
 ) -> fl.MemorySource:
-    """A robot drives for so many steps; fixes from the sixth on, one in so many, are of its antenna."""
+    """A robot drives for so many steps; fixes at every so many of them are of its antenna."""
     rng, count = np.random.default_rng(seed), len(speed)
     moved = arcs(np.cumsum(turn * step_s) - turn * step_s, speed, turn, np.full(count, step_s))
     pose = np.cumsum(moved, axis=0) - moved
-    x, y, heading = pose[5::every].T
+    x, y, heading = pose[first::every].T
     antenna = np.stack([x + lever_m * np.cos(heading), y + lever_m * np.sin(heading)], axis=1)
     stamps_ns = np.rint(1e9 * step_s * np.arange(count)).astype(np.int64)
     noise = rng.standard_normal((count, 2)) * densities / step_s**0.5
@@ -253,7 +254,7 @@ def driven(
     fixes = antenna + sigma_m * rng.standard_normal(antenna.shape)
     start = np.diag([0.1, 0.1, 0.1])
     prior = prior_stream("/robot1/prior", 0, ("x_m", "y_m", "heading_rad"), np.zeros(3), start)
-    streams = [wheels, fix_stream("/robot1/fix", stamps_ns[5::every], fixes, sigma_m**2), prior]
+    streams = [wheels, fix_stream("/robot1/fix", stamps_ns[first::every], fixes, sigma_m**2), prior]
     return memory_source(Recording(streams), RunMetadata("driven", epoch_ns=0))
 
 
@@ -293,3 +294,41 @@ def test_a_search_without_a_usable_value_says_so() -> None:
     assert progress_of(none) == "3 evaluations; no values so far with which all logs can be replayed"
     found = Best(4, np.array([0.25]), 1.0, ["lever_x_m"])
     assert progress_of(found) == "4 evaluations; best so far: lever_x_m 0.25"
+
+
+def late_fixes(delay_s: float, first: int) -> fl.MemorySource:
+    """A minute of noisy wheels, with the first fix at the wheels' stamp of this number."""
+    time_s = 0.1 * np.arange(600)
+    speed, turn = 1.5 + 0.8 * np.sin(0.4 * time_s), 0.3 * np.sin(0.25 * time_s) + 0.05
+    log = driven(1, speed, turn, 0.1, (0.05, 0.003), 0.01, first=first)
+    late = delayed(log.streams["/robot1/fix"], delay_s)
+    return replace(log, streams={**log.streams, "/robot1/fix": late})
+
+
+def test_a_delay_may_put_fixes_before_the_prior() -> None:
+    """With a little more than the delay the first fix is before the prior, and gives no innovation."""
+    found = fl.tune(late_fixes(0.06, first=0), "ekf", "fix_delay_s")
+    row = found.parameters.iloc[0]
+    assert row["low"] < 0.06 < row["high"]
+    assert row["high"] - row["low"] < 0.08
+    assert any(each.startswith("/robot1/fix: its first messages, 3 in") for each in found.notes)
+
+
+def test_ctrl_c_in_the_second_search_ends_with_the_best_of_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, stops = list[float](), iter([KeyboardInterrupt])
+    correct = Objective.correct
+
+    def noting(objective: Objective, values: Floats) -> None:
+        first.extend(values)
+        correct(objective, values)
+
+    def stop(_: Best) -> None:
+        for error in stops if first else ():
+            raise error
+
+    monkeypatch.setattr(Objective, "correct", noting)
+    found = fl.tune(late_fixes(0.0, first=5), "ekf", "fix_delay_s", on_best=stop)
+    assert found.notes[0].startswith("stopped after ")
+    assert found.parameters["value"].tolist() == first

@@ -47,6 +47,8 @@ def test_growth_is_the_slope_of_the_greater_half() -> None:
     assert power.power == pytest.approx(3.0)
     assert factor.factor == pytest.approx(1.5)
     assert np.isnan(growth_of(pd.DataFrame({"vehicles": [2.0], "step_ms": [1.0]})).power)
+    unmeasured = pd.DataFrame({"vehicles": vehicles, "step_ms": 0.5 * vehicles**3 * [1, 1, 0, 1, 1]})
+    assert growth_of(unmeasured).power == pytest.approx(3.0)
 
 
 def test_means_and_their_intervals() -> None:

@@ -406,6 +406,24 @@ def test_a_thread_at_work_does_not_spoil_the_end(is_daemon: bool) -> None:
     assert ended.stdout.endswith("\ncleared away\n")
 
 
+FAILS = """
+import sys, threading, time
+from pipeline.command_line import main, process
+
+process.fuselog = lambda *_, **__: 1 / 0
+threading.Thread(target=time.sleep, args=[60.0]).start()
+sys.exit(main())
+"""
+
+
+def test_an_unexpected_error_ends_beside_a_thread_at_work_too() -> None:
+    command = [sys.executable, "-c", FAILS]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30.0)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("Traceback ")
+    assert ended.stderr.endswith("\nZeroDivisionError: division by zero\n")
+
+
 # What takes long to import, and is for drawing, for tables or for one family alone.
 HEAVY = (
     *("matplotlib", "rerun", "pandas", "pyarrow", "sklearn", "h5py", "rosbags.typesys", "rich.progress"),

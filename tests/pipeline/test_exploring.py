@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tomllib
 import urllib.error
 import urllib.request
@@ -474,3 +475,21 @@ def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subproce
     assert not [each for each in lines if path.strip("/") in each or "\x9b" in each or "Trace" in each]
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url[0])
+
+
+ENDS = """
+import atexit, sys, threading
+import fuselog as fl
+if __name__ == "__main__":
+    atexit.register(lambda: print(threading.active_count()))  # after all that is registered later
+    fl.explore(sys.argv[1], "ekf", show=False)
+"""
+
+
+def test_a_script_that_ends_with_an_open_page_ends_the_server(log: Path, tmp_path: Path) -> None:
+    """Python up to 3.13 breaks off threads that are still at work, which can abort the process."""
+    pytest.importorskip("bokeh")
+    script = tmp_path / "script.py"
+    script.write_text(ENDS, encoding="utf-8")
+    ended = subprocess.run([sys.executable, script, log], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1\n", "")

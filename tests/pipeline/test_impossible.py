@@ -4,6 +4,7 @@ import math
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -117,6 +118,19 @@ def test_no_warning_of_numpy_reaches_standard_error(tmp_path: Path) -> None:
     assert "Warning" not in ended.stderr
     assert ended.returncode in (0, 2)
     assert len(ended.stderr.splitlines()) == (ended.returncode == 2)
+
+
+def test_no_warning_of_numpy_reaches_who_calls_from_python() -> None:
+    log = fl.record("landmarks", seed=3, duration_s=10.0, fix={"rate_hz": 5.0})
+    wheels = log.streams["/robot1/odometry"]
+    speed = wheels["forward_mps"].copy()
+    speed[20] = 1e200
+    wheels = replace(wheels, columns={**wheels.columns, "forward_mps": speed})
+    log = replace(log, streams={**log.streams, "/robot1/odometry": wheels})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.resetwarnings()  # those of Python as it begins would show a warning
+        fl.tune(log, "ekf", "sigma_range_m")
+    assert [str(each.message) for each in caught] == []
 
 
 class Cells(HTMLParser):

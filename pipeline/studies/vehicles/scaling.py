@@ -126,8 +126,11 @@ def _timed(
 
 
 def growth_of(table: pd.DataFrame) -> Growth:
-    """Fit to the greater half of the numbers of vehicles, where the work hides what is constant."""
-    own = table[table["vehicles"] >= table["vehicles"].median()]
+    """Fit to the greater half of the numbers of vehicles, where the work hides what is constant.
+
+    Steps too short for the clock, which measure 0, are left out.
+    """
+    own = table[(table["vehicles"] >= table["vehicles"].median()) & (table["step_ms"] > 0)]
     if len(own) < 2:
         return Growth(np.nan, np.nan)
     logs = np.log(own["step_ms"])
