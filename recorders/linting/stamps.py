@@ -34,8 +34,8 @@ _CLOCKED = {
     schemas.ODOMETRY.full_name,
 }
 _USES = {
-    schemas.INERTIAL_SAMPLE.full_name: "a model that they drive takes the mean of both; gyro, "
-    "bingham-inertial and deployed filters take them one by one, and one of both may have no effect",
+    schemas.INERTIAL_SAMPLE.full_name: "estimators take the mean of both; deployed filters and those "
+    "of others take them one by one, and one of both may have no effect",
     schemas.ODOMETRY.full_name: "the first of both holds for no time, and has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
