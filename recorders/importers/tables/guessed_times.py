@@ -59,6 +59,8 @@ _COUNTERS = re.compile(
     r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
     r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
 )
+# How many cells are looked at together for one that is not empty.
+_CELLS = 1000
 # Names of columns that count days, as Excel and MATLAB do.
 _DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
 # What the column of a message's own stamp is called, and columns without a name of their own.
@@ -108,7 +110,8 @@ class GuessedTime(NamedTuple):
 class _Table(NamedTuple):
     """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,).
 
-    `has_others` is whether there are other tables, with which it has to share a clock.
+    `has_others` is whether there are other tables, with which it has to share a clock; `stamps` are
+    those that were read, by their mapping.
     """
 
     path: Path
@@ -119,6 +122,7 @@ class _Table(NamedTuple):
     codes: NDArray[np.int64]
     kind: str
     has_others: bool
+    stamps: dict[str, Stamps]
 
 
 def guess_time(
@@ -136,7 +140,7 @@ def guess_time(
     plain = {column.plain for column in columns}
     vehicle = _vehicle(batch, columns, texts)
     table = _Table(
-        path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain), has_others
+        path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain), has_others, {}
     )
     refusals: list[BadInput] = []
     try:
@@ -368,8 +372,12 @@ def _tried(
 
 
 def _stamps(table: _Table, mapping: TimeMapping) -> Stamps:
-    rows = np.arange(len(table.codes))
-    return stamps_ns(mapping, table.batch, rows, str(table.path))
+    """Read the stamps of all rows, once for each mapping."""
+    key = repr(mapping)
+    if key not in table.stamps:
+        rows = np.arange(len(table.codes))
+        table.stamps[key] = stamps_ns(mapping, table.batch, rows, str(table.path))
+    return table.stamps[key]
 
 
 def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.int64]], back: int) -> int:
@@ -423,7 +431,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
     days += [column.name for column in table.columns if re.fullmatch("(.*_)?date", column.plain)]
     hours = [name for name in plain if re.fullmatch("(.*_)?(time|clock|utc|hour)", plain[name])]
     for name in filter(str.isdecimal, table.texts):
-        cell = _first_cell(table.batch[name])
+        cell = first_cell(table.batch[name])
         days += [name] * bool(re.fullmatch(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}", cell))
         hours += [name] * bool(re.match(r"\d{1,2}:\d{2}", cell))
     offsets = [
@@ -439,7 +447,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
             if "zero" in found[0].model_fields_set and days and names[0] not in days:
                 if dated & {*days}:
                     continue
-                cell = _first_cell(table.batch[days[0]])
+                cell = first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
                     f"'{cell}', whose format is not known; write a mapping by hand, with time = "
@@ -452,7 +460,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
 def _offsets(table: _Table) -> dict[str, str]:
     """Return the columns that are called offsets from UTC, with their first cells."""
     found = {
-        name: _first_cell(table.batch[name])
+        name: first_cell(table.batch[name])
         for name in table.batch
         if re.fullmatch(_OFFSETS, parted(name)[0])
     }
@@ -462,7 +470,7 @@ def _offsets(table: _Table) -> dict[str, str]:
 def _check_texts(table: _Table, dated: set[str]) -> None:
     """Raise BadInput for a column of times in no known format."""
     for name in table.texts:
-        cell = _first_cell(table.batch[name])
+        cell = first_cell(table.batch[name])
         is_named = _NAMED.search(parted(name)[0]) and re.search(r"\d.*\d", cell)
         if name not in dated and (is_named or re.search(_LIKE_A_TIME, cell)):
             raise BadInput(
@@ -473,12 +481,17 @@ def _check_texts(table: _Table, dated: set[str]) -> None:
             )
 
 
-def _first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
-    return next((text for text in texts_of(cells, is_part=is_part).to_pylist() if text), "")
+def first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
+    """Return the first cell that is not empty, as text; an empty one without any."""
+    for begin in range(0, len(cells), _CELLS):
+        texts = texts_of(cells[begin : begin + _CELLS], is_part=is_part).to_pylist()
+        if found := next(filter(None, texts), ""):
+            return str(found)
+    return ""
 
 
 def _first_cells(table: _Table, names: Sequence[str]) -> str:
-    return " ".join(_first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
+    return " ".join(first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
 
 
 def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
@@ -500,7 +513,7 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
             name = min(unread)
             raise Undecided(
                 f"{table.path}: column {name} states offsets from UTC such as "
-                f"'{_first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
+                f"'{first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
                 "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
@@ -595,12 +608,12 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     clock = [letters for letters in ("%H", "%M", "%S") if letters in parts]
     if clock == ["%H", "%M", "%S"]:
         found = [parts[letters] for letters in (*day, *clock)]
-        cells = [_first_cell(table.batch[name]) for name in found]
+        cells = [first_cell(table.batch[name]) for name in found]
         formats = [
             letters + ".%f" * ("." in cell) for letters, cell in zip([*day, *clock], cells, strict=True)
         ]
     else:
-        of_day = {name: next(formats_of(_first_cell(table.batch[name]))) for name in table.texts}
+        of_day = {name: next(formats_of(first_cell(table.batch[name]))) for name in table.texts}
         name = next((name for name in of_day if of_day[name].startswith(("%H", "%I"))), "")
         if not name:
             return
@@ -623,7 +636,7 @@ def _parts_of_date(table: _Table) -> dict[str, str]:
         found = {letters: name for letters, name in found.items() if letters not in ("%m", "%d")}
     if all(column.name.isdecimal() for column in table.columns):
         found = _nameless_parts(table)
-    cell = _first_cell(table.batch[found["%Y"]]) if "%Y" in found else ""
+    cell = first_cell(table.batch[found["%Y"]]) if "%Y" in found else ""
     return found if re.fullmatch(r"(19|20)\d\d", cell.partition(".")[0]) else {}
 
 
@@ -656,7 +669,7 @@ def _check_calendars(table: _Table) -> None:
 def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     """Yield times as hhmmss, as NMEA has them, with or without a date as ddmmyy or yyyymmdd."""
     for column in table.columns:
-        cell = _first_cell(table.batch[column.name])
+        cell = first_cell(table.batch[column.name])
         if not (
             re.search("time|utc|clock|hour", column.plain) and re.fullmatch(r"\d{5,6}(\.\d+)?", cell)
         ):
@@ -680,7 +693,7 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
                 [f"{ASSUMED}{column.name} is hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
             )
             continue
-        digits = len(_first_cell(table.batch[day.name]).partition(".")[0])
+        digits = len(first_cell(table.batch[day.name]).partition(".")[0])
         date = "%Y%m%d" if digits == 8 else "%d%m%y"
         mapping = TimeMapping(column=[day.name, column.name], unit="date", format=f"{date} {clock}")
         how = "yyyymmdd" if digits == 8 else "ddmmyy, as NMEA has it,"
