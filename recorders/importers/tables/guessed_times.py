@@ -155,10 +155,7 @@ def guess_time(
     return GuessedTime(
         f'{{ rate_hz = 1, zero = "{UNKNOWN_ZERO}" }}',
         set(),
-        [
-            f"{ASSUMED}one row a second from {UNKNOWN_ZERO} on, as no column could be a time; give "
-            "rate_hz"
-        ],
+        [f"{ASSUMED}one row a second from {UNKNOWN_ZERO} on, as no column could be a time; rate_hz"],
         None,
         vehicle,
     )
@@ -309,7 +306,7 @@ def _passed_over(table: _Table, used: set[str]) -> list[str]:
         return []
     names = " and ".join(sorted(used))
     why = " of the measurement" if any(re.search(_OF_HEADER, parted(each)[0]) for each in used) else ""
-    return [f"{ASSUMED}{names} is the time{why}, and {', '.join(others)} is not; column"]
+    return [f"{ASSUMED}{names}: the time{why}, not {', '.join(others)}; column"]
 
 
 def _tried(
@@ -344,7 +341,7 @@ def _tried(
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
             comments = [
                 *comments,
-                f"{ASSUMED}{columns[0]} begins again at {rollover}, and goes on beyond that; rollover",
+                f"{ASSUMED}{columns[0]}: begins again at {rollover}, and is continued; rollover",
             ]
             stamps = _stamps(table, mapping)
         elif back == 1 and not vehicle:
@@ -352,7 +349,7 @@ def _tried(
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
     if back == -1:
-        comments = [*comments, f"{ASSUMED}rows are newest first, as their times fall; they are reversed"]
+        comments = [*comments, f"{ASSUMED}rows: newest first, as their times fall, so reversed; order"]
     try:
         for part in parts:
             order = Order(label, mapping)
@@ -364,8 +361,7 @@ def _tried(
     if vehicle:
         comments = [
             *comments,
-            f"{ASSUMED}{vehicle} says whose row it is: a namespace of topics for each of its "
-            f"{len(parts)} values; vehicle",
+            f"{ASSUMED}{vehicle}: {len(parts)} vehicles, each with a namespace; vehicle",
         ]
     seen = _seen([stamps[part] for part in parts])
     return GuessedTime(_toml(mapping), {*columns}, [*seen, *comments], stamps, vehicle)
@@ -517,12 +513,13 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
                 "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
-            f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
-            'zone = "Europe/Berlin" or utc_offset_h'
+            f"{ASSUMED}{' and '.join(names)}: in UTC, as no zone is stated; zone or utc_offset_h"
         ]
     if re.match(r"\d{1,2}:\d{2}", cell) is not None:
         given["zero"] = UNKNOWN_ZERO
-        comments.append(f"{ASSUMED}times of the day {UNKNOWN_ZERO}, as no date is stated; zero")
+        comments.append(
+            f"{ASSUMED}{' and '.join(names)}: of the day {UNKNOWN_ZERO}, as no date is stated; zero"
+        )
     fitting: dict[str, Stamps] = {}
     for pattern in formats_of(cell):
         mapping = TimeMapping.model_validate({**given, "format": pattern})
@@ -542,8 +539,8 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     others = [each for each in fitting if not np.array_equal(fitting[each], fitting[pattern])]
     if others:
         comments.append(
-            f"{ASSUMED}{' and '.join(names)} has {_first_part(pattern)} first, {pattern}, so that rows "
-            f"follow one another; with {_first_part(others[0])} first they leap; format"
+            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as rows leap with "
+            f"{_first_part(others[0])} first; format"
         )
     return TimeMapping.model_validate({**given, "format": pattern}), comments
 
@@ -621,7 +618,7 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         formats = [*day, of_day[name]]
     yield (
         TimeMapping(column=found, unit="date", format=" ".join(formats)),
-        [f"{ASSUMED}{', '.join(found)} are in UTC, as no zone is stated; utc_offset_h or zone"],
+        [f"{ASSUMED}{', '.join(found)}: in UTC, as no zone is stated; zone or utc_offset_h"],
     )
 
 
@@ -690,14 +687,14 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             mapping = TimeMapping(column=column.name, unit="date", format=clock, zero=UNKNOWN_ZERO)
             yield (
                 mapping,
-                [f"{ASSUMED}{column.name} is hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
+                [f"{ASSUMED}{column.name}: hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
             )
             continue
         digits = len(first_cell(table.batch[day.name]).partition(".")[0])
         date = "%Y%m%d" if digits == 8 else "%d%m%y"
         mapping = TimeMapping(column=[day.name, column.name], unit="date", format=f"{date} {clock}")
         how = "yyyymmdd" if digits == 8 else "ddmmyy, as NMEA has it,"
-        yield mapping, [f"{ASSUMED}{day.name} is {how} and {column.name} hhmmss in UTC; format"]
+        yield mapping, [f"{ASSUMED}{day.name} and {column.name}: {how} and hhmmss in UTC; format"]
 
 
 # Numbers that count.
@@ -726,7 +723,10 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         is_ms = re.fullmatch("i_?tow|gms", tow.plain) or np.nanmax(tow.values) > 604_800
         unit = tow.unit if tow.unit in _SIZES else "ms" if is_ms else "s"
         mapping = TimeMapping(column=tow.name, week=week.name, unit=unit)  # type: ignore[arg-type]
-        yield mapping, [f"{ASSUMED}GPS time is kept as it is; leap_seconds = 18 makes it UTC"]
+        yield (
+            mapping,
+            [f"{ASSUMED}{week.name} and {tow.name}: GPS time, not UTC; leap_seconds = 18 makes it UTC"],
+        )
     for whole in table.columns:
         stem = re.fullmatch(r"(.*?)_?(secs?|seconds?|s)", _full(whole))
         if not stem or not _are_whole(whole.values):
@@ -751,7 +751,14 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             is_date = _DATES_S[0] < np.nanmedian(whole.values) < _DATES_S[1]
             zero = {} if is_date else {"zero": UNKNOWN_ZERO}
             given = {"column": [whole.name, part.name], "unit": ["s", unit], **zero}
-            comments = [] if is_date else [f"{ASSUMED}times count from {UNKNOWN_ZERO}; zero"]
+            comments = (
+                []
+                if is_date
+                else [
+                    f"{ASSUMED}{whole.name} and {part.name}: from {UNKNOWN_ZERO}, as no date is stated; "
+                    "zero"
+                ]
+            )
             yield TimeMapping.model_validate(given), comments
 
 
@@ -798,13 +805,10 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
         )
     if unit in ("", "s") and _LONGEST_S < largest < _FIT_END and _is_fit(table):
         unit, zero = "s", {"zero": _FIT_ZERO}
-        comments = [f"{ASSUMED}{column.name} counts from {_FIT_ZERO}, as files of FIT have it; zero"]
+        comments = [f"{ASSUMED}{column.name}: from {_FIT_ZERO}, as files of FIT have it; zero"]
     elif not unit and _UNSET_S[0] < float(known.min()) and largest < _UNSET_S[1]:
         unit = "s"
-        comments = [
-            f"{ASSUMED}{column.name} counts in s from 1970, by a clock that was never set, as it begins "
-            "in 1980; zero"
-        ]
+        comments = [f"{ASSUMED}{column.name}: s from 1970, by a clock that was never set (1980); zero"]
     elif not unit:
         zero = {"zero": UNKNOWN_ZERO}
         unit, why = _stated_unit(column), ""
@@ -818,11 +822,11 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             )
         comments = [
             f"# Stamps begin at {known[0]:g}.",
-            f"{ASSUMED}{column.name} counts in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; "
-            "unit, zero",
+            f"{ASSUMED}{column.name}: in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; unit, "
+            "zero",
         ]
     elif "gps" in column.plain and unit == "s":
-        comments = [f"{ASSUMED}{column.name} counts from 1970, not from GPS's 1980-01-06; zero"]
+        comments = [f"{ASSUMED}{column.name}: from 1970, not from GPS's 1980-01-06; zero"]
     given = {"column": column.name, "unit": unit, **zero}
     yield TimeMapping.model_validate(given), comments
 

@@ -183,7 +183,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
         parts = [f"{json.dumps(source)} = {json.dumps(names)}" for source, names in split.items()]
         lines.append(f"split = {{ {', '.join(parts)} }}")
         lines += [
-            f"{ASSUMED}{source} holds {' and '.join(names)} in one cell, in this order; split"
+            f"{ASSUMED}{source}: {' and '.join(names)} in one cell, in this order; split"
             for source, names in split.items()
         ]
     lines += [*time.comments, f"time = {time.text}"]
@@ -260,7 +260,7 @@ def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
         if column.unknown.lower() not in _NO_UNITS:
             unknown.setdefault(column.unknown, []).append(column.name)
     for text, names in unknown.items():
-        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, and is passed over; units"
+        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, so ignored; units"
 
 
 def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
