@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
+from recorders.models.orientation import heading
 from recorders.plausibility.finding import Finding
 from recorders.plausibility.stamps import FEWEST, REGULARS
 
@@ -16,6 +17,8 @@ MOVING = 0.5  # of the rows of a span, in which another column changes
 LOOKED_AT = 20_000  # rows by which a resolution is told
 LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
 SHARE, ROWS, NEAR = 1e-3, 5, 5e-3
+# Of a code among values: times the usual step, part of its step that others differ by, and how often.
+ALONE, ALIKE, OFTEN = 20.0, 0.2, 3
 RANGES = {
     "turn_rate_radps": np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0]),
     "specific_force_mps2": 9.80665 * np.array([2.0, 4.0, 8.0, 16.0, 32.0]),
@@ -56,6 +59,46 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 f"{first_s:.4g} s after its first stamp on, where {usual:.3g} are usual and others move",
                 mapping="leave these messages out: fuselog cut LOG --start ... --end ...",
             )
+
+
+def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find one number that comes again and again, far from the messages before and after it."""
+    entries = [(*each, np.inf) for each in _entries(stream) if each[0] not in RANGES]
+    if stream.schema.full_name == schemas.ORIENTATION.full_name:
+        entries = [("quaternion", "the heading in rad", heading(stream["quaternion"]), np.pi)]
+    elif stream.schema.full_name == schemas.GEODETIC_FIX.full_name:
+        entries = [("altitude_m", "altitude_m", stream["altitude_m"], np.inf)]
+    for field, name, column, half_turn in entries:
+        known = np.flatnonzero(np.isfinite(column))
+        if len(known) < FEWEST:
+            continue
+        values = column[known]
+        steps, two = _apart(np.diff(values), half_turn), _apart(values[2:] - values[:-2], half_turn)
+        usual, smaller = float(np.median(steps)), np.minimum(steps[1:], steps[:-1])
+        alone = (smaller > ALONE * usual) & (two < ALIKE * smaller)
+        found, counts = np.unique(values[1:-1][alone], return_counts=True)
+        if counts.max(initial=0) < max(OFTEN, 0.8 * alone.sum()):
+            continue
+        code = float(found[np.argmax(counts)])
+        others = values[values != code]
+        is_pulse = usual == 0.0 and abs(code) < 2.0 * np.abs(others).max()  # of what mostly rests
+        if is_pulse or counts.max() < 0.5 * (len(values) - len(others)):
+            continue
+        yield Finding(
+            "values",
+            stream.topic,
+            field,
+            code,
+            f"{stream.topic}: {name} is {code:.6g} in {counts.max()} messages, each far from those "
+            "before and after it: a code of a missing value, which is taken for one",
+            mapping="missing = { COLUMN = [...] } in the table of the mapping",
+        )
+
+
+def _apart(steps: Floats, half_turn: float) -> Floats:
+    """Return the sizes of steps, of angles the shorter way round."""
+    sizes = np.abs(steps)
+    return sizes if half_turn == np.inf else np.minimum(sizes, 2 * half_turn - sizes)
 
 
 def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:

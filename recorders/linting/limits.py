@@ -17,6 +17,7 @@ ZERO_DEG = 0.01  # around latitude and longitude 0, where there is only sea
 FASTEST_MPS, FARTHEST_M = 1500.0, 1000.0
 ZIGZAG = 5.0  # by how much a step is longer than two together
 SIDEWAYS_MPS2, SLOWEST_MPS = 10.0, 1.0
+LEGS, BENT_RAD = 10, 0.5
 EARLIEST_NS, LATEST_NS = 31_536_000 * 10**9, 946_684_800 * 10**9  # 1971 and 2000
 FAR_H, NEAR_S = 14, 30.0
 _PLACED = (schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name)
@@ -118,6 +119,17 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     moving = span_s > 0
     if speed < SLOWEST_MPS or not moving.any():
         return
+    bent = max((_bent(other) for other in streams.values()), default=0.0)
+    if np.ptp(angle) == 0.0 and bent > BENT_RAD:
+        yield _found(
+            stream,
+            "quaternion",
+            bent,
+            f"its heading is the same in all messages, while the course of the fixes turns by "
+            f"{bent:.3g} rad: it was not measured",
+            "leave it out, or missing = { COLUMN = [...] } in the table of the mapping",
+        )
+        return
     rate = float(np.median(np.abs(wrap_angle(np.diff(angle)))[moving] / span_s[moving]))
     if rate * speed > SIDEWAYS_MPS2:
         yield _found(
@@ -128,6 +140,15 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             f"{rate * speed:.3g} m/s^2 sideways",
             "the unit of the angle in the mapping",
         )
+
+
+def _bent(stream: Stream) -> float:
+    """Return between which courses (rad) the legs of fixes are, 0 for another topic."""
+    if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
+        return 0.0
+    places = _places(stream)[np.linspace(0, len(stream) - 1, LEGS + 1).astype(int)]
+    east, north = np.diff(places[np.isfinite(places).all(axis=1)], axis=0).T
+    return float(np.ptp(np.unwrap(np.arctan2(north, east)))) if len(east) else 0.0
 
 
 def _speed(stream: Stream) -> float:

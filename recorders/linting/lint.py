@@ -49,6 +49,7 @@ CHECKS: tuple[Check, ...] = (
     forces.upright,
     magnetic.units,
     magnetic.iron,
+    columns.codes,
     columns.frozen,
     columns.saturated,
     columns.rounded,

@@ -20,6 +20,7 @@ SCALE = (0.9, 1.1)
 CLIMB_M, MIRRORED = 2.0, -0.9
 FEWEST = 20
 LEAP_M, CLIMB_MPS = 15.0, 100.0  # what climbs faster has an engine for it
+ABRUPT, CLIMB_MPS2 = 0.1, 30.0  # of a leap between fixes that climb by so little of it
 ALIKE = 0.03  # of a metre of the wheels
 # What degrees are that were read in another unit, by what they are read as.
 _READ_AS: dict[str, Callable[[NDArray], NDArray]] = {
@@ -109,7 +110,10 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     rows = rows[np.argsort(stream.publish_time_ns[rows], kind="stable")]
     steps_m = np.diff(stream["altitude_m"][rows])
     steps_s = 1e-9 * np.diff(stream.publish_time_ns[rows])
-    leaps = np.flatnonzero((np.abs(steps_m) > LEAP_M) & (np.abs(steps_m) > CLIMB_MPS * steps_s))
+    sizes_m = np.abs(steps_m)
+    beside_m = np.maximum(np.append(0.0, sizes_m[:-1]), np.append(sizes_m[1:], 0.0))
+    is_abrupt = (beside_m < ABRUPT * sizes_m) & (sizes_m > CLIMB_MPS2 * steps_s**2)
+    leaps = np.flatnonzero((sizes_m > LEAP_M) & ((sizes_m > CLIMB_MPS * steps_s) | is_abrupt))
     if len(leaps):
         first_s = 1e-9 * float(
             stream.publish_time_ns[rows[leaps[0] + 1]] - stream.publish_time_ns[rows[0]]

@@ -26,6 +26,7 @@ GPS_LEAPS = {
 }
 TAI_LESS_GPS_S = 19
 DRIFT, FACT = 1e-5, 1e-3
+AGAIN, FEW_FALLS = 100.0, 10  # usual steps that a clock falls by when it begins again, and how often
 LONG_S, SURE = 100.0, 6.0
 # What a sensor's own clock drives; fixes and poses may come as they can be computed.
 _CLOCKED = {
@@ -34,8 +35,8 @@ _CLOCKED = {
     schemas.ODOMETRY.full_name,
 }
 _USES = {
-    schemas.INERTIAL_SAMPLE.full_name: "a model that they drive takes the mean of both; gyro, "
-    "bingham-inertial and deployed filters take them one by one, and one of both may have no effect",
+    schemas.INERTIAL_SAMPLE.full_name: "estimators take the mean of both; deployed filters and those "
+    "of others take them one by one, and one of both may have no effect",
     schemas.ODOMETRY.full_name: "the first of both holds for no time, and has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
@@ -80,19 +81,28 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     rows = np.argsort(stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
     back = np.diff(stamps_ns) < 0
-    is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
     if back.any():
+        is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
         count, first_s = int(back.sum()), _since_s(stream, int(stamps_ns[int(np.argmax(back))]))
+        steps_ns = np.diff(stamps_ns)
+        usual_ns = float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else np.inf
+        began_again = not is_late and -steps_ns.min() > AGAIN * usual_ns and count <= FEW_FALLS
+        how = (
+            "; its clock began again: it was restarted, rolled over, or is that of several vehicles"
+            if began_again
+            else "; messages overtook one another" * is_late
+        )
         yield Finding(
             "stamps",
             stream.topic,
             "",
             float(count),
             f"{stream.topic}: {count} of its {len(stream)} stamps go back, the first "
-            f"{first_s:.4g} s after "
-            f"the earliest{'; messages overtook one another' if is_late else ''}",
+            f"{first_s:.4g} s after the earliest{how}",
             mapping="--late says what becomes of them"
             if is_late
+            else "`rollover` of `time`, or `vehicle` of the table, in the mapping"
+            if began_again
             else "sort them where the log is written",
             sure="hint" if is_late else "fact",
         )

@@ -35,6 +35,8 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
         which = f"{name} needs" if len(models) == 1 else "a registered model needs"
         return f"it has nothing that {which}"
     missing = "; ".join(part.words for part in parts if not part.is_here)
+    if not missing:
+        return f"model {name} fits it, and is taken only by its name: --model {name}"
     return f"model {name} comes nearest and lacks {missing}"
 
 

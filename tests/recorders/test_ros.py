@@ -396,7 +396,7 @@ def test_named_transforms_are_composed(real_data: Path) -> None:
 
 @pytest.mark.parametrize("is_static", [True, False])
 def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is_static: bool) -> None:
-    """Over a mast, as sent once or as ever the same; a frame that moves on the body has none."""
+    """Over a mast, as sent once or as ever the same; of a frame that moves on the body, that it does."""
     make, turn = Maker(), Rotation.from_euler("xyz", [0.1, -0.4, 2.0])
     links = [
         ("base_link", "mast", (0.5, 0.1, 0.2), Rotation.from_euler("z", 90, degrees=True)),
@@ -426,7 +426,9 @@ def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is
             sent.append((topic, stamp_ns, fix))
     _, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
     told = {key: note for key, note in notes.items() if key.endswith(", mounting")}
-    assert set(told) == {"/fix, mounting", "/inertial, mounting"}
+    assert set(told) == {"/fix, mounting", "/inertial, mounting", "/arm/fix, mounting"}
+    assert told["/arm/fix, mounting"].startswith("its frame arm moves in base_link, and no lever arm")
+    assert told["/arm/fix, mounting"].endswith('transforms=["base_link:arm"]\' imports how it moves')
     assert told["/fix, mounting"] == (
         "its frame antenna is 0.5, 0.4, 1.2 m forward, left and up of base_link; used by "
         "--set lever_x_m=0.5 --set lever_y_m=0.4 for the model robot, or "

@@ -52,6 +52,12 @@ COLUMNS = {
     "t": STAMPS_S, "lat": LATITUDE, "lon": LONGITUDE, "alt": np.full(400, 105.0), "speed": SPEED,
     "turn": -np.gradient(COURSE, 0.5), "heading": np.degrees(COURSE), "id": np.zeros(400),
 }  # fmt: skip
+SAMPLES = (
+    "topic = '/inertial'\nbecomes = 'InertialSample'\n"
+    "fields = { specific_force_mps2 = ['ax', 'ay', 'az'], turn_rate_radps = ['gx', 'gy', 'gz'] }"
+)
+INERTIAL = {name: np.zeros(400) for name in ("ax", "ay", "gx", "gy")}
+INERTIAL |= {"az": np.full(400, 9.81), "gz": COLUMNS["turn"]}
 SCALED = "units = { latitude_deg = '1e-7 deg', longitude_deg = '1e-7 deg' }"
 
 
@@ -121,6 +127,84 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
         "day and month are swapped",
     ),
     "a unit of time": ({"t": STAMPS_S - 1_150_000_000}, TIME, [FIX], "begin on 1987"),
+    "a rollover": (
+        {"t": (np.rint(1e6 * (STAMPS_S - STAMPS_S[0])).astype(np.int64) + 2**32 - 10**8) % 2**32},
+        "time = { column = 't', unit = 'us', order = 'any', zero = '2026-01-01' }",
+        [FIX],
+        "its clock began again: .*`rollover` of `time`",
+    ),
+    "several vehicles": (
+        {"t": np.tile(STAMPS_S[:200], 2), "lat": LATITUDE + 0.02 * (np.arange(400) >= 200)},
+        "time = { column = 't', order = 'any' }",
+        [FIX],
+        "several vehicles",
+    ),
+    "newest first": (
+        {name: COLUMNS[name][::-1] for name in ("lat", "lon", "speed", "turn")},
+        "time = { rate_hz = 2, zero = '2026-01-01' }",
+        [FIX, ODOMETRY],
+        "turn_radps has the wrong sign",
+    ),
+    "longitudes to the west": (
+        {"lon": -LONGITUDE},
+        TIME,
+        [FIX, ODOMETRY],
+        "turn_radps has the wrong sign",
+    ),
+    "a code among headings": (
+        {"heading": np.where(np.arange(400) % 20 == 3, 511, np.degrees(COURSE))},
+        f"{TIME}\n{ATTITUDE} }}",
+        [FIX, HEADING],
+        "the heading in rad is .* in 20 messages, .*: a code of a missing value",
+    ),
+    "a code among speeds": (
+        {"speed": np.where(np.arange(400) % 20 == 3, 52.6, SPEED)},
+        TIME,
+        [ODOMETRY],
+        "forward_mps is 52.6 in 20 messages, .*: a code of a missing value",
+    ),
+    "a heading of 0": (
+        {"heading": np.zeros(400)},
+        f"{TIME}\n{ATTITUDE} }}",
+        [FIX, HEADING],
+        "its heading is the same in all messages, while the course of the fixes turns",
+    ),
+    "forces of 0": (
+        INERTIAL | {"az": np.zeros(400)},
+        TIME,
+        [SAMPLES],
+        "specific forces are exactly zero",
+    ),
+    "turn rates of 0": (
+        INERTIAL | {"gz": np.zeros(400)},
+        TIME,
+        [SAMPLES],
+        "turn rates are exactly zero",
+    ),
+    "samples of one stamp": (
+        INERTIAL | {"t": np.repeat(STAMPS_S[:200], 2)},
+        TIME,
+        [SAMPLES],
+        "estimators take the mean of both",
+    ),
+    "heights of two kinds": (
+        {"alt": np.where(np.arange(400) % 50 < 25, 105, 152)},
+        TIME,
+        [FIX],
+        "its altitude leaps 15 times, by up to 47 m",
+    ),
+    "a height of 0": (
+        {"alt": np.where(np.arange(400) < 100, 0, 488)},
+        TIME,
+        [FIX],
+        "its altitude leaps 1",
+    ),
+    "ns as us": (
+        {"t": STAMPS_S * 1e3},
+        "time = { column = 't', unit = 'us' }",
+        [FIX],
+        "1e.03 times too small",
+    ),
     "whole seconds": ({"t": np.floor(STAMPS_S)}, TIME, [ODOMETRY], "the first of both .* has no effect"),
 }
 

@@ -145,7 +145,7 @@ def test_several_vehicles_of_a_file_are_told_apart(column: str, tmp_path: Path) 
     )
     got = Got(path)
     assert {topic: len(each) for topic, each in got.streams.items()} == {"/A/fix": 20, "/B/fix": 20}
-    assert f"{column} says whose row it is" in got.said
+    assert f"{column}: 2 vehicles, each with a namespace" in got.said
 
 
 # Places.
@@ -752,7 +752,7 @@ def test_a_date_without_a_name_is_of_the_time_beside_it(tmp_path: Path) -> None:
 def test_axes_that_nothing_names_are_assumed(tmp_path: Path) -> None:
     row = lambda k: f"{EPOCH + k},{2 * k},{k},{-3 * k}"  # noqa: E731
     for head in ("t,x,y,z", "t,gt_x,gt_y,gt_z"):
-        assert "are along east, north and up" in Got(text_of(tmp_path, head, row)).said
+        assert ": along east, north and up" in Got(text_of(tmp_path, head, row)).said
     assert "along east" not in Got(text_of(tmp_path, "t,x_enu,y_enu,z_enu", row)).said
 
 
@@ -810,7 +810,7 @@ def test_the_stamp_of_the_header_is_the_time(tmp_path: Path) -> None:
     )
     got = Got(path)
     assert got.times("/fix")[0] == "2023-11-14 22:13:20"
-    assert "field.header.stamp is the time of the measurement, and time is not" in got.said
+    assert "field.header.stamp: the time of the measurement, not time" in got.said
 
 
 @pytest.mark.parametrize(("late", "early"), [("Z", ""), ("", "+02:00"), (" EST", "")])

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
-from recorders.importers.ros.transforms import Chain, Floats, Pair, Transforms
+from recorders.importers.ros.transforms import Chain, Floats, Pair, Transforms, path_between
 from recorders.log import schemas
 
 BASES = ("base_link", "base_footprint", "base")
@@ -45,6 +45,8 @@ class Mountings:
         for topic, (name, stated) in streams.items():
             pose = self._pose(bases, stated) if name in (FIX, UNIT) else None
             if pose is None:
+                if name in (FIX, UNIT) and (note := self._note_of_moving(bases, stated)):
+                    yield f"{topic}, mounting", note
                 continue
             base, place_m, turn = pose
             frame = f"its frame {stated['frame_id']}"
@@ -65,6 +67,22 @@ class Mountings:
                 what = f"{frame} is turned by roll, pitch, yaw {where} in {base}"
             if uses:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
+
+    def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
+        """Say that a frame moves on the body; empty if none of the bases carries it."""
+        frame = stated.get("frame_id", "").lstrip("/")
+        for base in bases:
+            try:
+                links = path_between((base, frame), [*self._fixed, *self._moving])
+            except BadInput:  # no transforms lead there
+                continue
+            if links and all(is_forward for _, is_forward in links):
+                return (
+                    f"its frame {frame} moves in {base}, and no lever arm or mounting follows it: its "
+                    f"messages are taken for those of {base}; --set "
+                    f"'transforms=[\"{base}:{frame}\"]' imports how it moves"
+                )
+        return ""
 
     def _pose(self, bases: list[str], stated: Mapping[str, str]) -> tuple[str, Floats, Rotation] | None:
         """Find where a stream's frame is on the body, by the first of the bases that it is fixed to."""

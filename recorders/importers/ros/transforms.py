@@ -134,7 +134,7 @@ class Chain:
     def __init__(self, pair: Pair, sent: Mapping[Pair, int], static: Mapping[Pair, Transforms]) -> None:
         self.pair = pair
         self._static = {each: static[each].take(slice(-1, None)) for each in static}
-        self._links = _path(pair, [*sent, *static])
+        self._links = path_between(pair, [*sent, *static])
         moving = [link for link, _ in self._links if link not in static]
         self._leader = max(moving, key=lambda each: sent[each], default=None)
         self._held: dict[Pair, list[Transforms]] = {link: [] for link in moving}
@@ -223,7 +223,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
     return Transforms(stamp_ns, stamp_ns, stamp_ns, position, first * begin + second * end)
 
 
-def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
+def path_between(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
     """Find the links from one frame to the other, and whether each is taken in its direction."""
     above = {child: parent for parent, child in links}
     parent, child = pair

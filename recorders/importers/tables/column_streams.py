@@ -63,7 +63,7 @@ _EAST, _NORTH = f"{_AT}(east(ing)?|e)", f"{_AT}(north(ing)?|n)"
 # Not where an origin, a home or a goal is.
 _HERE = r"(?!(.*_)?(ref|home|origin|base|datum|target|goal|waypoint|wp|setpoint|sp)_)(.*_)?"
 _GEODETIC = rf"{_HERE}lat(itude)?", rf"{_HERE}(lon|lng|long)(gitude)?"
-_ENU = "along east, north and up, or the axes of the positions; the order of fields, factors"
+_ENU = "along east, north and up; order of fields, factors"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
 )
@@ -87,7 +87,7 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
     # a magnetometer of the same table is one of a nine-axis unit, which orientation filters read
     field = take_axes(list(columns), *_MAGNETOMETERS, usual="uT")
     is_ned = force[0].frame == "ned"
-    axes = "forward, right and down" if is_ned else "forward, left and up"
+    axes = "forward, right, down" if is_ned else "forward, left, up"
     yield from stream_lines(
         f"{table.prefix}/inertial",
         "InertialSample",
@@ -98,8 +98,7 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
         f"units.specific_force_mps2 = {json.dumps(force_unit)}   # {why}",
         f"units.turn_rate_radps = {json.dumps(rate_unit)}   # {rate_why}",
         *_field_lines(field)[1:],
-        f"{ASSUMED}the axes of {force[0].name} and the others are the body's, {axes}; "
-        "mounting_deg turns those of the sensor (roll, pitch, yaw)",
+        f"{ASSUMED}{', '.join(each.name for each in force + rate)}: axes {axes}; mounting_deg",
         "mounting_deg = [180, 0, 0]" if is_ned else "# mounting_deg = [0, 0, 0]",
     )
 
@@ -152,8 +151,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
             lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
     elif accuracy := take(table.columns, _ACCURACY, usual="m"):
         lines += [
-            f"{ASSUMED}{accuracy[0].name} is the standard deviation of each axis, upwards twice that; "
-            "deviations, factors",
+            f"{ASSUMED}{accuracy[0].name}: standard deviation of each axis, twice upwards; factors",
             f"deviations.covariance_m2 = {names_of(3 * accuracy)}",
             "factors.covariance_m2 = [1, 1, 2]",
             *accuracy_of(table, accuracy[0], found.unit),
@@ -162,7 +160,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
         lines += [
             "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
             "# horizontally divided by the root of 2.",
-            f"{ASSUMED}{dilution[0].name} is of a receiver with a range error of 2 m; factors",
+            f"{ASSUMED}{dilution[0].name}: for a range error of 2 m; factors",
             f"deviations.covariance_m2 = {names_of(3 * dilution)}",
             "factors.covariance_m2 = [1.4, 1.4, 2.8]",
         ]
@@ -190,9 +188,7 @@ def _target(table: GuessedTable) -> Iterator[str]:
     what = " and ".join(["a range"] * bool(distance) + ["a bearing"] * bool(direction))
     lines = [f"fields.target_id = {name_of(each)}" for each in number]
     if not number:
-        lines.append(
-            f"{ASSUMED}all rows are of target 0, as no column numbers targets; fields.target_id"
-        )
+        lines.append(f"{ASSUMED}all rows: target 0, as no column numbers targets; fields.target_id")
     for each in distance:
         lines.append(f"fields.range_m = {name_of(each)}")
         if stated := stated_unit(each, "m"):
@@ -202,8 +198,7 @@ def _target(table: GuessedTable) -> Iterator[str]:
         lines += [
             f"fields.bearing_rad = {name_of(each)}",
             f"units.bearing_rad = {json.dumps(in_unit)}   # {why}",
-            f"{ASSUMED}{each.name} is anticlockwise from the sensor's x axis; factors.bearing_rad = -1 "
-            "if it is clockwise",
+            f"{ASSUMED}{each.name}: anticlockwise from the x axis; factors.bearing_rad = -1 if not",
         ]
     topic = {"RangeBearing": "range_bearing"}.get(becomes, becomes.lower())
     why = f"the names are {what}" + " of numbered targets" * bool(number)
@@ -254,8 +249,7 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
         f"fields.turn_radps = {name_of(rate)}",
         f"units.forward_mps = {json.dumps(speed_unit)}   # {speed_why}",
         f"units.turn_radps = {json.dumps(rate_unit)}   # {why}",
-        f"{ASSUMED}{rate.name} is anticlockwise seen from above; factors.turn_radps = -1 if it is "
-        "clockwise",
+        f"{ASSUMED}{rate.name}: anticlockwise seen from above; factors.turn_radps = -1 if not",
     )
 
 
@@ -327,7 +321,7 @@ def _along_axes(
     if frame == "ned":
         return [found[1], found[0], *found[2:]], [1, 1, -1][: len(found)], []
     names = ", ".join(each.name for each in found)
-    return found, [1] * len(found), [] if frame else [f"{ASSUMED}{names} are {_ENU}"]
+    return found, [1] * len(found), [] if frame else [f"{ASSUMED}{names}: {_ENU}"]
 
 
 def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
@@ -336,8 +330,8 @@ def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
         return []
     names = ", ".join(each.name for each in turn)
     return [
-        f"{ASSUMED}{names} turn the body's axes, forward, left and up, to those of the positions, or to "
-        "east, north and up; mounting_deg"
+        f"{ASSUMED}{names}: turns forward, left, up to the axes of positions, or east, north, up; "
+        "mounting_deg"
     ]
 
 
@@ -459,7 +453,7 @@ def _heading(table: GuessedTable) -> Iterator[str]:
     angle = "heading" if direction.is_compass else "yaw"
     what = "clockwise from north" if direction.is_compass else "anticlockwise from east"
     begin = "# " if direction.is_sure else ASSUMED
-    table.made.append(f"{begin}{found[0].name}: {what}, {direction.unit}: {direction.why}.")
+    table.made.append(f"{begin}{found[0].name}: {what}, in {direction.unit}, {direction.why}; attitude")
     table.made.append(f'attitude = {{ {angle} = {name_of(found[0])}, unit = "{direction.unit}" }}')
     quaternion = [f"quaternion_{part}" for part in "wxyz"]
     yield from stream_lines(
@@ -467,8 +461,7 @@ def _heading(table: GuessedTable) -> Iterator[str]:
         "Orientation",
         "the name is that of a heading or compass",
         f"fields.quaternion = {json.dumps(quaternion)}",
-        f"states.sigma_heading_rad = {scatter_rad(found[0], direction.unit):.2g}   # as it scatters "
-        "from one to the next; fill in the standard deviation",
+        f"states.sigma_heading_rad = {scatter_rad(found[0], direction.unit):.2g}   # by its scatter",
     )
 
 

@@ -152,7 +152,7 @@ def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
         where = ", ".join(f"{json.dumps(name)} = {_listed(valid)}" for name, _, valid in found)
         lines.append(f"where = {{ {where} }}")
     lines += [
-        f"{ASSUMED}{name} says that there is no fix in {_rows(int((~which).sum()))}, left out; where"
+        f"{ASSUMED}{name}: no fix in {_rows(int((~which).sum()))}, left out; where"
         for name, which, _ in found
         if not which.all()
     ]
@@ -196,7 +196,7 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         if not chosen:
             _refuse(table, place, f"they may be {', '.join(fitting)}")
     if chosen not in ("deg", stated):
-        comment = f"{ASSUMED}{names} are in {chosen}, {why}"
+        comment = f"{ASSUMED}{names}: in {chosen}, {why}"
     units = (chosen, own if chosen == stated else chosen)
     degrees = [_degrees(name, values) for name, values in zip(units, pair, strict=True)]
     lines = [f"{comment}; {_how(chosen)}"] if comment else []
@@ -212,17 +212,14 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         ]
     if own == "arcmin":
         lines.append(
-            f"{ASSUMED}{longitude.name} is positive to the east; units.longitude_deg = "
-            '"-1 arcmin" if to the west'
+            f'{ASSUMED}{longitude.name}: positive to the east; units.longitude_deg = "-1 arcmin" if not'
         )
     zero = (degrees[0] == 0) & (degrees[1] == 0)
     if zero.any() and np.abs(np.nanmedian(degrees[0])) > 0.5:
         missing = table.prepared.setdefault("missing", {})
         for column in place:
             missing[column.name] = [*missing.get(column.name, []), 0.0]
-        lines.append(
-            f"{ASSUMED}{names}: 0, 0 means that there was no fix, in {_rows(int(zero.sum()))}; missing"
-        )
+        lines.append(f"{ASSUMED}{names}: 0, 0 is no fix, in {_rows(int(zero.sum()))}; missing")
         degrees = [np.where(zero, np.nan, values) for values in degrees]
     return Places(chosen, lines, *degrees)
 
@@ -411,12 +408,12 @@ def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) 
     largest = float(np.abs(known).max())
     is_whole = bool(np.all(known == np.rint(known)))
     if is_whole and position_unit == "1e-7 deg" and largest > 1000:
-        said = f"{ASSUMED}{height.name} is in mm, as receivers with positions of 1e-7 deg have it; units"
+        said = f"{ASSUMED}{height.name}: in mm, as receivers with positions of 1e-7 deg have it; units"
         return [said, 'units.altitude_m = "mm"']
     if largest <= _HIGHEST_M:
-        return [f"{ASSUMED}{height.name} is in m, as no unit is stated; units"]
+        return [f"{ASSUMED}{height.name}: in m, as no unit is stated; units"]
     if is_whole and largest > 60_000:
-        said = f"{ASSUMED}{height.name} is in mm, as {largest:.6g} m is above any receiver; units"
+        said = f"{ASSUMED}{height.name}: in mm, as {largest:.6g} m is above any receiver; units"
         return [said, 'units.altitude_m = "mm"']
     raise BadInput(
         f"{table.path}: it is not certain what {height.name}, up to {largest:.6g}, is in; write a "
@@ -431,14 +428,14 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
         return [f'units.covariance_m2 = "{length}"   # as its name says'] if length != "m" else []
     known = known_of(accuracy)
     if position_unit != "1e-7 deg" or np.any(known != np.rint(known)) or known.max() < 20:
-        return [f"{ASSUMED}{accuracy.name} is in m, as no unit is stated; units"]
+        return [f"{ASSUMED}{accuracy.name}: in m, as no unit is stated; units"]
     if not re.search("acc", accuracy.plain):
         raise BadInput(
             f"{table.path}: it is not certain what {accuracy.name}, up to {known.max():.6g}, is "
             "in: whole numbers may be m, mm, or a dilution times 100; write a mapping by hand with "
             "`deviations` and `factors` of covariance_m2"
         )
-    said = f"{ASSUMED}{accuracy.name} is in mm, as receivers with positions of 1e-7 deg have it; units"
+    said = f"{ASSUMED}{accuracy.name}: in mm, as receivers with positions of 1e-7 deg have it; units"
     return [said, 'units.covariance_m2 = "mm"']
 
 

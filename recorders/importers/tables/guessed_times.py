@@ -59,6 +59,8 @@ _COUNTERS = re.compile(
     r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
     r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
 )
+# How many cells are looked at together for one that is not empty.
+_CELLS = 1000
 # Names of columns that count days, as Excel and MATLAB do.
 _DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
 # What the column of a message's own stamp is called, and columns without a name of their own.
@@ -108,7 +110,8 @@ class GuessedTime(NamedTuple):
 class _Table(NamedTuple):
     """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,).
 
-    `has_others` is whether there are other tables, with which it has to share a clock.
+    `has_others` is whether there are other tables, with which it has to share a clock; `stamps` are
+    those that were read, by their mapping.
     """
 
     path: Path
@@ -119,6 +122,7 @@ class _Table(NamedTuple):
     codes: NDArray[np.int64]
     kind: str
     has_others: bool
+    stamps: dict[str, Stamps]
 
 
 def guess_time(
@@ -136,7 +140,7 @@ def guess_time(
     plain = {column.plain for column in columns}
     vehicle = _vehicle(batch, columns, texts)
     table = _Table(
-        path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain), has_others
+        path, batch, columns, texts, vehicle, _codes(batch, vehicle), _kind_of(plain), has_others, {}
     )
     refusals: list[BadInput] = []
     try:
@@ -151,10 +155,7 @@ def guess_time(
     return GuessedTime(
         f'{{ rate_hz = 1, zero = "{UNKNOWN_ZERO}" }}',
         set(),
-        [
-            f"{ASSUMED}one row a second from {UNKNOWN_ZERO} on, as no column could be a time; give "
-            "rate_hz"
-        ],
+        [f"{ASSUMED}one row a second from {UNKNOWN_ZERO} on, as no column could be a time; rate_hz"],
         None,
         vehicle,
     )
@@ -305,7 +306,7 @@ def _passed_over(table: _Table, used: set[str]) -> list[str]:
         return []
     names = " and ".join(sorted(used))
     why = " of the measurement" if any(re.search(_OF_HEADER, parted(each)[0]) for each in used) else ""
-    return [f"{ASSUMED}{names} is the time{why}, and {', '.join(others)} is not; column"]
+    return [f"{ASSUMED}{names}: the time{why}, not {', '.join(others)}; column"]
 
 
 def _tried(
@@ -340,7 +341,7 @@ def _tried(
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
             comments = [
                 *comments,
-                f"{ASSUMED}{columns[0]} begins again at {rollover}, and goes on beyond that; rollover",
+                f"{ASSUMED}{columns[0]}: begins again at {rollover}, and is continued; rollover",
             ]
             stamps = _stamps(table, mapping)
         elif back == 1 and not vehicle:
@@ -348,7 +349,7 @@ def _tried(
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
     if back == -1:
-        comments = [*comments, f"{ASSUMED}rows are newest first, as their times fall; they are reversed"]
+        comments = [*comments, f"{ASSUMED}rows: newest first, as their times fall, so reversed; order"]
     try:
         for part in parts:
             order = Order(label, mapping)
@@ -360,16 +361,19 @@ def _tried(
     if vehicle:
         comments = [
             *comments,
-            f"{ASSUMED}{vehicle} says whose row it is: a namespace of topics for each of its "
-            f"{len(parts)} values; vehicle",
+            f"{ASSUMED}{vehicle}: {len(parts)} vehicles, each with a namespace; vehicle",
         ]
     seen = _seen([stamps[part] for part in parts])
     return GuessedTime(_toml(mapping), {*columns}, [*seen, *comments], stamps, vehicle)
 
 
 def _stamps(table: _Table, mapping: TimeMapping) -> Stamps:
-    rows = np.arange(len(table.codes))
-    return stamps_ns(mapping, table.batch, rows, str(table.path))
+    """Read the stamps of all rows, once for each mapping."""
+    key = repr(mapping)
+    if key not in table.stamps:
+        rows = np.arange(len(table.codes))
+        table.stamps[key] = stamps_ns(mapping, table.batch, rows, str(table.path))
+    return table.stamps[key]
 
 
 def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.int64]], back: int) -> int:
@@ -423,7 +427,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
     days += [column.name for column in table.columns if re.fullmatch("(.*_)?date", column.plain)]
     hours = [name for name in plain if re.fullmatch("(.*_)?(time|clock|utc|hour)", plain[name])]
     for name in filter(str.isdecimal, table.texts):
-        cell = _first_cell(table.batch[name])
+        cell = first_cell(table.batch[name])
         days += [name] * bool(re.fullmatch(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}", cell))
         hours += [name] * bool(re.match(r"\d{1,2}:\d{2}", cell))
     offsets = [
@@ -439,7 +443,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
             if "zero" in found[0].model_fields_set and days and names[0] not in days:
                 if dated & {*days}:
                     continue
-                cell = _first_cell(table.batch[days[0]])
+                cell = first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
                     f"'{cell}', whose format is not known; write a mapping by hand, with time = "
@@ -452,7 +456,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
 def _offsets(table: _Table) -> dict[str, str]:
     """Return the columns that are called offsets from UTC, with their first cells."""
     found = {
-        name: _first_cell(table.batch[name])
+        name: first_cell(table.batch[name])
         for name in table.batch
         if re.fullmatch(_OFFSETS, parted(name)[0])
     }
@@ -462,7 +466,7 @@ def _offsets(table: _Table) -> dict[str, str]:
 def _check_texts(table: _Table, dated: set[str]) -> None:
     """Raise BadInput for a column of times in no known format."""
     for name in table.texts:
-        cell = _first_cell(table.batch[name])
+        cell = first_cell(table.batch[name])
         is_named = _NAMED.search(parted(name)[0]) and re.search(r"\d.*\d", cell)
         if name not in dated and (is_named or re.search(_LIKE_A_TIME, cell)):
             raise BadInput(
@@ -473,12 +477,17 @@ def _check_texts(table: _Table, dated: set[str]) -> None:
             )
 
 
-def _first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
-    return next((text for text in texts_of(cells, is_part=is_part).to_pylist() if text), "")
+def first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
+    """Return the first cell that is not empty, as text; an empty one without any."""
+    for begin in range(0, len(cells), _CELLS):
+        texts = texts_of(cells[begin : begin + _CELLS], is_part=is_part).to_pylist()
+        if found := next(filter(None, texts), ""):
+            return str(found)
+    return ""
 
 
 def _first_cells(table: _Table, names: Sequence[str]) -> str:
-    return " ".join(_first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
+    return " ".join(first_cell(table.batch[name], is_part=len(names) > 1) for name in names)
 
 
 def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
@@ -500,16 +509,17 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
             name = min(unread)
             raise Undecided(
                 f"{table.path}: column {name} states offsets from UTC such as "
-                f"'{_first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
+                f"'{first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
                 "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
-            f"{ASSUMED}{' and '.join(names)} is in UTC, as no zone is stated; "
-            'zone = "Europe/Berlin" or utc_offset_h'
+            f"{ASSUMED}{' and '.join(names)}: in UTC, as no zone is stated; zone or utc_offset_h"
         ]
     if re.match(r"\d{1,2}:\d{2}", cell) is not None:
         given["zero"] = UNKNOWN_ZERO
-        comments.append(f"{ASSUMED}times of the day {UNKNOWN_ZERO}, as no date is stated; zero")
+        comments.append(
+            f"{ASSUMED}{' and '.join(names)}: of the day {UNKNOWN_ZERO}, as no date is stated; zero"
+        )
     fitting: dict[str, Stamps] = {}
     for pattern in formats_of(cell):
         mapping = TimeMapping.model_validate({**given, "format": pattern})
@@ -529,8 +539,8 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     others = [each for each in fitting if not np.array_equal(fitting[each], fitting[pattern])]
     if others:
         comments.append(
-            f"{ASSUMED}{' and '.join(names)} has {_first_part(pattern)} first, {pattern}, so that rows "
-            f"follow one another; with {_first_part(others[0])} first they leap; format"
+            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as rows leap with "
+            f"{_first_part(others[0])} first; format"
         )
     return TimeMapping.model_validate({**given, "format": pattern}), comments
 
@@ -595,12 +605,12 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     clock = [letters for letters in ("%H", "%M", "%S") if letters in parts]
     if clock == ["%H", "%M", "%S"]:
         found = [parts[letters] for letters in (*day, *clock)]
-        cells = [_first_cell(table.batch[name]) for name in found]
+        cells = [first_cell(table.batch[name]) for name in found]
         formats = [
             letters + ".%f" * ("." in cell) for letters, cell in zip([*day, *clock], cells, strict=True)
         ]
     else:
-        of_day = {name: next(formats_of(_first_cell(table.batch[name]))) for name in table.texts}
+        of_day = {name: next(formats_of(first_cell(table.batch[name]))) for name in table.texts}
         name = next((name for name in of_day if of_day[name].startswith(("%H", "%I"))), "")
         if not name:
             return
@@ -608,7 +618,7 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         formats = [*day, of_day[name]]
     yield (
         TimeMapping(column=found, unit="date", format=" ".join(formats)),
-        [f"{ASSUMED}{', '.join(found)} are in UTC, as no zone is stated; utc_offset_h or zone"],
+        [f"{ASSUMED}{', '.join(found)}: in UTC, as no zone is stated; zone or utc_offset_h"],
     )
 
 
@@ -623,7 +633,7 @@ def _parts_of_date(table: _Table) -> dict[str, str]:
         found = {letters: name for letters, name in found.items() if letters not in ("%m", "%d")}
     if all(column.name.isdecimal() for column in table.columns):
         found = _nameless_parts(table)
-    cell = _first_cell(table.batch[found["%Y"]]) if "%Y" in found else ""
+    cell = first_cell(table.batch[found["%Y"]]) if "%Y" in found else ""
     return found if re.fullmatch(r"(19|20)\d\d", cell.partition(".")[0]) else {}
 
 
@@ -656,7 +666,7 @@ def _check_calendars(table: _Table) -> None:
 def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     """Yield times as hhmmss, as NMEA has them, with or without a date as ddmmyy or yyyymmdd."""
     for column in table.columns:
-        cell = _first_cell(table.batch[column.name])
+        cell = first_cell(table.batch[column.name])
         if not (
             re.search("time|utc|clock|hour", column.plain) and re.fullmatch(r"\d{5,6}(\.\d+)?", cell)
         ):
@@ -677,14 +687,14 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             mapping = TimeMapping(column=column.name, unit="date", format=clock, zero=UNKNOWN_ZERO)
             yield (
                 mapping,
-                [f"{ASSUMED}{column.name} is hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
+                [f"{ASSUMED}{column.name}: hhmmss in UTC of the day {UNKNOWN_ZERO}; format, zero"],
             )
             continue
-        digits = len(_first_cell(table.batch[day.name]).partition(".")[0])
+        digits = len(first_cell(table.batch[day.name]).partition(".")[0])
         date = "%Y%m%d" if digits == 8 else "%d%m%y"
         mapping = TimeMapping(column=[day.name, column.name], unit="date", format=f"{date} {clock}")
         how = "yyyymmdd" if digits == 8 else "ddmmyy, as NMEA has it,"
-        yield mapping, [f"{ASSUMED}{day.name} is {how} and {column.name} hhmmss in UTC; format"]
+        yield mapping, [f"{ASSUMED}{day.name} and {column.name}: {how} and hhmmss in UTC; format"]
 
 
 # Numbers that count.
@@ -713,7 +723,10 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         is_ms = re.fullmatch("i_?tow|gms", tow.plain) or np.nanmax(tow.values) > 604_800
         unit = tow.unit if tow.unit in _SIZES else "ms" if is_ms else "s"
         mapping = TimeMapping(column=tow.name, week=week.name, unit=unit)  # type: ignore[arg-type]
-        yield mapping, [f"{ASSUMED}GPS time is kept as it is; leap_seconds = 18 makes it UTC"]
+        yield (
+            mapping,
+            [f"{ASSUMED}{week.name} and {tow.name}: GPS time, not UTC; leap_seconds = 18 makes it UTC"],
+        )
     for whole in table.columns:
         stem = re.fullmatch(r"(.*?)_?(secs?|seconds?|s)", _full(whole))
         if not stem or not _are_whole(whole.values):
@@ -738,7 +751,14 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
             is_date = _DATES_S[0] < np.nanmedian(whole.values) < _DATES_S[1]
             zero = {} if is_date else {"zero": UNKNOWN_ZERO}
             given = {"column": [whole.name, part.name], "unit": ["s", unit], **zero}
-            comments = [] if is_date else [f"{ASSUMED}times count from {UNKNOWN_ZERO}; zero"]
+            comments = (
+                []
+                if is_date
+                else [
+                    f"{ASSUMED}{whole.name} and {part.name}: from {UNKNOWN_ZERO}, as no date is stated; "
+                    "zero"
+                ]
+            )
             yield TimeMapping.model_validate(given), comments
 
 
@@ -785,13 +805,10 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
         )
     if unit in ("", "s") and _LONGEST_S < largest < _FIT_END and _is_fit(table):
         unit, zero = "s", {"zero": _FIT_ZERO}
-        comments = [f"{ASSUMED}{column.name} counts from {_FIT_ZERO}, as files of FIT have it; zero"]
+        comments = [f"{ASSUMED}{column.name}: from {_FIT_ZERO}, as files of FIT have it; zero"]
     elif not unit and _UNSET_S[0] < float(known.min()) and largest < _UNSET_S[1]:
         unit = "s"
-        comments = [
-            f"{ASSUMED}{column.name} counts in s from 1970, by a clock that was never set, as it begins "
-            "in 1980; zero"
-        ]
+        comments = [f"{ASSUMED}{column.name}: s from 1970, by a clock that was never set (1980); zero"]
     elif not unit:
         zero = {"zero": UNKNOWN_ZERO}
         unit, why = _stated_unit(column), ""
@@ -805,11 +822,11 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             )
         comments = [
             f"# Stamps begin at {known[0]:g}.",
-            f"{ASSUMED}{column.name} counts in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; "
-            "unit, zero",
+            f"{ASSUMED}{column.name}: in {unit}{why} from {UNKNOWN_ZERO}, as no date is stated; unit, "
+            "zero",
         ]
     elif "gps" in column.plain and unit == "s":
-        comments = [f"{ASSUMED}{column.name} counts from 1970, not from GPS's 1980-01-06; zero"]
+        comments = [f"{ASSUMED}{column.name}: from 1970, not from GPS's 1980-01-06; zero"]
     given = {"column": column.name, "unit": unit, **zero}
     yield TimeMapping.model_validate(given), comments
 

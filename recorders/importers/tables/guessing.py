@@ -35,7 +35,7 @@ from recorders.importers.tables.exports import export_mapping
 from recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
 from recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
 from recorders.importers.tables.guessed_places import prepared_lines, without_codes
-from recorders.importers.tables.guessed_times import GuessedTime, guess_time
+from recorders.importers.tables.guessed_times import GuessedTime, first_cell, guess_time
 
 # How many rows are read.
 _ROWS = 100_000
@@ -183,7 +183,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
         parts = [f"{json.dumps(source)} = {json.dumps(names)}" for source, names in split.items()]
         lines.append(f"split = {{ {', '.join(parts)} }}")
         lines += [
-            f"{ASSUMED}{source} holds {' and '.join(names)} in one cell, in this order; split"
+            f"{ASSUMED}{source}: {' and '.join(names)} in one cell, in this order; split"
             for source, names in split.items()
         ]
     lines += [*time.comments, f"time = {time.text}"]
@@ -260,7 +260,7 @@ def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
         if column.unknown.lower() not in _NO_UNITS:
             unknown.setdefault(column.unknown, []).append(column.name)
     for text, names in unknown.items():
-        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, and is passed over; units"
+        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, so ignored; units"
 
 
 def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
@@ -370,18 +370,17 @@ def _opened(source: Source, decimal: str, split: dict[str, list[str]]) -> tuple[
 
 def _has_commas(cells: pa.Array) -> bool:
     """Tell whether all cells are numbers, and some have a fraction after a comma."""
-    if not pa.types.is_string(cells.type):
+    if not pa.types.is_string(cells.type) or not pc.any(pc.match_substring(cells, ",")).as_py():
         return False
     known = pc.utf8_trim_whitespace(cells).drop_null()
     known = known.filter(pc.not_equal(known, ""))
     numbers = pc.match_substring_regex(known, r"^[-+]?\d*(,\d+)?([eE][-+]?\d+)?$")
-    with_comma = pc.match_substring(known, ",")
-    return bool(pc.all(numbers).as_py() and pc.any(with_comma).as_py())
+    return bool(pc.all(numbers).as_py())
 
 
 def _split(name: str, cells: pa.Array) -> list[str]:
     """Return the names of the numbers that each cell of a column holds; none for a column of others."""
-    if not pa.types.is_string(cells.type):
+    if not pa.types.is_string(cells.type) or not re.search(r"\d[\s,;]+[-+.\d]", first_cell(cells)):
         return []
     is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()
     known = pc.replace_substring_regex(cells.drop_null(), r"(?i)^\s*POINT\s*Z?", "")

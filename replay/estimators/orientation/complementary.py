@@ -230,7 +230,7 @@ def keep(
 
 
 def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
-    """Return the library's estimate of every sample; samples are taken to be evenly spaced.
+    """Return the library's estimate at every stamp; samples are taken to be evenly spaced.
 
     Raises BadInput where the library is not installed.
     """
@@ -239,8 +239,9 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     except ImportError:
         raise BadInput("estimator vqf needs the package vqf: pip install vqf") from None
     samples = streams["inertial"]
-    force, rate, field = (np.ascontiguousarray(samples[name]) for name in FIELDS)
-    time_ns = samples.publish_time_ns
+    is_last = np.diff(samples.publish_time_ns, append=-1) != 0  # of one stamp, which have their mean
+    force, rate, field = (np.ascontiguousarray(samples[name][is_last]) for name in FIELDS)
+    time_ns = samples.publish_time_ns[is_last]
     step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
     if not has_field.any():
         raise BadInput(f"topic {samples.topic}: has no magnetic field; estimator vqf needs one")

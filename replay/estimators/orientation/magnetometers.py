@@ -35,12 +35,17 @@ class _Waiting(NamedTuple):
 
 
 def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator, which takes the fields of a topic beside the unit's where there is one."""
+    """Return the estimator, which takes the fields of a topic beside the unit's where there is one.
+
+    Samples of one stamp have the mean of their forces and turn rates, so that each of them counts.
+    """
 
     def bind(name: str, topics: Mapping[str, Topic], values: Any) -> list[Bound]:
         bound = estimator.bind(name, topics, values)
         units = [each.streams[0] for each in bound]
-        return [_joining(each, _magnetometer(each.streams[0], units, topics)) for each in bound]
+        return [
+            _joining(_averaging(each), _magnetometer(each.streams[0], units, topics)) for each in bound
+        ]
 
     needs = (
         f"{estimator.requirements}, .../magnetic_field ({schemas.MAGNETIC_FIELD.full_name}, optional)"
@@ -56,6 +61,36 @@ def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> s
     if own in there:
         return own
     return there[0] if len(there) == 1 and len(units) == 1 else ""
+
+
+def _averaging(bound: Bound) -> Bound:
+    """Return an estimator of a unit's samples that is given the means of those with one stamp."""
+    unit = bound.streams[0]
+    if isinstance(bound, Batch):
+        solve = bound.solve
+        return replace(bound, solve=lambda given: solve({**given, unit: with_means(given[unit])}))
+    run = bound.run
+
+    def run_means(state: Any, block: Block) -> tuple[Any, list[Ragged]]:
+        return run(state, block._replace(streams={unit: with_means(block.streams[unit])}))
+
+    return replace(bound, run=run_means)
+
+
+def with_means(samples: Ragged) -> Ragged:
+    """Return inertial samples, in the order of time, of which those of one stamp have their mean."""
+    stream, run = samples.stream, run_of_rows(samples.offsets)
+    is_new = (np.diff(stream.publish_time_ns, prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0)
+    if is_new.all():
+        return samples
+    stamp, changed = np.cumsum(is_new) - 1, {}
+    for name in ("specific_force_mps2", "turn_rate_radps"):
+        changed[name] = stream[name].copy()
+        for column in changed[name].T:
+            known = np.isfinite(column)
+            sums = np.bincount(stamp[known], column[known])
+            column[known] = (sums / np.maximum(np.bincount(stamp[known]), 1))[stamp[known]]
+    return Ragged(replace(stream, columns={**stream.columns, **changed}), samples.offsets)
 
 
 def _joining(bound: Bound, magnetometer: str) -> Bound:

@@ -67,3 +67,35 @@ def test_vqf_gives_what_its_package_gives():
     found = replayed("vqf", sigma_deg=2.0)
     np.testing.assert_allclose(found["mean"], expected["quat9D"])
     np.testing.assert_allclose(found["covariance"][0], (np.radians(2.0) ** 2 * np.eye(3)).ravel())
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("label", ["gyro", "bingham-inertial", "madgwick", "mahony", "vqf"])
+def test_both_samples_of_one_stamp_count(label):
+    """A turn of 0.1 rad/s, of which one of two samples says all or nothing: 1 s turns 0.1 rad."""
+    time_s = np.arange(0.0, 1.5, 0.01)
+    turned = 0.1 * np.maximum(time_s - 0.5, 0.0)
+    rate = np.where(time_s < 0.5, 0.0, 0.1)
+
+    def yaw(shares: list[float]) -> float:
+        rates = np.outer(rate, shares).ravel()
+        angle, flat = np.repeat(turned, len(shares)), np.zeros(len(rates))
+        samples = make_stream(
+            "/hand/inertial",
+            schemas.INERTIAL_SAMPLE,
+            SIMULATION_EPOCH_NS + np.repeat(np.rint(1e9 * time_s).astype(np.int64), len(shares)),
+            specific_force_mps2=np.stack([flat, flat, flat + 9.81], axis=1),
+            turn_rate_radps=np.stack([flat, flat, rates], axis=1),
+            magnetic_field_ut=20 * np.stack([np.sin(angle), np.cos(angle), flat - 2], axis=1),
+        )
+        source = memory_source(Recording([samples]), RunMetadata("hand"))
+        settings = {"rest_s": 0.4, "block_s": 0.2} if label in ("gyro", "bingham-inertial") else {}
+        estimates = collect(replay([source], bind(label, [source], settings)))
+        [mean] = [each["mean"] for topic, each in estimates.items() if topic.endswith("/state")]
+        angles = np.unwrap(2 * np.arctan2(mean[:, 3], mean[:, 0]))
+        return float(angles[-1] - angles[0])
+
+    assert yaw([1.0]) == pytest.approx(0.1, abs=2e-3)
+    assert yaw([0.0, 2.0]) == pytest.approx(yaw([1.0]), abs=2e-3)
+    assert yaw([2.0, 0.0]) == pytest.approx(yaw([0.0, 2.0]), abs=1e-9)
+    assert yaw([np.nan, 1.0]) == pytest.approx(yaw([1.0]), abs=2e-3)

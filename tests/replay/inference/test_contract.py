@@ -210,6 +210,9 @@ def test_a_sensor_that_fits_no_topic(registered: dict[str, Model]) -> None:
     assert fit(changed("/landmarks", None))[0].streams == ("/speed",)
     with pytest.raises(BadInput, match=r"vehicle-a comes nearest and lacks /prior .*of x_m, y_m"):
         fit(changed("/prior", None))
+    registered["vehicle-a"] = replace(registered["vehicle-a"], by_name=True)
+    with pytest.raises(BadInput, match=r"is taken only by its name: --model vehicle-a"):
+        fit(SOURCE)
     registered["vehicle-a"] = with_sensor(SPEED, topic="velocity")
     with pytest.raises(BadInput, match=r"does not fit this log: .*vehicle-a"):
         fit(SOURCE)
