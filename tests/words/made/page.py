@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 from pipeline.api.api import record
-from pipeline.exploring import markup
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.session import open_session
 from recorders.errors import BadInput
@@ -20,6 +19,7 @@ def pressed() -> Iterator[str]:
         return
     from bokeh.document import Document
 
+    from pipeline.exploring import markup
     from pipeline.exploring.page import Page
 
     source = record("landmarks", seed=3, duration_s=2.0, landmarks=4)
