@@ -41,6 +41,7 @@ from replay.judging.metrics.measuring import (
 from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors, unjudged_sets
+from replay.judging.sets.regions import regions_of
 from replay.judging.tracks.errors import SOME_ARE_KNOWN
 from replay.judging.tracks.errors import Judged as Targets
 from replay.judging.tracks.evaluation import targets_of, track_blocks, unjudged_tracks
@@ -146,6 +147,8 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
+        for topic, regions in regions_of(outputs, self._truths, self._gap_limit_s).items():
+            self._measured.add(topic, regions)
         self._find_targets(outputs)
         for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
             self._measured.add(topic, tracks)

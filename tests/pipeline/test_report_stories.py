@@ -313,7 +313,7 @@ def test_who_is_best_on_average_alone_is_doubtful() -> None:
     begun = opening(result.model_copy(update={"metrics": metrics}), {})
     assert begun.story.doubts == [
         "that pmbm is best everywhere, as in 1 of 3 cases another one has the least GOSPA (jpda in 1)",
-        "whether differences are chance, as the result keeps no errors of single runs",
+        "whether differences are chance, as the result has no table of the GOSPA of single runs",
         "the covariances of all 3, which nothing here judges",
     ]
 

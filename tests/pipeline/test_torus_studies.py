@@ -3,8 +3,10 @@
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from pipeline.output.report.kinds import run_sentences
 from pipeline.runs.experiment import load_experiment, run_experiment
 from pipeline.studies.sampling.torus import PropagationOptions, propagation_errors
 from recorders.errors import BadInput
@@ -81,6 +83,19 @@ def test_propagation_says_where_the_five_samples_lose(tmp_path):
     assert {claim.verdict for claim in result.claims} == {"not shown"}
     of_all = as_of_all("torus-propagation", vars(result))
     assert [claim.verdict for claim in of_all] == ["refuted", "confirmed"]
+
+
+def test_a_report_compares_by_the_errors_of_single_runs(tmp_path):
+    """It draws them, so that it cannot miss them; a tie is no refutation."""
+    _, experiment = load_experiment("torus-filter", {}, {})
+    cases = {"strong-coupling": experiment.options["cases"]["strong-coupling"]}
+    result = run("torus-filter", tmp_path / "out", {"runs": 8, "options": {"cases": cases}})
+    runs = pd.read_parquet(tmp_path / "out" / "tables" / "runs.parquet")
+    found = np.sqrt((runs[runs["estimator"] == "torus"]["angle_rmse_rad"] ** 2).mean())
+    assert found == pytest.approx(result.metrics["torus.angle_rmse_rad.strong-coupling"])
+    tried, came = run_sentences(result, tmp_path / "out")
+    assert "8 simulated runs" in tried
+    assert came.startswith("A tie so far: 8 runs do not tell torus and ukf apart")
 
 
 def test_torus_filter_is_nearly_as_good_as_a_grid(tmp_path):

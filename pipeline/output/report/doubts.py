@@ -110,7 +110,10 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
     if unclear:
         return [f"who of {named([take, *unclear])} is better, which {runs} do not tell"]
     if len(compared) > 1 and found.by_run(take or compared[0], found.main).empty:
-        return ["whether differences are chance, as the result keeps no errors of single runs"]
+        return [
+            f"whether differences are chance, as the result has no table of the {found.error_name} of "
+            "single runs"
+        ]
     return []
 
 

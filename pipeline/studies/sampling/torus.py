@@ -20,7 +20,7 @@ from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.recorded import Replayed, require_memory
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import rmse_of_runs
+from pipeline.studies.toolkit.repetitions import rmse_of_runs, table_of_runs
 from recorders.errors import BadInput
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
@@ -209,9 +209,7 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
         errors_rad[case] = found
         sources += replayed.sources
     outcome.input_sha256 = hash_streams(sources)
-    outcome.tables["runs"] = pd.concat(
-        [pd.DataFrame({"case": case, **found}) for case, found in errors_rad.items()]
-    )
+    outcome.tables["runs"] = table_of_runs("angle_rmse_rad", errors_rad)
     outcome.figures["errors"] = filter_figure(errors_rad)
     return outcome
 

@@ -18,7 +18,8 @@ from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from replay.judging.errors.evaluation import split_topic
-from replay.judging.sets.evaluation import JudgedSets, frames_of, judge_sets
+from replay.judging.sets.evaluation import JudgedSets, judge_sets
+from replay.judging.sets.regions import rings_of
 
 EXACT, BOX, L4, L8 = "exact", "box", "l4", "l8"
 FIRST_PAIR, SECTION_V = "section-v-first-pair", "section-v"
@@ -134,7 +135,7 @@ def _set_chart(replayed: Replayed, title: str) -> Chart:
     for topic, sets in replayed.outputs.items():
         if topic.endswith("/set"):
             sizes = replayed.outputs[f"{topic.removesuffix('set')}size"]
-            for ring in frames_of(sizes.stream, sets.stream)[0]:
+            for ring in rings_of(sizes.stream, sets.stream)[0]:
                 series.append(path(split_topic(topic)[0], np.append(ring, ring[:1], axis=0)))
     source = replayed.sources[0]
     robot = source.read(["/robot1/truth"])["/robot1/truth"]["state"][:1]

@@ -5,10 +5,11 @@ ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a r
 for its 100 runs can be tried as often.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
@@ -96,6 +97,24 @@ def rmse_of_runs(errors: Errors, runs: int) -> Floats:
     count = np.bincount(errors.run, minlength=runs)
     with np.errstate(invalid="ignore"):
         return np.sqrt(np.bincount(errors.run, squared, runs) / count)
+
+
+def table_of_runs(quantity: str, cases: Mapping[str, Mapping[str, Floats]]) -> pd.DataFrame:
+    """Make the table by which reports compare estimators: a row per estimator, case and run.
+
+    Args:
+        quantity: the name of what is listed, as in the metrics.
+        cases: values (runs,) by case and estimator.
+    """
+    return pd.DataFrame(
+        [
+            (estimator, case, run, value)
+            for case, found in cases.items()
+            for estimator, values in found.items()
+            for run, value in enumerate(values.tolist())
+        ],
+        columns=["estimator", "case", "run", quantity],
+    )
 
 
 def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:

@@ -6,7 +6,7 @@ set at a time are all targets whose truth has the estimate's components and is k
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from replay.judging.errors.frames import not_comparable, seen_in
 from replay.judging.errors.truths import Truths
 from replay.judging.metrics.measuring import Sums, metric_of_sums
 from replay.judging.sets.distances import gospa, ospa
+from replay.judging.sets.regions import Regions
 
 Floats = NDArray[np.float64]
 CUTOFF_M = 10.0
@@ -142,7 +143,12 @@ def _judge_run(
     return rows
 
 
-def _sums(found: SetErrors) -> Sums:
+def _sums(found: SetErrors | Regions) -> Sums:
+    if isinstance(found, Regions):
+        held = int((found.holds & found.known).sum())
+        area_m2 = float(found.area_m2.sum())
+        known = int(found.known.sum())
+        return {"regions": len(found.area_m2), "area": area_m2, "known": known, "held": held}
     return {
         "steps": len(found.run),
         "ospa": float(found.ospa.sum()),
@@ -155,6 +161,12 @@ def _sums(found: SetErrors) -> Sums:
 
 
 def _means(sums: Sums) -> dict[str, float]:
+    if sums.get("regions"):
+        known = sums["known"]
+        return {
+            "area_mean_m2": sums["area"] / sums["regions"],
+            "containment_share": sums["held"] / known if known else np.nan,
+        }
     steps = sums.get("steps")
     if not steps:
         return {}
@@ -170,5 +182,8 @@ def _means(sums: Sums) -> dict[str, float]:
 
 
 SETS = metric_of_sums(
-    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m", SetErrors, _sums, _means
+    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m; area of regions, and what they hold",
+    cast(type[SetErrors | Regions], SetErrors | Regions),
+    _sums,
+    _means,
 )

@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 from recorders.log import Stream, schemas
 from replay.engine.streams.blocks import Ragged, run_of_rows
 from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import Components
-from replay.judging.errors.evaluation import reference, split_topic
+from replay.judging.errors.evaluation import split_topic
 from replay.judging.errors.truths import Truths
-from replay.regions.feasible_sets import excess_rad, signed_area
+from replay.judging.sets.regions import areas_of, inside, places_at, rings_of
+from replay.regions.feasible_sets import excess_rad
 from replay.regions.frames import Known, frames
 
 Floats = NDArray[np.float64]
-
-PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 
 @dataclass(frozen=True)
@@ -51,22 +49,6 @@ class JudgedSets:
         return int((self.known & ~self.in_arena).sum())
 
 
-def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
-    """Return the rings (n, 2) of every frame; none where its set is empty."""
-    ends = np.cumsum(sizes["elements"].astype(np.int64))
-    ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
-    frames = []
-    for first, end in zip(np.append(0, ends)[:-1], ends, strict=True):
-        cuts = np.flatnonzero(np.diff(ring[first:end])) + 1
-        frames.append(np.split(vertex[first:end], cuts) if end > first else [])
-    return frames
-
-
-def areas_of(frames: Sequence[Sequence[Floats]]) -> Floats:
-    """Return the area (n,) inside the rings of every frame; holes run the other way round."""
-    return np.array([abs(sum(map(signed_area, rings))) for rings in frames])
-
-
 def judge_sets(
     outputs: dict[str, Ragged], sources: Sequence[Source], gap_limit_s: float
 ) -> list[JudgedSets]:
@@ -87,33 +69,24 @@ def _judge(
     from matplotlib.path import Path  # which takes long to import
 
     run = run_of_rows(sizes.offsets)
-    topic = sizes.stream.metadata["truth"]
-    truth = [
-        reference(Truths(source), topic, PLACE, sizes.of_run(number), gap_limit_s)
-        for number, source in enumerate(sources)
-    ]
-    places = np.concatenate(truth)
+    places = places_at(sizes, [Truths(source) for source in sources], gap_limit_s)
     in_arena, bound_holds = np.concatenate(
         [
-            premises_hold(sizes.of_run(number), source, truth[number])
+            premises_hold(sizes.of_run(number), source, places[run == number])
             for number, source in enumerate(sources)
         ],
         axis=1,
     )
-    sets_of_frames = frames_of(sizes.stream, sets.stream)
-    inside = np.zeros(len(places), bool)
-    for frame, rings in enumerate(sets_of_frames):
-        for ring in rings:
-            inside[frame] ^= Path(ring, closed=False).contains_point(places[frame])
+    rings = rings_of(sizes.stream, sets.stream)
     estimator, case = split_topic(sizes.stream.topic)
     return JudgedSets(
         estimator,
         case,
         run,
         sizes.stream.publish_time_ns,
-        areas_of(sets_of_frames),
+        areas_of(rings),
         np.asarray(np.isfinite(places).all(axis=1)),
-        inside,
+        inside(rings, places),
         in_arena,
         bound_holds,
         faults,

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from recorders.log import schemas
 from replay.judging.errors.evaluation import Floats
-from replay.judging.sets.evaluation import areas_of, frames_of
+from replay.judging.sets.regions import areas_of, rings_of
 from replay.timeline.drawing.canvas import (
     TRUTH,
     Canvas,
@@ -73,7 +73,7 @@ def draw_sets(
         topic = "/" + entity_path("estimates", estimator, case, "set")
         if topic not in scene.outputs:
             continue
-        frames, colour = frames_of(sizes, scene.outputs[topic]), scene.colour(estimator)
+        frames, colour = rings_of(sizes, scene.outputs[topic]), scene.colour(estimator)
         counts = np.array([len(rings) for rings in frames], np.int64)
         polygons = [ring for rings in frames for ring in rings]
         time_ns = sizes.publish_time_ns

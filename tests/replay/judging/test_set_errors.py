@@ -8,6 +8,7 @@ from recorders.recording import Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.judging.errors.truths import Truths
+from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import measure
 from replay.judging.sets.errors import SETS, set_errors
 
@@ -92,3 +93,32 @@ def test_the_cutoff_is_that_which_is_asked_for():
     for cutoff_m, expected in ((3.0, 3.0), (5.0, 4.0)):
         [found] = set_errors(outputs, [Truths(source)], cutoff_m=cutoff_m).values()
         assert found.gospa[0] == pytest.approx(expected)
+
+
+def test_regions_have_their_area_and_hold_the_truth_or_not() -> None:
+    """A square about the truth, one with a hole there, an empty one, and one of unknown truth."""
+    square = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)])
+    hole = 0.5 + 0.5 * square[::-1]
+    stamps = SECOND * np.arange(4)
+    plane = {"components": "x_m,y_m", "kinds": "linear,linear", "truth": "/robot/truth"}
+    rings = np.concatenate([square, square, hole, square])
+    region = make_stream(
+        "/estimates/e/robot/set",
+        schemas.SET_ESTIMATE,
+        stamps[[0] * 4 + [1] * 8 + [3] * 4],
+        metadata=plane,
+        ring_id=[0] * 8 + [1] * 4 + [0] * 4,
+        vertex=rings,
+    )
+    size = make_stream(
+        "/estimates/e/robot/size", schemas.ESTIMATE_SIZE, stamps, metadata=plane, elements=[4, 8, 0, 4]
+    )
+    truth = make_stream(
+        "/robot/truth", schemas.TRUTH_STATE, stamps[:3], metadata=plane, state=np.full((3, 2), 1.2)
+    )
+    source = memory_source(Recording([truth]), RunMetadata("test"))
+    judge = Judge([source], gap_limit_s=2.0)
+    judge.add({stream.topic: gather([stream]) for stream in (region, size)})
+    assert judge.metrics == pytest.approx(
+        {"e.area_mean_m2.robot": (4.0 + 3.0 + 0.0 + 4.0) / 4, "e.containment_share.robot": 1 / 3}
+    )

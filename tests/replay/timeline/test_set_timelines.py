@@ -9,7 +9,7 @@ from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import memory_source
 from replay.judging.judge import Judge
-from replay.judging.sets.evaluation import areas_of, frames_of
+from replay.judging.sets.regions import areas_of, rings_of
 from replay.timeline.families.networks import ARRIVED, LOST
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read, told
@@ -89,7 +89,7 @@ def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
     _, outputs, found = drawn("relative-bearings", parameters, names, tmp_path)
     for name in names:
         sizes, sets = (outputs[f"/estimates/{name}/robot1/{leaf}"].stream for leaf in ("size", "set"))
-        frames = frames_of(sizes, sets)
+        frames = rings_of(sizes, sets)
         assert any(not rings for rings in frames)
         strips = [
             strip
