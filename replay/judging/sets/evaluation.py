@@ -66,8 +66,6 @@ def judge_sets(
 def _judge(
     sizes: Ragged, sets: Ragged, faults: int, sources: Sequence[Source], gap_limit_s: float
 ) -> JudgedSets:
-    from matplotlib.path import Path  # which takes long to import
-
     run = run_of_rows(sizes.offsets)
     places = places_at(sizes, [Truths(source) for source in sources], gap_limit_s)
     in_arena, bound_holds = np.concatenate(
