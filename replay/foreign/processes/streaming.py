@@ -11,8 +11,8 @@ little-endian. The program begins with its description, and answers every frame 
     R  program: number u32 of the frame that it answers, status i32, flags u8; mean and covariance with
        flag 1; innovation and its covariance with flag 2, and 4 where a gate kept it out
 
-A status from 1 on counts in the description's failures. The end of standard input is the end; an answer
-that nobody asked for is an error.
+A status from 1 on counts in the description's failures; one below zero, and other flags, are errors. The
+end of standard input is the end; an answer that nobody asked for is an error.
 """
 
 import queue
