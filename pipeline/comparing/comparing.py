@@ -104,7 +104,8 @@ class Differences:
 
         Each has its whole interval beyond the margin.
 
-        Raises BadInput where none of them has enough runs, since there is nothing to judge by.
+        Raises BadInput where none of them has enough runs, or a candidate that is not worse in another
+        one lacks one that the first has, since there is nothing to judge by.
         """
         judged = [each for each in self.paired if _is_judged(each.quantity)]
         runs = max((each.found.runs for each in judged), default=0)
@@ -113,7 +114,18 @@ class Differences:
                 f"{runs_of(runs)} cannot show that a side is worse, since an interval takes "
                 f"{FEWEST_RUNS}; give more runs, or leave out --fail-if-worse"
             )
-        return [each for each in judged if each.found.verdict == "worse" and not each.is_withheld]
+        worse = [each for each in judged if each.found.verdict == "worse" and not each.is_withheld]
+        failing = {each.second for each in worse}
+        for first, *others in self.groups:
+            for second in others:
+                lacking = sorted(_judged_by(first) - _judged_by(second))
+                if lacking and second.name not in failing:
+                    raise BadInput(
+                        f"{second.name}: has no {', '.join(lacking)}, which {first.name} has, so that "
+                        "nothing shows whether it is worse; let it give the same components and "
+                        "innovations, or leave out --fail-if-worse"
+                    )
+        return worse
 
     def __repr__(self) -> str:
         return "\n".join([*self.notes, *self.sentences])
@@ -205,6 +217,12 @@ class Differences:
 def _is_judged(key: str) -> bool:
     is_of_group = words.quantity(key).group == words.CONSISTENCY
     return is_of_group or words.is_error(key) or key == "failed_runs"
+
+
+def _judged_by(candidate: Candidate) -> set[str]:
+    """List the metrics by which a candidate is judged; those that count what is bad may be absent."""
+    known = candidate.rows.dropna(subset=["value"])["quantity"]
+    return {key for key in known if _is_judged(key) and not key.startswith("estimates_without")}
 
 
 def _target_text(target: Target) -> str:

@@ -53,7 +53,11 @@ def inputs_of(
     kinds = [kind_of(path, named, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):
-        raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
+        other = next(path for path, kind in zip(paths, kinds, strict=True) if kind != "log")
+        raise BadInput(
+            f"{logs[0]}: is a log without estimates; make them with fuselog replay, or leave out "
+            f"{other}, which is no log to replay"
+        )
     if logs:
         if not estimators:
             raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")

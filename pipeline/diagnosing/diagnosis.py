@@ -259,11 +259,7 @@ def diagnose(
         notes += [note] if note else []
         sought = seek(part, label, opened, MOST_SENTENCES)
     if not np.isfinite(sought.log_likelihood):
-        mend = for_likelihood(settings)
-        notes.append(
-            f"{label} states no likelihood of its innovations: faults are named by unusual "
-            f"measurements alone{'; ' if mend else ''}{mend}"
-        )
+        notes.append(_without_likelihood(label, settings, innovations))
     named, beside = name_of(label, {"kind": label, **settings})
     trying = Trying(shlex.quote(named), alterations_of(source), "kind" in beside, gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
@@ -294,6 +290,19 @@ def diagnose(
         least_gain(len(sought.tried)),
         [*notes, *no_judges.values(), *notes_of(done, sentences, sought.in_doubt)],
         sought.log_likelihood,
+    )
+
+
+def _without_likelihood(label: str, settings: Mapping[str, Any], innovations: Outputs) -> str:
+    """Say why no fault is tried."""
+    if innovations.state("log_likelihood") and any(
+        np.isneginf(each["log_likelihood"]).any() for each in innovations.values()
+    ):
+        return f"{label} diverged: its log-likelihood is -inf, so that no fault was tried"
+    mend = for_likelihood(settings)
+    return (
+        f"{label} states no likelihood of its innovations: faults are named by unusual measurements "
+        f"alone{'; ' if mend else ''}{mend}"
     )
 
 

@@ -291,8 +291,13 @@ class Objective:
                 )
             parts = self._parts(start, run)
             count = max(map(self._count, parts))
-            cost = self._cost([self._total(parts, run, count)])
-            if not np.isfinite(cost):
+            total = self._total(parts, run, count)
+            if self.by == "likelihood" and total and -np.inf in total.values():
+                raise BadInput(
+                    f"{run.name}: {self.label} diverges at the values that the search starts from: its "
+                    "log-likelihood is -inf; give others with --set"
+                )
+            if not np.isfinite(self._cost([total])):
                 mend = for_likelihood(self.settings) if self.by == "likelihood" else ""
                 raise BadInput(
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,6 +94,27 @@ def test_a_worse_candidate_fails_a_build(logs: list[Path], fuselog: Fuselog, tmp
     said = fuselog("compare", *logs[:4], "-e", "ekf", "-e", "tight", *build)
     assert said.code == 2
     assert "4 runs cannot show that a side is worse" in said.err
+
+
+def test_a_candidate_that_cannot_be_judged_is_no_success(logs: list[Path]) -> None:
+    """It lacks what the first is judged by, and nothing else shows that it is worse."""
+    found = fl.compare(*logs, estimators=["ekf", "ukf"])
+    [[first, second]] = found.groups
+    assert not found.worse()
+    mute = replace(second, rows=second.rows[second.rows["quantity"] != "nees"])
+    with pytest.raises(fl.BadInput, match=r"ukf: has no nees, which ekf has, so that nothing shows"):
+        replace(found, groups=[[first, mute]]).worse()
+    assert not replace(found, groups=[[mute, first]]).worse()
+
+
+def test_a_folder_with_something_else_among_its_logs_is_named(
+    logs: list[Path], fuselog: Fuselog, tmp_path: Path
+) -> None:
+    shutil.copy(logs[0], tmp_path / "run.mcap")
+    (tmp_path / "broken.mcap").write_text("no log")
+    said = fuselog("compare", tmp_path, "-e", "ekf", "-e", "ukf")
+    assert said.code == 2
+    assert "broken.mcap" in said.err
 
 
 @pytest.mark.paper

@@ -200,7 +200,7 @@ class Outputs:
         return made
 
     def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
-        rows = np.flatnonzero(np.isfinite(results.squared))
+        rows = np.flatnonzero(~np.isnan(results.squared))
         accepted, squared = results.accepted[rows], results.squared[rows]
         innovation, covariance = results.innovation[rows], results.innovation_covariance[rows]
         likelihood = np.where(accepted, log_likelihood(squared, innovation, covariance), 0.0)

@@ -24,7 +24,7 @@ from replay.inference.linear_algebra.gaussian import (
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, fault_of, filled
 
 # What fails whatever the filter is; a status s of the filter's own counts on from there.
-NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, OWN = 5, 6, 7, 7
+NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8
 NOBODY = -1  # calls for no estimate
 FAILURES = {
     0: "a variance of the filter's covariance is negative",
@@ -32,6 +32,7 @@ FAILURES = {
     NOT_CREATED: "fuselog_filter_create returned NULL",
     NOT_COPIED: "fuselog_filter_copy returned NULL",
     INNOVATION_UNSOUND: "the covariance of the filter's innovation is not positive definite",
+    UNDEFINED: "the filter returned a number below zero that fuselog_filter.h does not define",
 }
 
 
@@ -115,20 +116,27 @@ def advance(
             carried.time_ns[run] = time_ns
 
 
+def outcome(status: int) -> int:
+    """Return WELL or what failed, of what a function of the filter returned."""
+    if status < REJECTED:
+        return -10 - UNDEFINED
+    return max(status, WELL)
+
+
 def begin(run: int, addresses: Addresses, static: Static, time_ns: int, carried: Filters) -> int:
     """Have the filter take what is static, and start; returns WELL or what failed."""
     handle = carried.handle[run]
     for row in range(static.offsets[run], static.offsets[run + 1]):
         status = TAKE(addresses.take, handle, static.source[row], static.time_ns[row], static.data[row])
-        if status > 0:
-            return status
+        if outcome(status) != WELL:
+            return outcome(status)
     if carried.has_prior[run] == 0:
         carried.time_ns[run] = time_ns
         status = START(addresses.start, handle, time_ns, 0, 0)
     else:
         start_ns = carried.time_ns[run]
         status = START(addresses.start, handle, start_ns, carried.mean[run], carried.covariance[run])
-    return max(status, WELL)
+    return outcome(status)
 
 
 def take(
@@ -143,16 +151,16 @@ def take(
     """Have the filter take a message, and note its innovation; returns WELL or what failed."""
     handle, time_ns = carried.handle[run], events.time_ns[event]
     if events.source[event] < 0:
-        return max(PREDICT(addresses.predict, handle, time_ns), WELL)
+        return outcome(PREDICT(addresses.predict, handle, time_ns))
     status = TAKE(addresses.take, handle, events.source[event], time_ns, events.data[event])
-    if status > 0 or addresses.innovation == 0:
-        return max(status, WELL)
+    if outcome(status) != WELL or addresses.innovation == 0:
+        return outcome(status)
     given, kept = work
     for i in range(len(given.difference)):
         given.difference[i] = np.nan
     status = INNOVATION(addresses.innovation, handle, given.difference, given.covariance)
-    if status > 0 or status == NOTHING:
-        return max(status, WELL)
+    if outcome(status) != WELL or status == NOTHING:
+        return outcome(status)
     row = innovations.end[run]
     for i in range(len(given.difference)):
         kept.difference[i] = given.difference[i]
@@ -182,8 +190,8 @@ def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made
     estimates, events = made.estimates, given.events
     row, state = estimates.end[run], given.addresses.state
     status = STATE(state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
-    if status > 0 or status == NOTHING:
-        return max(status, WELL)
+    if outcome(status) != WELL or status == NOTHING:
+        return outcome(status)
     fault = fault_of(estimates.mean[row], estimates.covariance[row])
     if fault != ALL_WELL:
         return -10 - fault

@@ -15,7 +15,7 @@
 #define FUSELOG_FILTER_VERSION 1
 
 /* What functions return. A number from 1 on is a failure: it counts in `failures` of the description, and
- * ends the run with that sentence. */
+ * ends the run with that sentence. A number below zero that is not one of these ends it, too. */
 #define FUSELOG_FILTER_WELL 0
 #define FUSELOG_FILTER_NOTHING (-1)  /* there is none now: no estimate, no innovation */
 #define FUSELOG_FILTER_REJECTED (-2) /* of an innovation: a gate kept the measurement out */

@@ -84,10 +84,17 @@ def end(process: "subprocess.Popen[bytes]") -> None:
         with suppress(psutil.Error):
             kill_family(psutil.Process(process.pid))
         process.wait()
-    for stream in (process.stdin, process.stdout, process.stderr):
-        if stream is not None:
-            with suppress(OSError):
-                stream.close()
+
+    def close() -> None:
+        for stream in (process.stdin, process.stdout, process.stderr):
+            if stream is not None:
+                with suppress(OSError):
+                    stream.close()
+
+    # what it started before it ended by itself may hold its output open, which nobody waits for
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    closing.join(LOOKS_S)
 
 
 def how_ended(code: int) -> str:

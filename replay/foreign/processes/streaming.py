@@ -11,8 +11,8 @@ little-endian. The program begins with its description, and answers every frame 
     R  program: number u32 of the frame that it answers, status i32, flags u8; mean and covariance with
        flag 1; innovation and its covariance with flag 2, and 4 where a gate kept it out
 
-A status from 1 on counts in the description's failures. The end of standard input is the end; an answer
-that nobody asked for is an error.
+A status from 1 on counts in the description's failures; one below zero, and other flags, are errors. The
+end of standard input is the end; an answer that nobody asked for is an error.
 """
 
 import queue
@@ -135,7 +135,8 @@ def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Descrip
     try:
         found = read_description(stream.next(b"D"), where)
     except Ended as ended:
-        raise BadInput(f"{where}: the program {ended}, before it gave its description") from None
+        why = str(ended).rstrip(",")
+        raise BadInput(f"{where}: the program {why}, before it gave its description") from None
     finally:
         stream.end()
     if found.protocol != PROTOCOL:
@@ -236,6 +237,10 @@ def _reply(
     if len(body) != wanted:
         sizes = f"{1 + len(body)} bytes with flags {flags}, where {1 + wanted} were due,"
         raise Ended(f"sent a reply of {sizes}")
+    if status < 0 or flags > ESTIMATE | INNOVATION | REJECTED:
+        raise Ended(
+            f"answered with status {status} and flags {flags}, which this protocol does not have,"
+        )
     if status > 0:
         raise _Failed(reason_of_code(OWN + status, description))
     numbers = np.frombuffer(body, "<f8", offset=_REPLY.size)

@@ -22,7 +22,7 @@
     "  \"exclusiveMinimum\": 0, \"maximum\": 10}}, \"failures\": [\"it was told to fail\"]}"
 #endif
 
-enum { CRASH = -1, LOOP = -2, LEAK = -3, PRINT = -4, NOT_A_NUMBER = -5, NEGATIVE = -6, FAIL = -7, LEAVE = -8 };
+enum { UNDEFINED = -9, LEAVE, FAIL, NEGATIVE, NOT_A_NUMBER, PRINT, LEAK, LOOP, CRASH };
 
 typedef struct {
     double mean, variance, innovation, spread;
@@ -80,6 +80,8 @@ int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns, const 
         return FUSELOG_FILTER_WELL;
     case FAIL:
         return 1;
+    case UNDEFINED:
+        return -22; /* as -EINVAL */
     case LEAVE:
         exit(3);
     }

@@ -6,7 +6,7 @@ import struct
 import sys
 import time
 
-HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP = range(-1, -9, -1)
+HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP, STATUS, FLAG = range(-1, -11, -1)
 DESCRIPTION = {
     "summary": "does as it is told",
     "topics": [{"topic": "/range", "fields": ["range_m"]}],
@@ -37,7 +37,7 @@ while head := sys.stdin.buffer.read(4):
             sys.exit("no more")
         if value == MUTE:
             time.sleep(60)
-        status, flags = int(value == FAIL), wanted
+        status, flags = int(value == FAIL) - int(value == STATUS), wanted | 8 * (value == FLAG)
         numbers = struct.pack("<dd", value, 0.1)[: 8 if value == OTHER_SIZE else 16] if wanted else b""
         if value == SKIP:
             continue

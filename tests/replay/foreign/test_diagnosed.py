@@ -218,6 +218,19 @@ def test_a_parameter_of_a_recursion_has_another_value(log: str) -> None:
     assert cause["low"] < -3.0 < cause["high"]
 
 
+def test_a_filter_that_diverged_is_not_told_to_give_innovations(log: str) -> None:
+    def diverging(run: int, settings: Any, messages: Any, state: Any, results: fl.Results) -> None:
+        follow(run, settings, messages, state, results)
+        results.squared[-1] = np.inf
+
+    given = {"mine": recursion(follow=diverging, compiled=False)}
+    with pytest.raises(fl.BadInput, match="mine diverges at the values that the search starts from"):
+        fl.tune(log, given, "drift_density")
+    assert any(
+        "mine diverged: its log-likelihood is -inf" in each for each in fl.diagnose(log, given).notes
+    )
+
+
 @pytest.mark.parametrize("field", ["squared", "innovation_covariance"])
 def test_without_a_likelihood_it_is_said_what_to_fill(log: str, field: str) -> None:
     def lacking(run: int, settings: Any, messages: Any, state: Any, results: fl.Results) -> None:

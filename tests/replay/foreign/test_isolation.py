@@ -14,7 +14,8 @@ from replay.engine.streams.sources import MemorySource, memory_source
 from replay.foreign.processes.isolation import Ended, Workers
 from tests.replay.foreign.conftest import MISBEHAVING, Compile
 
-CRASH, LOOP, LEAK, PRINT, NOT_A_NUMBER, NEGATIVE, FAIL, LEAVE = (float(-each) for each in range(1, 9))
+COMMANDS = (float(-each) for each in range(1, 10))
+CRASH, LOOP, LEAK, PRINT, NOT_A_NUMBER, NEGATIVE, FAIL, LEAVE, UNDEFINED = COMMANDS
 MESSAGES, AT = 600, 499
 SANE = 1.0
 LIMITS = {"time_limit_s": 4.0, "memory_limit_mb": 400}
@@ -29,6 +30,7 @@ RUNS = {
     NOT_A_NUMBER: "the filter's estimate or covariance is not finite",
     NEGATIVE: "a variance of the filter's covariance is negative",
     FAIL: "it was told to fail",
+    UNDEFINED: "returned a number below zero that fuselog_filter.h does not define",
 }
 
 
@@ -63,11 +65,11 @@ def test_a_run_ends_with_its_filter_and_the_others_go_on(compile_filter: Compile
 def test_failures_in_this_process(compile_filter: Compile) -> None:
     """Those that leave the process as it is are told alike."""
     mine = {"kind": "lib", "path": str(compile_filter(MISBEHAVING)), "in_process": True}
-    commands = [SANE, NOT_A_NUMBER, NEGATIVE, FAIL]
+    commands = [SANE, NOT_A_NUMBER, NEGATIVE, FAIL, UNDEFINED]
     done = fl.replay([run_with(each) for each in commands], {"mine": mine})
     for command, estimates in zip(commands, done.estimates, strict=True):
         assert len(estimates["/estimates/mine/failure"]) == bool(RUNS[command])
-        assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 3)
+        assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 4)
 
 
 @pytest.mark.unix

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import time
 from dataclasses import replace
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -27,8 +28,8 @@ from replay.foreign.processes.process import Program
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 
-HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP = range(-1, -9, -1)  # as in the program
-PROGRAM = Path(__file__).with_name("program.py")
+HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL, TWICE, SKIP, STATUS, FLAG = range(-1, -11, -1)
+PROGRAM = Path(__file__).with_name("program.py")  # which has the same commands
 RUNS = {
     SANE: "",
     HALF: "the filter ended within a frame at message 500 (/range)",
@@ -39,6 +40,8 @@ RUNS = {
     FAIL: "it was told to fail",
     TWICE: "answered frame 500 where 501 was due",
     SKIP: "answered frame 501 where 500 was due",
+    STATUS: "answered with status -1 and flags 1, which this protocol does not have",
+    FLAG: "answered with status 0 and flags 9, which this protocol does not have",
 }
 
 
@@ -70,6 +73,17 @@ def test_an_answer_too_many_at_the_end_is_an_error() -> None:
         memory_source(Recording(list(whole.values())), log.run), {"mine": program(python(PROGRAM))}
     )
     assert ["one answer more" in each for each in done.failures] == [True]
+
+
+def test_nobody_waits_for_what_a_program_leaves_behind(tmp_path: Path) -> None:
+    """A child that it started holds its output open, after the program has ended."""
+    leaving = tmp_path / "leaving.py"
+    child = "import subprocess\nsubprocess.Popen(['sleep', '20'])\n"
+    leaving.write_text(PROGRAM.read_text() + child)
+    began = time.monotonic()
+    done = fl.replay(run_with(SANE), {"mine": program(python(leaving))})
+    assert not done.failures
+    assert time.monotonic() - began < 15.0
 
 
 @pytest.mark.usefixtures("nothing_left")
