@@ -646,8 +646,10 @@ def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "smaller"),
     [
+        ("relative-bearings", ["--runs", "2"]),
         ("los-two-sensors", ["--runs", "2", "--set", "passes=1"]),
         ("navigation-simulated", ["--runs", "1", "--set", "duration_s=12"]),
+        ("set-filter", ["--runs", "1", "--set", "duration_s=3"]),
         ("vehicles-ctm4", ["--runs", "1", "--set", "duration_s=3", "--set", "options.few_runs=0"]),
         ("vehicles-cv", ["--runs", "1", "--set", "duration_s=3"]),
         ("warehouse-uwb", ["--runs", "1", "--set", "duration_s=5"]),
