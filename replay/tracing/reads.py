@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from functools import lru_cache
 from types import CellType, CodeType, FunctionType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,13 @@ _PURE = {
 }
 _ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
 _ABSENT = object()
+Made = TypeVar("Made")
+
+
+def pure(kind: type[Made]) -> type[Made]:
+    """Declare that what a class makes follows from its arguments alone."""
+    _PURE[id(kind)] = kind
+    return kind
 
 
 class Reads(NamedTuple):

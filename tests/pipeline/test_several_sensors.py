@@ -17,8 +17,13 @@ from recorders.errors import BadInput
 from recorders.log.streams import empty_stream
 from recorders.parameters import parse_settings
 from replay.distributions import chi2
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.ensembles import Ensemble
 from replay.inference.estimators import registered_models
 from replay.inference.model.own_parameters import read_by
+from replay.inference.run import events
+from replay.tracing import functions
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -100,6 +105,30 @@ def test_each_topic_has_its_own_parameters(drive: fl.MemorySource) -> None:
     same = {**one, "/gps2/fix.lever_x_m": -0.5}
     found = fl.replay(drive, "ekf", set=same).innovations
     assert nis_of(drive, "/gps2/fix", found)[0] < 3.0
+
+
+def test_other_values_are_replayed_with_the_same_trace_and_tables(
+    drive: fl.MemorySource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `tune` replays a log hundreds of times; a sigma of fixes that state none is in the tables."""
+    fix = drive.streams[FIXES[0]]
+    unstated = replace(fix, columns={**fix.columns, "covariance_m2": np.full((len(fix), 4), np.nan)})
+    source = replace(drive, streams={**drive.streams, FIXES[0]: unstated})
+    moved, unsure = {f"{FIXES[1]}.lever_x_m": 0.5}, {"sigma_fix_m": 1.0}
+
+    def end(ensemble: Ensemble[fl.MemorySource], values: dict[str, float]) -> list[float]:
+        settings = {"topics": {"fix": list(FIXES)}, "sigma_fix_m": 0.1, **OPEN, **values}
+        outputs = collect(replay(ensemble, bind("ekf", ensemble, settings)))
+        last: list[float] = outputs["/estimates/ekf/robot1/pose"]["mean"][-1].tolist()
+        return last
+
+    expected = [end(Ensemble([source]), values) for values in ({}, moved, unsure)]
+    assert len({*map(tuple, expected)}) == 3
+    ensemble = Ensemble([source])
+    assert [end(ensemble, values) for values in ({}, unsure)] == [expected[0], expected[2]]
+    monkeypatch.setattr(functions, "trace", None)
+    monkeypatch.setattr(events, "filter_events", None)
+    assert [end(ensemble, values) for values in (moved, {})] == [expected[1], expected[0]]
 
 
 @pytest.mark.paper

@@ -21,6 +21,7 @@ from replay.inference.model.model import Model, Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.validation import trial_state
+from replay.tracing.reads import pure
 
 Tables = Mapping[str, Mapping[str, Any]]
 
@@ -177,22 +178,27 @@ def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
     )
 
 
+@pure
 class _Own:
     """Reads parameters, in place of some those of a topic."""
 
-    def __init__(self, parameters: Any, fields: Mapping[str, str]) -> None:
-        self._parameters, self._fields = parameters, fields
+    def __init__(self, parameters: Any, fields: tuple[tuple[str, str], ...]) -> None:
+        self._parameters, self._fields = parameters, dict(fields)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._parameters, self._fields.get(name, name))
 
 
 def _reading(function: Function, place: int, fields: Mapping[str, str]) -> Function:
-    """Make a function whose parameters, at a place of its arguments, are the topic's own."""
+    """Make a function whose parameters, at a place of its arguments, are the topic's own.
+
+    It is seen to do the same again where the given one is; see `replay.tracing.reads`.
+    """
+    pairs = tuple(fields.items())
 
     def read(*arguments: Any) -> Any:
         given = list(arguments)
-        given[place] = _Own(given[place], fields)
+        given[place] = _Own(given[place], pairs)
         return function(*given)
 
     return read

@@ -91,8 +91,12 @@ def events_of(
     drives = () if found.control is None else (found.control.name,)
     read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
     origins = None if context.origins is None else context.origins.tobytes()
-    noise = settings.tobytes() if any(sensor.covariance for sensor in stage.sensors) else b""
-    key = stage, drives, *read, *context.points.values(), origins, noise
+    noise = [
+        _own_variances(stage, number, settings).tobytes()
+        for number, sensor in enumerate(stage.sensors)
+        if sensor.covariance
+    ]
+    key = stage, drives, *read, *context.points.values(), origins, *noise
     return block.once(key, lambda: filter_events(stage, found, block, context, settings))
 
 
@@ -218,7 +222,6 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     Raises BadInput where a field has another width than the model declares.
     """
     sensor, (width, _) = stage.sensors[number], data_columns(stage)
-    parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
     m = len(sensor.measured)
     if ragged.stream.schema.full_name == GEODETIC:
         assert context.origins is not None
@@ -228,7 +231,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     without_covariance = np.zeros(len(stream), bool)
     if sensor.covariance:
         value, spread, without_covariance = with_covariance(sensor, ragged)
-        variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
+        variances = _own_variances(stage, number, settings)
         if np.isfinite(variances).all():
             spread[without_covariance], without_covariance = (
                 np.diag(variances),
@@ -259,6 +262,13 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
         parts.append(np.full((len(stream), width - filled), np.nan))
     data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
     return Table(np.ascontiguousarray(data), source, target, without_covariance)
+
+
+def _own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
+    """Compute the variances that a sensor gives messages without a covariance; NaN where it has none."""
+    sensor = stage.sensors[number]
+    parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
+    return np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
 
 
 def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
