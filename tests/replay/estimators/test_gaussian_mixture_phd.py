@@ -103,7 +103,7 @@ def test_merging_keeps_weight_and_moments():
 
 
 def test_a_sensor_states_its_noise_as_sigma_or_variance_to_every_estimator() -> None:
-    """The log of one page serves all of its estimators; the old name of the setting is still accepted."""
+    """One log serves all of its estimators; the old name of the setting is still accepted."""
     by_sigma = {**STATED, "sigma_m": str(0.5**0.5)}
     del by_sigma["variance_m2"]
     for stated in (STATED, by_sigma):
