@@ -15,7 +15,14 @@ from pipeline.logs.folders import logs_in
 from pipeline.output.alarming import alarms_of
 from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
-from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files
+from pipeline.output.outputs import (
+    ESTIMATES,
+    PICTURE,
+    TIMELINE,
+    check_files,
+    replaced,
+    run_written,
+)
 from pipeline.output.results import (
     in_order,
     plain,
@@ -78,6 +85,7 @@ def replay_logs(
     given = [settings_file] if settings_file else []
     inputs = {"log": logs, "start": [Path(origin) for origin in origins], "settings": given}
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
+    before = {path: run_written(path) for path in paths}
     alterations, own = split_texts(settings)
     estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
     plan = plan_replay(
@@ -99,6 +107,9 @@ def replay_logs(
         companions=companions_if(foxglove),
         progress=progress,
     )
+    for path, run in before.items():
+        if run is not None and (sentence := replaced(path, run, run_written(path))):
+            warn(sentence)
     _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)

@@ -44,7 +44,8 @@ def record(
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
     from pipeline.command_line.commands import companions_if
-    from pipeline.output.outputs import RECORDED, check_files
+    from pipeline.output.outputs import RECORDED, check_files, replaced, run_written
+    from pipeline.output.terminal import warn
     from pipeline.runs.inputs import load_scenario
     from recorders.log import open_log, write_log
     from recorders.parameters import merge, parse_settings
@@ -64,10 +65,13 @@ def record(
     values = merge(values, parse_settings(settings))
     path = out or Path(f"{label}.mcap")
     check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
+    before = run_written(path)
     recording, metadata = record_run(name, values, seed or 0, run or 0)
     beside = companions_if(foxglove)
     write_log(path, recording.streams, metadata, compression=compression, companions=beside)
     say_written(path, sum(map(len, recording.streams)))
+    if sentence := replaced(path, before, open_log(path).run):
+        warn(sentence)
 
 
 @command(

@@ -37,14 +37,29 @@ def alarms_of(
         parameters: of the estimators by label, as far as they are known.
         coverage: what became of the measurements.
     """
+    uninformed = [*_of_components(judge)]
+    explained = {(each.estimator, each.case) for each in uninformed}
+    inconsistent = [*_of_innovations(judge, parameters), *_of_errors(judge)]
     found = [
-        *_of_innovations(judge, parameters),
-        *_of_errors(judge),
+        *uninformed,
+        *(each for each in inconsistent if (each.estimator, each.case) not in explained),
         *_of_costs(judge),
         *_of_digits(judge),
         *_of_measurements(coverage),
     ]
     return [*sorted(found, key=lambda each: -each.excess), *_of_gates(judge, parameters)]
+
+
+def _of_components(judge: Judge) -> Iterator[Alarm]:
+    """Find components that an estimator cannot estimate, for no measurement informs it of them."""
+    for (estimator, case), names in judge.uninformed.items():
+        them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
+        words = (
+            f"{_name(estimator, case)}: {', '.join(names)} {keep} start and prior uncertainty: no "
+            f"measurement informs this method of {them}; take another one that fits the log, by fuselog "
+            "info LOG"
+        )
+        yield Alarm("uninformed", estimator, case, LARGEST, words)
 
 
 def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
@@ -94,6 +109,12 @@ def _of_errors(judge: Judge) -> Iterator[Alarm]:
                 yield _of_constant(estimator, case, constants[what])
             elif key == of_state:
                 words = f"{_name(*what)}: NEES is {nees:.3g}, {_expected(nees, low, high)}"
+                if (lacking := judge.unestimated.get(what)) and nees > high:
+                    more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+                    words += (
+                        f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "
+                        "can, the setting estimate adds them to the state"
+                    )
                 if any(split_topic(each)[0] == estimator for each in judge.innovations):
                     words += f"; fuselog diagnose LOG -e {estimator} says why"
                 yield Alarm("errors", estimator, case, _beyond(nees, low, high), words)

@@ -7,7 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-Kind = Literal["innovations", "errors", "origin", "lever arm", "minimum", "digits", "unused", "gates"]
+Kind = Literal[
+    "innovations",
+    "errors",
+    "uninformed",
+    "origin",
+    "lever arm",
+    "minimum",
+    "digits",
+    "unused",
+    "gates",
+]
 
 
 @dataclass(frozen=True)

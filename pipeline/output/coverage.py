@@ -33,6 +33,7 @@ from replay.judging.errors.truths import Doubt
 if TYPE_CHECKING:
     import pandas as pd
 
+MOST_TOPICS = 3  # that one sentence names
 COLUMNS = [*Row._fields]
 # An estimates log's note on the span and the clock of its replay, unless it is all by publish time.
 REPLAYED = "replayed"
@@ -271,9 +272,31 @@ def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:
-    """Say what was not used; that an estimator takes no measurements at all is its nature."""
+    """Report what was not used: topics that an estimator does not take in one sentence.
+
+    That an estimator takes no measurements at all is its nature, and not reported.
+    """
     measuring = {
         row.estimator for row in rows if row.used is not None and not row.why.startswith(UNTAKEN)
     }
-    shown = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
-    return list(dict.fromkeys(row.sentence for row in shown if row.sentence))
+    untaken: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.why == UNTAKEN and row.sentence and row.estimator in measuring:
+            untaken.setdefault(row.estimator, []).append(row)
+    found: dict[str, None] = {}
+    for row in rows:
+        if row.why != UNTAKEN:
+            found[row.sentence] = None
+        elif row.estimator in untaken:
+            found[_of_untaken(untaken[row.estimator])] = None
+    return [sentence for sentence in found if sentence]
+
+
+def _of_untaken(rows: Sequence[Row]) -> str:
+    """Name the topics that one estimator does not take, the first of many."""
+    if len(rows) == 1:
+        return rows[0].sentence
+    topics = [row.topic for row in rows]
+    more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
+    named = ", ".join(topics[:MOST_TOPICS])
+    return f"{rows[0].estimator}: {len(topics)} topics not used: it does not take {named}{more}"

@@ -5,18 +5,22 @@ An output is never an input, another output or a symbolic link, by whatever name
 judged is the place that will be written.
 """
 
+import json
 import os
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from textwrap import shorten
+from typing import Any, NamedTuple
 
 from pipeline.output.results import RESULT_FILE, read_result, require_ours
 from recorders.atomic import settled
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
+from recorders.parsing import parse_json
 
+MOST_SETTINGS = 3  # that one sentence names
 # The notes of a log's run that tell how it was cut, merged or relabelled, and which command did so last.
 CHANGES, CHANGED_BY = "changes", "changed by"
 
@@ -103,6 +107,36 @@ def _identity(path: Path) -> Hashable:
     except OSError:
         return os.path.realpath(path.parent), path.name
     return state.st_dev, state.st_ino
+
+
+def run_written(path: Path) -> RunMetadata | None:
+    """Return the run of a log that is there already, if fuselog wrote it."""
+    return _run_of(path) if path.is_file() else None
+
+
+def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
+    """Describe how a log that was replaced had been made; empty if as the one that is there now."""
+    if before is None or now is None:
+        return ""
+    old, new = _settings_of(before), _settings_of(now)
+    names = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
+    facts = [f"{name} = {_shown(old, name)}, now {_shown(new, name)}" for name in names[:MOST_SETTINGS]]
+    more = f"; and {len(names) - MOST_SETTINGS} more" if len(names) > MOST_SETTINGS else ""
+    return f"{path}: replaced one of other settings: {'; '.join(facts)}{more}" if facts else ""
+
+
+def _settings_of(run: RunMetadata) -> dict[str, str]:
+    """Return what a run, or the estimates of one, were made with: values as JSON by name."""
+    found: dict[str, Any] = {"scenario": run.scenario, "seed": run.seed, "run": run.run}
+    found |= run.parameters
+    if _is_estimates(run):
+        own = parse_json(run.notes["estimators"])
+        found |= {**run.notes, "estimators": list(own), **{name: of for name, of in own.items() if of}}
+    return {name: json.dumps(value) for name, value in found.items()}
+
+
+def _shown(settings: Mapping[str, str], name: str) -> str:
+    return shorten(settings.get(name, "not there"), 60)
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:

@@ -26,10 +26,12 @@ from replay.judging.errors.evaluation import (
     errors_of,
     innovations_of,
     split_topic,
+    unestimated,
     unjudged_sentence,
 )
 from replay.judging.errors.planes import first_fixes
 from replay.judging.errors.truths import Doubt, Truths
+from replay.judging.errors.uninformed import Uninformed
 from replay.judging.metrics.means import MeansOfAll
 from replay.judging.metrics.measuring import (
     Metric,
@@ -113,6 +115,8 @@ class Judge:
         self.conditioning: dict[str, Conditioning] = {}
         self._epochs_ns = np.array([source.epoch_ns for source in sources])
         self._bounds: dict[tuple[str, str], Bounds] = {}
+        self._uninformed: dict[str, Uninformed] = {}
+        self._unestimated: dict[str, list[str]] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
 
@@ -176,6 +180,7 @@ class Judge:
         begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
         if topic not in self._unjudged:
             self._unjudged[topic] = unjudged_sentence(rows, self._sources, self._first_fixes)
+            self._unestimated[topic] = unestimated(rows.stream, self._sources)
         errors = errors_of(
             rows,
             self._truths,
@@ -187,6 +192,7 @@ class Judge:
         self._steps[topic] = begun + np.diff(rows.offsets)
         if errors is None:
             return
+        self._uninformed.setdefault(topic, Uninformed()).add(rows, self._first_run)
         if self._burn_in_s is not None:
             errors = errors_at(errors, errors.elapsed_s > self._burn_in_s + 1e-9)
         judged.errors.append(errors)
@@ -209,6 +215,8 @@ class Judge:
         self._doubts = self.doubts
         self._sources, self._truths, self._targets, self._on_errors = (), [], {}, None
         self._steps.clear()
+        for of_topic in self._uninformed.values():
+            of_topic.first.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
 
@@ -219,6 +227,9 @@ class Judge:
         self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
+        self._unestimated |= other._unestimated
+        for topic, uninformed in other._uninformed.items():
+            self._uninformed.setdefault(topic, Uninformed()).merge(uninformed)
         for topic, sums in other.innovations.items():
             self.innovations.setdefault(topic, InnovationSums(sums.first_run)).merge(sums)
         for topic, quantities in other._quantities.items():
@@ -272,6 +283,18 @@ class Judge:
         """Return by estimator and case the errors that stay, see `ConstantSums`."""
         found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
         return {what: each for what, each in found.items() if each is not None}
+
+    @property
+    def uninformed(self) -> dict[tuple[str, str], list[str]]:
+        """Name by estimator and case the components of which no measurement informs it."""
+        found = {split_topic(topic): each.found() for topic, each in self._uninformed.items()}
+        return {what: names for what, names in found.items() if names}
+
+    @property
+    def unestimated(self) -> dict[tuple[str, str], list[str]]:
+        """Name by estimator and case the errors of sensors in the truth that it does not estimate."""
+        found = {split_topic(topic): names for topic, names in self._unestimated.items()}
+        return {what: names for what, names in found.items() if names}
 
     @property
     def has_numbers(self) -> bool:

@@ -46,6 +46,21 @@ def test_no_alarm_where_all_is_well(log: MemorySource) -> None:
     assert not replay(log, ["ekf", "ukf", "smoother:ekf", "smoother:iterated"]).alarms
 
 
+def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -> None:
+    """Points all about a target tell a UKF nothing of its size, and the analytic moments all."""
+    found = replay(record("extended-target", seed=1), ["ukf", "lrkf", "analytic"]).alarms
+    assert [(each.kind, each.estimator) for each in found] == [
+        ("uninformed", "ukf"),
+        ("uninformed", "lrkf"),
+    ]
+    assert found[0].words.startswith(
+        "ukf: half_x_m, half_y_m keep their start and prior uncertainty: no"
+    )
+    [biased, *_] = replay(record("moving-los", seed=1, duration_s=10.0), ["ekf"]).alarms
+    assert biased.kind == "errors"
+    assert "the truth has sensor_1_yaw_bias_rad and 11 more, which it does not estimate" in biased.words
+
+
 def test_the_worst_is_said_first(
     log: MemorySource, tmp_path: Path, fuselog: Callable[..., Said]
 ) -> None:

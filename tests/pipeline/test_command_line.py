@@ -774,3 +774,21 @@ def test_errors_beyond_any_covariance_are_called_divergence(
         said = fuselog("replay", world / "log.mcap", "-e", "ekf", *own, "--out", here / "e.mcap")
         assert said.code == 0
         assert [line for line in said.out.splitlines() if "NIS is" in line and why in line], said.out
+
+
+def test_a_log_that_is_replaced_by_one_of_other_settings_is_named(
+    fuselog: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With what differs; nothing is said where the same command made it."""
+    monkeypatch.chdir(tmp_path)
+    record = ("record", "landmarks", "--set", "duration_s=2", "-o", "a.mcap", "--seed")
+    replay = ("replay", "a.mcap", "--set", "sigma_range_m=0.3", "-e")
+    assert fuselog(*record, "1").err == fuselog(*record, "1").err == ""
+    assert fuselog(*record, "2").err == (
+        "fuselog: a.mcap: replaced one of other settings: seed = 1, now 2\n"
+    )
+    assert "replaced" not in fuselog(*replay, "ekf").err + fuselog(*replay, "ekf").err
+    assert (
+        'a.estimates.mcap: replaced one of other settings: estimators = ["ekf"], now ["ekf", "ukf"]; '
+        'ukf = not there, now {"sigma_range_m": 0.3}'
+    ) in fuselog(*replay, "ekf", "-e", "ukf").err

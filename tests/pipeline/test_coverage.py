@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 
 from pipeline.api.replays import replay
+from pipeline.output.coverage import sentences
 from recorders.log import Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
-from replay.engine.replaying.usage import Usage
+from replay.engine.replaying.usage import UNTAKEN, Row, Usage
 from replay.engine.streams.blocks import gather
 from tests.pipeline.conftest import Said
 
@@ -233,3 +234,15 @@ def test_sides_of_a_comparison_have_the_table(
     assert {row["estimator"]: row["used"] > 0 for row in one} == {"ekf": True, "dead-reckoning": False}
     table = pd.read_parquet("out/tables/coverage.parquet")
     assert table.to_dict("records") == two
+
+
+def test_topics_that_an_estimator_does_not_take_are_one_sentence() -> None:
+    rows = [Row("ekf", f"/gps{n}/fix", 10, 0, 0, 0, UNTAKEN) for n in range(5)]
+    rows.insert(2, Row("ekf", "/radar", 10, 8, 0, 0, "they gave no innovation"))
+    rows += [Row("ukf", "/radar", 10, 10, 0, 0, ""), Row("ukf", "/odd", 4, 0, 0, 0, UNTAKEN)]
+    assert sentences(rows) == [
+        "ekf: 5 topics not used: it does not take /gps0/fix, /gps1/fix, /gps2/fix and 2 more",
+        "ekf: /radar: 2 of 10 not used: they gave no innovation",
+        "ukf: /odd: 4 of 4 not used: the estimator does not take this topic",
+    ]
+    assert sentences([rows[0]]) == []  # of one that takes no measurements it is its nature

@@ -11,6 +11,9 @@ MOST_NAMED = 4  # more estimators are counted
 # What the checks of a replay found, of the estimators that they found it of.
 _OF_COVARIANCES = {"innovations": "innovations", "errors": "errors"}
 _CHECKS: dict[str, Callable[[str], str]] = {
+    "uninformed": lambda whose: (
+        f"components that {whose} cannot estimate, as no measurement informs the method of them"
+    ),
     "origin": lambda whose: (
         f"the error of {whose}, most of which is constant: truth and estimate may have other origins"
     ),

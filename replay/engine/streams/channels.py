@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
+from pydantic import PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Topic
@@ -20,6 +21,8 @@ def stated(
 ) -> float:
     """Return the first number of this name that one of the channels states; NaN where none needs to.
 
+    A channel may state `sigma_m` as its square, `variance_m2`, and the other way round.
+
     Where it stands for a parameter, that is of the type `parameters`, and called `stands_for` there if
     that is another name. Raises BadInput where none states it though it is needed, it is no number, or
     the parameter does not take it.
@@ -27,10 +30,24 @@ def stated(
     for topic in topics:
         if name in topic.metadata:
             return _number(topic.name, name, topic.metadata[name], parameters, stands_for or name)
+        other, power = _POWERS.get(name, ("", 1.0))
+        if other in topic.metadata:
+            return _number(topic.name, other, topic.metadata[other], _Noise, other) ** power
     if needed:
         mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
         raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
     return np.nan
+
+
+# Of a number, another name that channels have for a power of it, and which power that takes back.
+_POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
+
+
+class _Noise(Parameters):
+    """States what these are: positive numbers."""
+
+    sigma_m: PositiveFloat = 1.0
+    variance_m2: PositiveFloat = 1.0
 
 
 @lru_cache(maxsize=256)

@@ -7,6 +7,7 @@ IEEE TAES 49(4), 2013: a detection that nothing explains begins a component, and
 is not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
 """
 
+import warnings
 from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Annotated, Any
@@ -52,7 +53,8 @@ class PhdParameters(Parameters):
 
     Attributes:
         sensor: the sensor to use, such as `network`; without one each sensor has a filter of its own.
-        variance_m2: variance of a detection, per axis.
+        sigma_m: standard deviation of a detection, per axis.
+        variance_m2: its square, an older name for it that goes in the next release.
         detection_probability: probability that a scan detects a target.
         clutter_per_m2: mean number of false detections in a scan, per area.
         survival_probability: probability that a target is still there at the next scan.
@@ -66,6 +68,7 @@ class PhdParameters(Parameters):
     """
 
     sensor: str = ""
+    sigma_m: PositiveFloat | None = None
     variance_m2: PositiveFloat | None = None
     detection_probability: Probability | None = None
     clutter_per_m2: NonNegativeFloat | None = None
@@ -228,6 +231,11 @@ def _outputs(
 
 def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
     """Read what the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
+    if parameters.variance_m2 is not None:
+        notice = "'variance_m2' is called 'sigma_m' now, its root; the old name goes in the next release"
+        warnings.warn(f"gm-phd: {notice}", FutureWarning, stacklevel=2)
+    elif parameters.sigma_m is not None:
+        parameters = parameters.model_copy(update={"variance_m2": parameters.sigma_m**2})
     names = PhdSettings._fields[:-1]
     numbers = [given_or_stated(parameters, [scan], name) for name in names]
     return PhdSettings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])

@@ -336,6 +336,19 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
     return f"{what}: {'; '.join(facts)}" if facts else ""
 
 
+def unestimated(estimates: Stream, sources: Sequence[Source]) -> list[str]:
+    """Name the components of the truth that are errors of sensors, and that the estimates lack."""
+    topic = estimates.metadata.get("truth", "")
+    if not all(topic in source.topics for source in sources):
+        return []
+    stated = stated_components(sources[0].topics[topic].metadata, {}, topic)
+    return [
+        name
+        for name in stated
+        if name not in estimates.components and ("bias_" in name or name.endswith("_clock_s"))
+    ]
+
+
 def _components(stream: Stream) -> dict[str, Any]:
     """Return names and kinds of an estimate's components; raises BadInput where it states none."""
     names = stream.components

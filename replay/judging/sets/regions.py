@@ -43,7 +43,7 @@ def regions_of(
             continue
         places = places_at(sizes, truths, gap_limit_s)
         rings = rings_of(sizes.stream, sets.stream)
-        known = np.isfinite(places).all(axis=1)
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(places).all(axis=1))
         holds = inside(rings, places)
         found[topic] = Regions(*split_topic(topic), areas_of(rings), known, holds)
     return found
@@ -79,7 +79,15 @@ def areas_of(regions: Sequence[Sequence[Floats]]) -> Floats:
 
 
 def inside(regions: Sequence[Sequence[Floats]], places: Floats) -> NDArray[np.bool_]:
-    """Tell for each region whether the place (n, 2) that belongs to it is in it."""
+    """Tell for each region whether the place that belongs to it is in it.
+
+    Args:
+        regions: n lists of rings, (vertices, 2) in m each.
+        places: (n, 2), in m; NaN is in none.
+
+    Returns:
+        (n,) answers.
+    """
     found = np.zeros(len(places), bool)
     for row, rings in enumerate(regions):
         for ring in rings:

@@ -11,6 +11,7 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams import channels
 from replay.engine.streams.blocks import gather
 from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
@@ -20,6 +21,7 @@ from replay.estimators.tracking.gaussian_mixture_phd import (
     settings_of,
 )
 from replay.estimators.tracking.phd_recursion import Scans
+from replay.estimators.vehicles.streams import scanning_of
 from replay.judging.errors.truths import Truths
 from replay.judging.sets.errors import set_errors
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source
@@ -98,6 +100,22 @@ def test_merging_keeps_weight_and_moments():
     assert (separate, merged) == (4, 1)
     for before, after in zip(apart, together, strict=True):
         assert_allclose(after, before, rtol=1e-12)
+
+
+def test_a_sensor_states_its_noise_as_sigma_or_variance_to_every_estimator() -> None:
+    """One log serves all of its estimators; the old name of the setting is still accepted."""
+    by_sigma = {**STATED, "sigma_m": str(0.5**0.5)}
+    del by_sigma["variance_m2"]
+    for stated in (STATED, by_sigma):
+        assert settings_of(PhdParameters(), scan_of(stated)).variance_m2 == pytest.approx(0.5)
+        assert scanning_of({"/scan": scan_of(stated)}, "/scan").variance_m2 == pytest.approx(0.5)
+        assert channels.stated([scan_of(stated)], "sigma_m") == pytest.approx(0.5**0.5)
+    assert settings_of(PhdParameters(sigma_m=3.0), scan_of(STATED)).variance_m2 == 9.0
+    with pytest.warns(FutureWarning, match="'variance_m2' is called 'sigma_m' now"):
+        old = settings_of(PhdParameters(variance_m2=4.0), scan_of(STATED))
+    assert old.variance_m2 == 4.0
+    with pytest.raises(BadInput, match=r"topic /scan: parameter 'sigma_m' is -1\.0"):
+        settings_of(PhdParameters(), scan_of({**by_sigma, "sigma_m": "-1"}))
 
 
 def test_two_things_in_one_place_are_two():
