@@ -45,6 +45,13 @@ DRAWN_ROWS = 5000
 # A stream is silent after so many of its usual intervals, but not before so long.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
+ESTIMATES = (
+    schemas.GAUSSIAN_ESTIMATE,
+    schemas.DENSITY_ESTIMATE,
+    schemas.ESTIMATE_SIZE,
+    schemas.TRACK_ESTIMATE,
+    schemas.SCORE_VECTOR,
+)
 # Stamps before the year 2000 count from something else than 1970.
 DATES_FROM_NS = 946_684_800_000_000_000
 
@@ -93,8 +100,12 @@ class Scene:
     def colours(self, case: str) -> dict[str, Colour]:
         """Return the colours of the truth of `case` and of its estimators, by name."""
         named = {"truth": TRUTH} if self.truths_of(case) else {}
-        own = {split_topic(topic)[0] for topic in self.outputs if split_topic(topic)[1] == case}
-        return named | {name: self.colour(name) for name in self.estimators if name in own}
+        return named | {name: self.colour(name) for name in self.estimators_of(case)}
+
+    def estimators_of(self, case: str) -> list[str]:
+        """Return the estimators that estimate something of `case`."""
+        own = {name for schema in ESTIMATES for name, _ in self.outputs_of(case, schema)}
+        return [name for name in self.estimators if name in own]
 
     def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
         """Return the non-empty output streams of `case` with this `schema`, and their estimators."""
@@ -244,11 +255,13 @@ class Timeline:
 def draw_cases(
     scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
 ) -> rrb.Container | rrb.View:
-    """Return the layouts of all cases, in tabs where there are several."""
+    """Return the layouts of all cases, in tabs where there are several, an estimated one first."""
     layouts = [draw_case(case) for case in scene.cases]
     if len(layouts) == 1:
         return layouts[0]
-    return rrb.Tabs(*layouts, active_tab=scene.cases.index(scene.focus or scene.cases[0]))
+    estimated = [case for case in scene.cases if scene.estimators_of(case)]
+    first = scene.focus or next(iter(estimated), scene.cases[0])
+    return rrb.Tabs(*layouts, active_tab=scene.cases.index(first))
 
 
 def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:

@@ -10,8 +10,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import Canvas, Colour
-from replay.timeline.drawing.plane import GRID, Stroke, bounds_of, draw_legend, turn_up
+from replay.timeline.drawing.canvas import MUTED, Board, Canvas, Colour
+from replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
 from replay.timeline.sinks import open_recording
 
 
@@ -31,11 +31,12 @@ def save_curves(title: str, panels: Sequence[CurvePanel], rrd: Path) -> None:
     with open_recording("fuselog-curves", title, save=rrd) as recording:
         recording.send_recording_name(title)
         canvas = Canvas(recording, 0, 0, np.zeros(1, np.int64))
-        views = [_view(canvas, f"curves/{number}", panel) for number, panel in enumerate(panels)]
+        views = [curve_view(canvas, f"curves/{number}", panel) for number, panel in enumerate(panels)]
         recording.send_blueprint(rrb.Blueprint(rrb.Grid(*views), collapse_panels=True))
 
 
-def _view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DView:
+def curve_view(canvas: Canvas, root: str, panel: CurvePanel) -> Board:
+    """Draw a panel below an entity; return its view below its legend."""
     turn_up(canvas, root)
     logs = {name: _drawn(places) for name, places in panel.curves.items()}
     places = np.concatenate(list(logs.values()))
@@ -44,13 +45,13 @@ def _view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DView:
     for name, line in logs.items():
         canvas.fix(f"{root}/{name}", rr.LineStrips2D([line], **panel.strokes[name].fields()))
     colours: dict[str, Colour] = {name: panel.strokes[name].colour for name in logs}
-    draw_legend(canvas, f"{root}/legend", colours, places)
-    return rrb.Spatial2DView(
+    view = rrb.Spatial2DView(
         origin="/",
         contents=[f"{root}/**"],
         name=panel.name,
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )
+    return with_legend(canvas, root, colours, view)
 
 
 def _drawn(places: Floats) -> Floats:
@@ -72,5 +73,5 @@ def _draw_decades(canvas: Canvas, entity: str, low: Floats, high: Floats) -> Non
             labels.append(f"1e{power}")
     strips = rr.LineStrips2D(lines, colors=[GRID], radii=rr.Radius.ui_points(0.5), draw_order=-1.0)
     canvas.fix(entity, strips)
-    numbers = rr.Points2D(at, labels=labels, colors=[GRID], radii=rr.Radius.ui_points(1.0))
+    numbers = rr.Points2D(at, labels=labels, colors=[MUTED], radii=rr.Radius.ui_points(1.0))
     canvas.fix(f"{entity}/numbers", numbers)

@@ -43,10 +43,8 @@ CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
 # What is left free beside the places, as a share of their side, or of so much of the longer one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
-# A legend has room for so many entries, one below another; names are centred so far from the left.
-LEGEND_ROWS, LEGEND_INDENT = 14, 0.05
-# A legend's row above a board: its most entries, its height by the width of one and by the board's.
-LEGEND_COLUMNS, LEGEND_ASPECT, LEGEND_SHARE = 6, 0.06, 0.07
+# A legend's row: its characters, those between names, its height in them, and that by the board's.
+LEGEND_CHARACTERS, LEGEND_GAP, LEGEND_ROW, LEGEND_SHARE = 100.0, 5.0, 6.0, 0.07
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -95,19 +93,19 @@ def draw_points(
     texts = np.array([str(number) for number in numbers.tolist()])
     radii = rr.Radius.ui_points(4.0)
     canvas.fix(entity, rr.Points2D(places, labels=texts, colors=[TRUTH], radii=radii, show_labels=False))
-    groups = _neighbours(places)
+    groups = neighbours(places, extent_of(places))
     spots = [(places[rows, 0].mean(), places[rows, 1].min()) for rows in groups]
     labels = [" ".join(texts[rows]) for rows in groups]
     names = rr.Points2D(spots, labels=labels, colors=[TRUTH], radii=0.0, show_labels=True)
     canvas.fix(f"{entity}/numbers", names)
 
 
-def _neighbours(places: Floats) -> list[list[int]]:
-    """Group the rows of points whose labels would overlap: a point joins the first group it is close to.
+def neighbours(places: Floats, extent_m: float) -> list[list[int]]:
+    """Group the rows of points (n, 2) whose labels would overlap in a view that shows so much.
 
-    It is close to a group if it is to all points of it.
+    A point joins the first group of which it is close to all points.
     """
-    farthest = LABEL_SHARE * extent_of(places)
+    farthest = LABEL_SHARE * extent_m
     groups: list[list[int]] = []
     for row, place in enumerate(places):
         for group in groups:
@@ -377,25 +375,6 @@ def bounds_of(places: Floats) -> tuple[Floats, Floats]:
     return low - margin, high + margin
 
 
-def draw_legend(canvas: Canvas, entity: str, entries: Mapping[str, Colour], places: Floats) -> None:
-    """Draw what colours stand for: a dot with its name each, at the left edge of a view.
-
-    Args:
-        canvas, entity: what is drawn on, and where.
-        entries: colours by name.
-        places: that the view shows, (n, 2) in m.
-    """
-    low, high = bounds_of(places)
-    step = (high[1] - low[1]) / LEGEND_ROWS
-    left = low[0] + LEGEND_INDENT * (high[0] - low[0])
-    at = [(left, high[1] - (row + 0.5) * step) for row in range(len(entries))]
-    radii = rr.Radius.ui_points(5.0)
-    dots = rr.Points2D(
-        at, labels=[*entries], colors=[*entries.values()], radii=radii, show_labels=True, draw_order=30.0
-    )
-    canvas.fix(entity, dots)
-
-
 def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board: Board) -> Board:
     """Return a board below what its colours stand for: a row of dots with their names.
 
@@ -407,11 +386,13 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
     """
     if not colours:
         return board
-    number = np.arange(len(colours))
-    rows = -(-len(colours) // LEGEND_COLUMNS)
-    columns = max(-(-len(colours) // rows), 4)
-    row_height = LEGEND_ASPECT * columns
-    at = np.stack([number % columns + 0.5, row_height * (number // columns)], axis=1)
+    at, row, left = [], 0, 0.0
+    for label in colours:
+        width = len(label) + LEGEND_GAP
+        if left > 0.0 and left + width > LEGEND_CHARACTERS:
+            row, left = row + 1, 0.0
+        at.append((left + 0.5 * width, row * LEGEND_ROW))
+        left += width
     radii = rr.Radius.ui_points(5.0)
     dots = rr.Points2D(at, labels=[*colours], colors=[*colours.values()], radii=radii, show_labels=True)
     entity = f"legend/{name}"
@@ -421,10 +402,10 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
         name="Legend",
         titlebar=False,
         visual_bounds=rrb.VisualBounds2D(
-            x_range=(0.0, columns), y_range=(-0.3 * row_height, (rows - 0.3) * row_height)
+            x_range=(0.0, LEGEND_CHARACTERS), y_range=(-0.3 * LEGEND_ROW, (row + 0.7) * LEGEND_ROW)
         ),
     )
-    return rrb.Vertical(view, board, row_shares=[LEGEND_SHARE * rows, 1.0])
+    return rrb.Vertical(view, board, row_shares=[LEGEND_SHARE * (row + 1), 1.0])
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:

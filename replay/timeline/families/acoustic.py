@@ -22,6 +22,7 @@ from replay.timeline.drawing.plane import (
     extent_of,
     plane_view,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import draw_quality
 
@@ -56,8 +57,11 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         _draw_shot(canvas, "truth", Stroke(TRUTH, 2.0), then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
         _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator), 1.5), stream, cone)
-    board = above_events(plane_view(canvas, ROOT, [], [], shown), draw_events(canvas, scene, CASE))
-    return beside(board, draw_quality(canvas, scene, CASE), CASE)
+    name = "Map; the bullet's way ends in its shockwave"
+    colours = scene.colours(CASE) | {"muzzle blast": MUZZLE_BLAST[:3], "shockwave": SHOCKWAVE[:3]}
+    board = with_legend(canvas, ROOT, colours, plane_view(canvas, ROOT, [], [], shown, name=name))
+    board = above_events(board, draw_events(canvas, scene, CASE))
+    return beside(board, draw_quality(canvas, scene, CASE, legend=False), CASE)
 
 
 def _place(scene: Scene, sensor: int) -> Floats:

@@ -1,4 +1,4 @@
-"""Draws score fusion: probes as they come, their scores, and wrong decisions so far."""
+"""Draws score fusion: how scores are spread, rates of both errors, probes as they come."""
 
 from functools import partial
 
@@ -9,10 +9,11 @@ import rerun.blueprint as rrb
 from recorders.log import Stream, schemas
 from recorders.models.scores import TOPIC, matchers_of
 from replay.estimators.biometrics.pairs import subsets_of
-from replay.judging.consistency.verification import Floats, Fused, fused_of
+from replay.judging.consistency.verification import Floats, Fused, fused_of, roc
 from replay.timeline.drawing.canvas import (
     PALETTE,
     WRONG,
+    Board,
     Canvas,
     Scene,
     Timeline,
@@ -21,11 +22,15 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     escaped,
 )
-from replay.timeline.drawing.plots import LINE, POINTS, plot_view
+from replay.timeline.drawing.curves import CurvePanel, curve_view
+from replay.timeline.drawing.plane import stroke_of
+from replay.timeline.drawing.plots import LINE, POINTS, below_legend, plot_view
 
 GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
 BINS = 60
 UPDATES = 50
+# How many of the genuine scores are below the histogram's upper end.
+SHOWN_SHARE = 0.95
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
@@ -39,7 +44,8 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
     matched = _draw_matchers(canvas, scene, case)
     boards: list[rrb.Container | rrb.View] = []
     if rows:
-        boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), _draw_errors(canvas, scene, case)]
+        rates = rrb.Horizontal(_draw_rates(canvas, scene, case), _draw_errors(canvas, scene, case))
+        boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), rates]
     if matched:
         boards.append(rrb.Horizontal(*matched))
     return rrb.Vertical(*boards, name=case or "run")
@@ -52,10 +58,22 @@ def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> r
     of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
     _draw_probes(canvas, f"{root}/scores", fused, time_ns)
     return rrb.Horizontal(
-        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-"),
         _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
+        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-"),
         name=estimator,
     )
+
+
+def _draw_rates(canvas: Canvas, scene: Scene, case: str) -> Board:
+    """Draw both rates of errors at every threshold, a curve for each fusion of a case."""
+    curves, strokes = {}, {}
+    for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
+        fused = fused_of(stream)
+        found = roc(fused.score, fused.genuine)
+        curves[estimator] = np.stack([found.false_accept, 1.0 - found.genuine_accept], axis=1)
+        strokes[estimator] = stroke_of(scene, estimator)
+    name = "ROC: genuine rejected (share) over impostors accepted (share)"
+    return curve_view(canvas, entity_path("rates", case), CurvePanel(name, curves, strokes))
 
 
 def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
@@ -112,17 +130,18 @@ def _errors_so_far(fused: Fused) -> Floats:
 def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
     """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars.
 
-    Bars of both stand side by side in a bin, so that neither hides or tints the other.
+    Their bars stand side by side within each bin. A bar as high as all marks the threshold.
     """
     low = np.quantile(fused.score[~fused.genuine], 0.001)
-    high = np.median(fused.score[fused.genuine])
+    high = np.quantile(fused.score[fused.genuine], SHOWN_SHARE)
     edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
     place = np.clip(np.searchsorted(edges, fused.score) - 1, 0, BINS - 1)
+    middle, width = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
     moments = np.unique(np.linspace(0, len(time_ns) - 1, UPDATES).astype(int))
-    width = 0.5 * (edges[1] - edges[0])
-    for label, colour, chosen, left in (
-        ("impostor", IMPOSTOR, ~fused.genuine, edges[:-1]),
-        ("genuine", GENUINE, fused.genuine, edges[:-1] + width),
+    largest = 0.0
+    for label, colour, chosen, side in (
+        ("impostor", IMPOSTOR, ~fused.genuine, -0.25),
+        ("genuine", GENUINE, fused.genuine, 0.25),
     ):
         counts = [
             np.bincount(place[: moment + 1][chosen[: moment + 1]], minlength=BINS) for moment in moments
@@ -131,15 +150,21 @@ def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times
         for moment, share in zip(moments, shares, strict=True):
             chart = rr.BarChart.columns(
                 values=[share],
-                abscissa=[left + 0.5 * width],
-                widths=[np.full(BINS, width, np.float32)],
-                color=[(*colour, 255)],
+                abscissa=[middle + side * width],
+                color=[colour],
+                widths=np.full((1, BINS), 0.5 * width),
             )
             canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
+        largest = max(largest, float(shares[-1].max()))
+    if fused.threshold is not None:
+        # a single bar is none to Rerun
+        heights, places = np.array([0.0, largest]), np.array([low, fused.threshold])
+        mark = rr.BarChart(heights, abscissa=places, color=WRONG, widths=[0.2 * width] * 2)
+        canvas.fix(f"{entity}/threshold", mark)
     return rrb.BarChartView(
         origin=escaped(entity),
-        name="Share of the scores so far",
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True),
+        name="Scores so far (share in each bin)",
+        plot_legend=rrb.Corner2D.RightTop,
     )
 
 
@@ -159,7 +184,9 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
         _draw_probes(canvas, plot, fused, stream.publish_time_ns[known])
         left_out = len(np.unique(probe[~known]))
         without = f", without {left_out} that it could not enrol" if left_out else ""
-        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe{without}", "-"))
+        extent = below_legend([fused.score[fused.genuine], fused.score[~fused.genuine]])
+        title = f"{matchers[index].name}: score of each probe{without}"
+        views.append(plot_view(plot, title, "-", extent, zoom_lock=False))
     return views
 
 

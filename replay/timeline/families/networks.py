@@ -22,6 +22,7 @@ from replay.timeline.drawing.canvas import (
     Timeline,
     entity_path,
     escaped,
+    thin,
 )
 from replay.timeline.drawing.events import above_events, draw_events, events_view, stamped
 from replay.timeline.drawing.plane import (
@@ -32,8 +33,11 @@ from replay.timeline.drawing.plane import (
     draw_lines,
     draw_path,
     draw_points,
+    neighbours,
     plane_view,
+    stroke_of,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import draw_errors, draw_nees, in_strips
 
@@ -44,6 +48,8 @@ LOST = (*WRONG, 255)
 # Plots are drawn for so many nodes, and an event names so many lost messages.
 PLOTTED_NODES = 6
 NAMED_MESSAGES = 8
+# Nodes are named on the map of errors at so many times at most.
+NAMED_TIMES = 500
 # The errors' map shows what this share of them does not reach beyond.
 SHOWN_SHARE = 0.9
 # Both directions of a link lie side by side, this share of the circle's radius apart.
@@ -56,19 +62,22 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     links = scene.read("/links")
     nodes = _nodes(scene, links)
     maps = rrb.Horizontal(_draw_graph(canvas, links, nodes), _draw_maps(canvas, scene))
-    board = above_events(maps, _draw_events(canvas, scene, links))
+    colours = scene.colours("") | {name: scene.colour(name) for name in scene.estimators}
+    colours |= {"arrived": ARRIVED[:3], "lost": LOST[:3]}
+    board = with_legend(canvas, "network", colours, maps)
+    board = above_events(board, _draw_events(canvas, scene, links))
     cases = [case for case in scene.cases if scene.errors_of(case)][:PLOTTED_NODES]
     if not cases:
         return board
-    nees = [view for case in cases for view in _draw_nees(canvas, scene, case, legend=case == cases[-1])]
+    nees = [view for case in cases for view in _draw_nees(canvas, scene, case)]
     errors = [in_strips(draw_errors(canvas, scene, case), case) for case in cases]
     plots = rrb.Tabs(rrb.Vertical(*nees, name="NEES"), *errors)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 
 
-def _draw_nees(canvas: Canvas, scene: Scene, case: str, *, legend: bool) -> list[rrb.TimeSeriesView]:
+def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """Draw the plots of one node."""
-    views = draw_nees(canvas, scene, case, legend=legend)
+    views = draw_nees(canvas, scene, case, legend=False)
     for view in views:
         view.name = f"{case}: {view.name}"
     return views
@@ -105,7 +114,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
     return rrb.Spatial2DView(
         origin="/",
         contents=[f"{escaped(GRAPH)}/**"],
-        name="Network: messages sent (green), lost (red)",
+        name="Network: links, messages that arrive and that are lost",
         visual_bounds=rrb.VisualBounds2D(x_range=extent, y_range=extent),
     )
 
@@ -127,6 +136,7 @@ def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
         ways, errors = (entity_path(ROOT, part, estimator) for part in ("ways", "errors"))
         paths = [f"{truth}/path", *(_draw_way(canvas, scene, ways, each) for each in found)]
         extents = [_draw_error(canvas, scene, errors, each) for each in found]
+        _draw_names(canvas, f"{errors}/names", found, np.max(extents, initial=0.0))
         extent = np.max(extents, initial=0.0) * np.array([[-1.0, -1.0], [1.0, 1.0]])
         views.append(
             rrb.Vertical(
@@ -141,7 +151,7 @@ def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
 
 def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
     """Draw the way of one node's estimates; returns its entity."""
-    stroke = Stroke(scene.colour(errors.estimator))
+    stroke = stroke_of(scene, errors.estimator)
     for name, stream in scene.outputs_of(errors.case, schemas.GAUSSIAN_ESTIMATE):
         # what a node sent is a Gaussian too, without a truth to be judged by
         if name == errors.estimator and "truth" in stream.metadata:
@@ -156,12 +166,35 @@ def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> floa
     columns = [errors.components.index(name) for name in PLACE]
     error, covariance = errors.error[:, columns], errors.covariance[:, columns][:, :, columns]
     draw_dots(canvas, f"{entity}/place", errors.time_ns, error, stroke)
-    label = rr.Points2D.from_fields(labels=[errors.case.removeprefix("node")], show_labels=True)
-    canvas.fix(f"{entity}/place", label)
     draw_ellipses(canvas, f"{entity}/ellipse", errors.time_ns, error, covariance, stroke)
     canvas.fix(f"{root}/truth", rr.Points2D([[0.0, 0.0]], **Stroke(TRUTH, 2.0).fields(widen=2.0)))
     reach = np.abs(error).max(axis=1) + 2.5 * np.sqrt(covariance[:, [0, 1], [0, 1]].max(axis=1))
     return float(np.quantile(reach, SHOWN_SHARE))
+
+
+def _draw_names(canvas: Canvas, entity: str, found: Sequence[Errors], extent_m: float) -> None:
+    """Write the nodes' numbers beside their errors, together where they would cover each other."""
+    if not found:
+        return
+    known = np.unique(np.concatenate([errors.time_ns for errors in found]))
+    time_ns = known[thin(known, NAMED_TIMES)]
+    numbers = np.array([errors.case.removeprefix("node") for errors in found])
+    places = np.full((len(time_ns), len(found), 2), np.nan)
+    for node, errors in enumerate(found):
+        row = np.searchsorted(errors.time_ns, time_ns, side="right") - 1
+        columns = [errors.components.index(name) for name in PLACE]
+        places[row >= 0, node] = errors.error[row[row >= 0]][:, columns]
+    spots, labels, sizes = [], [], []
+    for there in places:
+        rows = np.flatnonzero(np.isfinite(there).all(axis=1))
+        groups = neighbours(there[rows], 2.0 * extent_m) if len(rows) else []
+        spots += [there[rows[group]].mean(axis=0) for group in groups]
+        labels += [" ".join(numbers[rows[group]]) for group in groups]
+        sizes.append(len(groups))
+    points = rr.Points2D.columns(positions=np.array(spots).reshape(-1, 2), labels=labels)
+    canvas.send(entity, time_ns, points.partition(sizes))
+    style = rr.Points2D.from_fields(colors=[TRUTH], radii=[0.0], show_labels=True)
+    canvas.fix(entity, style)
 
 
 def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLogView]:

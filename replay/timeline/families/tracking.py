@@ -32,13 +32,13 @@ from replay.timeline.drawing.events import Happened, above_events, draw_events
 from replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
-    draw_legend,
     draw_lines,
     draw_outlines,
     draw_path,
     ellipses,
     plane_view,
     turn_up,
+    with_legend,
 )
 from replay.timeline.drawing.plots import LINE, POINTS, below_legend, draw_curve, plot_view
 from replay.timeline.families.ais import track_colours
@@ -60,9 +60,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         places.append(place)
     scans = _draw_scans(canvas, scene)
     shown = np.concatenate(places) if places else np.zeros((1, 2))
-    legend = f"{ROOT}/legend"
-    draw_legend(canvas, legend, _legend(scene) | scans, shown)
-    shared = [ground, f"{ROOT}/{SCANS}", legend]
+    colours = _legend(scene) | scans
+    shared = [ground, f"{ROOT}/{SCANS}"]
     trackers = scene.outputs_of("", schemas.TRACK_ESTIMATE)
     boards = []
     for name, tracks in trackers:
@@ -71,7 +70,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         view = plane_view(canvas, f"{ROOT}/{name}", shared, [*paths, *drawn], shown, name=name)
         boards.append(view)
     if not boards:
-        return plane_view(canvas, ground, shared, paths, shown)
+        return with_legend(canvas, ROOT, colours, plane_view(canvas, ground, shared, paths, shown))
     at_ns, errors = _errors(scene, trackers)
     plots = [
         _draw_gospa(canvas, scene, at_ns, errors),
@@ -80,7 +79,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     ]
     events = [each for name, tracks in trackers for each in _life(scene, name, tracks)]
     events += [each for name in errors for each in _switches(name, at_ns, errors[name])]
-    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, "", also=events), share=4.0)
+    board = with_legend(canvas, ROOT, colours, rrb.Tabs(*boards))
+    board = above_events(board, draw_events(canvas, scene, "", also=events), share=4.0)
     return rrb.Horizontal(board, rrb.Vertical(*plots), column_shares=[3, 1])
 
 
@@ -295,7 +295,9 @@ def _draw_existence(
             time_ns, values = tracks.publish_time_ns[rows], existence[name]["existence"][rows]
             entity = "plots/existence"
             draw_curve(canvas, entity, f"track{number}", (red, green, blue), time_ns, values, POINTS)
-    return plot_view("plots/existence", "Existence", "probability", (0.0, 1.0), legend=False)
+    return plot_view(
+        "plots/existence", "Existence of each track", "probability", (0.0, 1.0), legend=False
+    )
 
 
 TIMELINE = Timeline(draw)

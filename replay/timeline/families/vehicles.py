@@ -25,7 +25,6 @@ from replay.judging.sets.errors import CUTOFF_M, set_errors
 from replay.timeline.drawing.canvas import (
     MUTED,
     TRUTH,
-    WRONG,
     Board,
     Canvas,
     Colour,
@@ -367,7 +366,7 @@ def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
     topics = [topic for topic in scene.source.topics if topic.endswith("/geodetic_fix")]
     fixes = [stream for topic in topics if len(stream := scene.read(topic))]
     for stream in fixes:
-        draw_fixes(canvas, f"geodetic/{stream.topic.split('/')[1]}", stream, WRONG)
+        draw_fixes(canvas, f"geodetic/{stream.topic.split('/')[1]}", stream, FIX)
     degrees = [degrees_of(stream) for stream in fixes]
     return [map_view(canvas, "geodetic", np.concatenate(degrees))] if degrees else []
 

@@ -73,12 +73,12 @@ def test_a_bias_that_is_known_is_not_estimated() -> None:
 
 def test_bad_runs_are_told_and_the_rest_goes_on() -> None:
     """A target behind all rays, one on a sensor, sights that are missing: beside a good run."""
-    good = source("optical-los", 0, bias_deg=BIAS)
+    good = source("optical-los", 0, bias_deg=BIAS, passes=1)
     on_sensor = [(-5500, 950, 15), (-235.9, 8152, 0), (2413, 6451, 0)]
     runs = [
         good,
-        source("optical-los", 1, bias_deg=BIAS, target_position_m=on_sensor),
-        source("optical-los", 2, bias_deg=BIAS, dropout_probability=0.6),
+        source("optical-los", 1, bias_deg=BIAS, passes=1, target_position_m=on_sensor),
+        source("optical-los", 2, bias_deg=BIAS, passes=1, dropout_probability=0.6),
     ]
     outputs = solve(runs, "los-biases")
     assert outputs["solution"]["converged"].tolist()[0] == 1

@@ -249,7 +249,7 @@ OF_NO_ESTIMATOR = {
     "without_fixes",
 }
 # What a view has beside its data, and the names of columns that are data.
-FRAMES = ("grid", "bounds", "circle", "cells", "names", "numbers", "threshold")
+FRAMES = ("grid", "decades", "bounds", "circle", "cells", "names", "numbers", "threshold")
 VALUES = ("scalars", "values", "strips", "positions", "centers", "vectors", "text", "buffer", "instance")
 SIZES = ("LineStrips2D:strips", "Points2D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips")
 
@@ -398,7 +398,7 @@ def _shown(picture: Picture, view: View) -> dict[str, Columns]:
 
 def _has_data(entity: str, columns: Columns) -> bool:
     """Whether an entity is something to see, and no frame for it."""
-    if entity.rpartition("/")[2] in FRAMES:
+    if entity.rpartition("/")[2] in FRAMES or entity.startswith("/legend"):
         return False
     values = [name for name in columns if name.partition(":")[2] in VALUES]
     return any(each for name in values for each in columns[name])
@@ -410,10 +410,10 @@ def _is_named(entity: str, columns: Columns, view: View, names: Mapping[int, str
     labels = [row for name, rows in columns.items() if name.endswith(":show_labels") for row in rows]
     words = [part.replace("\\", "") for part in entity.split("/") if part]
     return (
-        words[-1] in FRAMES
+        words[-1] in (*FRAMES, "axes")
         or [True] in labels
         or {colour >> 8 for row in rows for colour in row} <= set(names)
-        or any(word in view.name for word in words)
+        or any(word.rstrip("0123456789") in view.name for word in words)
     )
 
 

@@ -120,7 +120,7 @@ def test_a_shot_has_what_was_heard_its_ellipses_and_its_cone(tmp_path: Path) -> 
         if field == "mean":
             wanted[f"/map/{name}/shooter"] = ellipses(stream, begin, block(stream, *PLANE))
     compare(run.picture.moving, wanted)
-    check_views(run.picture, {*titles, ("Map", "map")})
+    check_views(run.picture, {*titles, ("Map; the bullet's way ends in its shockwave", "map")})
     marks = run.picture.still["/map/sensors"]
     np.testing.assert_allclose(marks["Points2D:positions"][0], places, rtol=1e-5, atol=1e-5)
     assert marks["Points2D:labels"][0] == list("12345")
@@ -262,7 +262,7 @@ def test_a_network_has_messages_on_their_way_and_the_errors_of_its_nodes(tmp_pat
     made = [estimate(name, node, truth) for name in ESTIMATORS for node in ("node1", "node3")]
     run = drawn(tmp_path, source, made)
     wanted: dict[str, Wanted] = {}
-    titles: Titles = {("Network: messages sent (green), lost (red)", "map/graph")}
+    titles: Titles = {("Network: links, messages that arrive and that are lost", "map/graph")}
     for node in ("node1", "node3"):
         plots, own = run.quality(node)
         wanted |= plots
@@ -286,7 +286,12 @@ def test_a_network_has_messages_on_their_way_and_the_errors_of_its_nodes(tmp_pat
     lines = np.stack([sender + left + 0.05 * way, sender + left + share * way], axis=1)
     wanted["/map/graph/messages"] = Wanted("lines", links.publish_time_ns, lines)
     said = "/events/links"  # see `test_set_timelines`
-    compare({name: rows for name, rows in run.picture.moving.items() if name != said}, wanted)
+    named = {f"/map/errors/{name}/names" for name in ESTIMATORS}
+    compare({name: run.picture.moving[name] for name in {*run.picture.moving} - {said, *named}}, wanted)
+    for entity in named:  # nodes that are close share a label
+        labels = [" ".join(each).split() for each in run.picture.moving[entity]["Points2D:labels"]]
+        assert all(len(set(each)) == len(each) for each in labels)
+        assert sorted(labels[-1]) == list("13")
     check_views(run.picture, {*titles, ("Events", "events")})
 
 

@@ -79,10 +79,10 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     check_clocks(picture.moving, SIMULATION_EPOCH_NS, [each.stream for each in outputs.values()])
     empty = [len(row) == 0 for row in picture.moving["/map/scans/radar"]["Points2D:positions"]]
     assert np.flatnonzero(empty).tolist() == [15]
-    assert picture.still["/map/legend"]["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
+    assert picture.still["/legend/map"]["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
     titles = {("GOSPA (m), c = 20 m", "plots/gospa"), ("Confirmed tracks (number)", "plots/count")}
     titles |= {
-        ("Existence (probability)", "plots/existence"),
+        ("Existence of each track (probability)", "plots/existence"),
         ("Events", "events"),
         ("jipda", "map/jipda"),
     }
