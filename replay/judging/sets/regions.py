@@ -51,7 +51,7 @@ def regions_of(
 
 def places_at(sizes: Ragged, truths: Sequence[Truths], gap_limit_s: float) -> Floats:
     """Return the true places (n, 2) at the stamps of regions; NaN where none is known."""
-    topic = sizes.stream.metadata["truth"]
+    topic = sizes.stream.metadata.get("truth", "")
     return np.concatenate(
         [
             reference(each, topic, PLACE, sizes.of_run(run), gap_limit_s)
