@@ -12,7 +12,6 @@ from typing import Literal, NamedTuple
 
 import contourpy
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats
@@ -247,6 +246,8 @@ def _nothing(order: Order) -> PseudoEllipsoid:
 
 def _weights(rings: Floats, arena: Arena, order: Order, weighting: Weighting, sweeps: int) -> Floats:
     """Find weights (k,) of the rings, with a sum of one."""
+    from scipy.optimize import minimize, minimize_scalar  # which takes long to import
+
     count = len(rings)
     equal = np.full(count, 1.0 / count)
     if weighting == "equal":
@@ -315,6 +316,8 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
     Its C^e is s A^-1, with the information A and the most room s, and a weight is lambda times s. Its
     prior is wide and proper, or the first determinants were infinite; it stays a part of the set.
     """
+    from scipy.optimize import minimize_scalar  # which takes long to import
+
     fused = _nothing(order)._replace(information=np.eye(order) / PRIOR_VARIANCE, constant=-1.0)
     for ring in np.tile(rings, (sweeps, 1)):
         most = most_room(fused)
