@@ -27,7 +27,8 @@ def choices(name: str, known: Collection[str]) -> str:
     from difflib import get_close_matches  # for a mistake alone, not for every start
 
     few = len(known) <= _COMPARED and all(len(each) <= _COMPARED for each in (name, *known))
-    near = get_close_matches(name, known, n=1) if few else []
+    near = [each for each in known if each.lower() == name.lower()]
+    near = near or (get_close_matches(name, known, n=1) if few else [])
     near = near or [each for each in known if name and name in each]
     return f"did you mean '{near[0]}'?" if near else f"there are: {some_of(known) or 'none'}"
 

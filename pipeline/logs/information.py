@@ -20,13 +20,16 @@ from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine.compiling.cache import cache_folder, kept_files
 from replay.engine.replaying.estimator import Bound, Estimator, bound_to
+from replay.engine.replaying.truth import truths_among
 from replay.engine.streams.sources import LogSource
+from replay.foreign.naming import KINDS as PROGRAMS
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model
 from replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
+MOST_TOPICS = 6  # that one line names
 ESTIMATES = "/estimates/"  # what topics of estimates logs begin with
 
 
@@ -145,45 +148,59 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))
-    used = (topic for each in bound.values() for one in each for topic in (*one.static, *one.streams))
-    return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
+    used = _topics_used([one for each in bound.values() for one in each])
+    return Fitting(used, list(bound), [] if bound else lacks[:1])
 
 
-def estimators_that_fit(topics: Mapping[str, Topic]) -> list[str]:
-    """Return which registered estimators fit a log that are no methods for models, such as trackers."""
-    found = []
+def estimators_that_fit(topics: Mapping[str, Topic]) -> dict[str, list[str]]:
+    """Return which estimators without a model, such as trackers, fit a log, and the topics of each."""
+    found: dict[str, list[str]] = {}
     for name in available("estimators"):
-        if name not in METHODS:
+        if name not in {*METHODS, *PROGRAMS}:
             with suppress(BadInput):
                 estimator = load("estimators", name, Estimator)
                 parameters = build(estimator.parameters, {}, f"estimator {name}")
                 with foreign_code(f"estimator {name}"):
-                    if bound_to(estimator, name, topics, parameters):
-                        found.append(name)
+                    if bound := bound_to(estimator, name, topics, parameters):
+                        found[name] = _topics_used(bound)
     return found
 
 
+def _topics_used(bound: Sequence[Bound]) -> list[str]:
+    return list(dict.fromkeys(topic for one in bound for topic in (*one.static, *one.streams)))
+
+
 def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
-    """Print which models fit the log and how, or that none does; with `is_all` what others lack."""
+    """Print which models and other estimators fit the log; with `is_all` what other models lack."""
     fittings = fitting_of(log.topics)
     fit = {name: each for name, each in fittings.items() if each.methods}
     others = {name: each for name, each in fittings.items() if name not in fit}
-    if fit:
-        say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
+    by_topics: dict[tuple[str, ...], list[str]] = {}
+    used = {topic for each in fit.values() for topic in each.topics}
+    # others are loaded, which takes a while, only where a model leaves something to them
+    if is_all or not used.issuperset(set(log.topics) - truths_among(log.topics)):
+        for name, topics in estimators_that_fit(log.topics).items():
+            by_topics.setdefault(tuple(topics), []).append(name)
+    if fit or by_topics:
+        first = "ekf" if fit else next(iter(by_topics.values()))[0]
+        say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e {first}:")
     else:
-        others_fit = estimators_that_fit(log.topics)
-        if others_fit:
-            say(f"What can be done with it: fuselog replay {shlex.quote(str(path))} -e NAME, of")
-            say(f"  {' '.join(others_fit)}: see fuselog estimators NAME")
-        else:
-            why = nearest(registered_models(), log.topics)
-            say(f"No registered model fits it: {why}; {OWN_MODEL}")
+        why = nearest(registered_models(), log.topics)
+        say(f"No registered model fits it: {why}; {OWN_MODEL}")
     for name, each in fit.items():
-        say(f"  {name}: -e {' '.join(each.methods)}; from {', '.join(each.topics)}")
+        say(f"  {name}: -e {' '.join(each.methods)}; from {_some_topics(each.topics)}")
+    for seen, names in by_topics.items():
+        say(f"  without a model: -e {' '.join(names)}; from {_some_topics(seen)}")
     if fit and others and not is_all:
         say(f"  {', '.join(others)}: do not fit; --all says what they need")
     for name, each in others.items() if is_all else ():
         say(f"  {name}: needs {'; '.join(each.lacks)}")
+
+
+def _some_topics(topics: Sequence[str]) -> str:
+    """Name topics, the first of many."""
+    more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
+    return ", ".join(topics[:MOST_TOPICS]) + more
 
 
 def _say_what_to_do(path: Path, log: Log) -> None:
@@ -265,6 +282,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "topics": topics,
         "findings": [each._asdict() for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
+        "estimators": estimators_that_fit(log.topics),
         "lost": log.loss_statement,
     }
 

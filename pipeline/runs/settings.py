@@ -9,6 +9,7 @@ from pipeline.altering.changes import by_topic, is_of_topic, is_parameter
 from recorders.errors import BadInput, choices
 from recorders.parameters import in_few_words, meanings, merge, parse_settings
 from recorders.parsing import read_toml
+from recorders.registry import available
 from replay.engine.replaying.estimator import Bound, specified
 from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
@@ -96,6 +97,8 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
             raise BadInput(f"--set {key}: this command takes no settings of topics; leave it out")
         if not takers and key in OPTIONS:
             raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
+        if not takers and isinstance(settings[key], Mapping) and key in available("estimators"):
+            raise BadInput(f"--set {key}: the estimator {key} is not replayed; add -e {key}")
         if not takers:
             names = sorted(set(chosen).union(*known.values()))
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")

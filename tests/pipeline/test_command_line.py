@@ -227,8 +227,29 @@ def test_info_names_the_tracker_of_detections(
     ]
     fl.write("seen.mcap", streams)
     said = fuselog("info", "seen.mcap").out
-    assert "fuselog replay seen.mcap -e NAME, of\n  tracker" in said
+    assert (
+        "as in fuselog replay seen.mcap -e gm-phd:\n  without a model: -e gm-phd tracker; from " in said
+    )
     assert "No registered model" not in said
+    used = ["/radar/scan", "/radar/detection"]
+    found = fuselog("info", "seen.mcap", "--json").json["estimators"]
+    assert found == {"gm-phd": used, "tracker": used}
+
+
+def test_info_names_the_estimators_of_what_a_fitting_model_leaves(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert fuselog("record", "vehicles", "--set", "duration_s=3").code == 0
+    said = fuselog("info", "vehicles.mcap").out
+    assert "  vehicle: -e ekf iekf" in said
+    assert "  without a model: -e gm-phd; from /infrastructure/scan" in said
+    assert "  without a model: -e vehicle-particles vehicles; from /vehicle1/prior" in said
+    replay = ("replay", "vehicles.mcap", "-e")
+    assert "did you mean 'gm-phd'?" in fuselog(*replay, "GM-PHD").err
+    assert "--set ukf: the estimator ukf is not replayed; add -e ukf" in (
+        fuselog(*replay, "ekf", "--set", "ukf.gate_probability=1").err
+    )
 
 
 def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:

@@ -191,7 +191,10 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
     if bound_rad is None and "bound_rad" in topic.metadata:
         bound_rad = _numbers(topic, "bound_rad")[0]
     if bound_rad is None:
-        raise BadInput(f"topic {topic.name} does not state bound_rad; give it with --set bound_deg=...")
+        raise BadInput(
+            f"topic {topic.name}: the bound of its relative bearings is unknown; give it with --set "
+            "bound_deg=..., in degrees, or state bound_rad on its channel"
+        )
     return Known(bound_rad, parameters.least_landmarks, arena_m, range_m)
 
 

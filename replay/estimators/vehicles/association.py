@@ -7,7 +7,6 @@ The weights are those of a scan with detection probability p_D and Poisson clutt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
@@ -92,6 +91,8 @@ def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 def _assigned(gain: Floats) -> Integers:
     """Find the map (vehicles,) of most gain (vehicles, detections) in sum; being missed has 0."""
+    from scipy.optimize import linear_sum_assignment  # which takes long to import
+
     vehicle, detection = linear_sum_assignment(-np.maximum(gain, 0.0))
     chosen = np.full(len(gain), MISSED)
     chosen[vehicle] = np.where(gain[vehicle, detection] > 0.0, detection, MISSED)
@@ -161,6 +162,8 @@ def log_permanents(logs: Floats) -> Floats:
         shared[columns] = sum(shared[columns ^ (1 << last)] * entries[row, last] for last in taken)
     with np.errstate(divide="ignore"):
         found: Floats = np.log(shared[-1]) + greatest[..., 0].sum(axis=1)
+    from scipy.optimize import linear_sum_assignment  # which takes long to import
+
     for index in np.flatnonzero(np.isneginf(found)):
         found[index] = flat[index][linear_sum_assignment(-flat[index])].sum()
     return found.reshape(logs.shape[:-2])
