@@ -245,7 +245,7 @@ TOLERANCES = {
 }
 # These are in colours of their own, below whatever estimator.
 OF_NO_ESTIMATOR = {
-    *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle"),
+    *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle", "names"),
     "without_fixes",
 }
 # What a view has beside its data, and the names of columns that are data.

@@ -232,7 +232,7 @@ def test_two_headings_are_cells_of_a_torus(tmp_path: Path) -> None:
     for row, mean in zip(samples["Points2D:positions"], cells(one["mean"]), strict=True):
         assert np.min(np.linalg.norm(np.array(row) - mean, axis=1)) < 0.5
     compare(run.picture.moving, wanted)
-    title = "Torus: density and samples of one, truth grey, measurement yellow"
+    title = "Heading 2 (deg) over heading 1 (deg); density and samples of one"
     check_views(run.picture, {*titles, (title, "torus")})
 
 
