@@ -227,6 +227,7 @@ READERS = {
     "rays": lambda columns: _directed(_strips(columns)),
     "rays in space": lambda columns: _directed(_strips(columns, "LineStrips3D")),
     "arrows": _arrows,
+    "places in space": lambda columns: np.array(_each(columns, "Points3D:positions")),
     "ellipses": _moments,
     "ellipsoids": _ellipsoids,
     "turns": lambda columns: np.array(_each(columns, "Transform3D:quaternion")),
