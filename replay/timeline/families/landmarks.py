@@ -1,6 +1,6 @@
 """Draws robots: each on its map of landmarks, its errors, NEES, NIS and events."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -31,6 +31,7 @@ from replay.timeline.drawing.plane import (
     draw_clouds,
     draw_ellipses,
     draw_lines,
+    draw_outlines,
     draw_path,
     draw_points,
     draw_poses,
@@ -56,6 +57,8 @@ SIGHTINGS = {
 }
 SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
+# What states how far and how widely a sensor sees; how its view is drawn.
+VIEW, CORNERS, SEEN_UP_TO = ("maximum_range_m", "field_of_view_deg"), 49, (110, 110, 90)
 # A pose is too old to look from after so long.
 FRESH_NS = 500_000_000
 
@@ -101,6 +104,7 @@ def _draw_robot(
     paths = [draw_track(canvas, root, track, extent_of(shown)) for track in tracks]
     draw_clouds(canvas, scene, robot, root)
     sights = draw_sights(canvas, scene, robot, tracks, landmarks)
+    sights |= _draw_view(canvas, scene, robot, tracks)
     _, areas = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
     board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
@@ -167,6 +171,26 @@ def draw_sights(
     draw_lines(canvas, entity_path(ROOT, robot, "sights"), time_ns[known], lines[known], colours[known])
     named = {"measured": (SEEN, known & ~gated), "rejected": (GATED, known & gated)}
     return {name: colour[:3] for name, (colour, rows) in named.items() if rows.any()}
+
+
+def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) -> dict[str, Colour]:
+    """Draw up to where the robot sees landmarks, if the run's parameters state it; names the colour."""
+    run, truths = scene.source.run, [track for track in tracks if track.name == "truth"]
+    for topic in scene.topics_near(robot):
+        sensor = topic.rpartition("/")[2]
+        stated = run.parameters.get(sensor) if run else None
+        is_seeing = scene.source.topics[topic].schema_name in SIGHTINGS and truths
+        if is_seeing and isinstance(stated, Mapping) and {*VIEW} <= {*stated}:
+            reach_m, opening_deg = (float(stated[name]) for name in VIEW)
+            [truth] = truths
+            angle = truth.poses[:, 2:] + np.radians(opening_deg) * np.linspace(-0.5, 0.5, CORNERS)
+            place = truth.poses[:, None, :2]
+            rim = place + reach_m * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+            outlines = rim if opening_deg == 360.0 else np.concatenate([place, rim, place], axis=1)
+            root = entity_path(ROOT, robot, "field of view")
+            draw_outlines(canvas, root, truth.time_ns, outlines, Stroke(SEEN_UP_TO, 0.5))
+            return {"field of view": SEEN_UP_TO}
+    return {}
 
 
 def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:

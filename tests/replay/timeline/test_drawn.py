@@ -35,7 +35,8 @@ from tests.replay.timeline.reading import Titles, Wanted, check_views, compare, 
 
 
 def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> None:
-    source = record("landmarks", duration_s=2.0, robots=2, landmarks=4)
+    view = {"maximum_range_m": 7.0, "field_of_view_deg": 350.0}
+    source = record("landmarks", duration_s=2.0, robots=2, landmarks=4, range_bearing=view)
     seen = source.streams["/robot2/range_bearing"]
     values, squared = np.full((len(seen), 2), 0.1), 0.01 * np.arange(len(seen))
     values[1::3, 0] = np.nan
@@ -68,6 +69,12 @@ def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> 
             if field == "mean":
                 wanted[f"{root}/ellipse"] = ellipses(stream, places, block(stream, *PLANE))
         sights, truth = source.streams[f"/{case}/range_bearing"], run.truth(case)
+        x, y, heading = columns(truth, "state", *PLANE, "heading_rad").T[..., None]
+        angle = heading + np.radians(np.linspace(-175.0, 175.0, 49))
+        rim = np.stack([x + 7.0 * np.cos(angle), y + 7.0 * np.sin(angle)], axis=2)
+        here = np.stack([x, y], axis=2)
+        outline = np.concatenate([here, rim, here], axis=1)
+        wanted[f"/map/{case}/field\\ of\\ view"] = Wanted("lines", truth.publish_time_ns, outline)
         order = np.lexsort((sights["target_id"], sights.publish_time_ns))
         time_ns = sights.publish_time_ns[order]
         begin = columns(truth, "state", *PLANE)[np.searchsorted(truth.publish_time_ns, time_ns)]
