@@ -161,7 +161,7 @@ def _draw_plane(
         draw_clouds(canvas, scene, case, root)
         named = {track.name: track.stroke.colour for track in tracks}
         named |= draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
-    for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
+    for stream, colour in zip(sensed, scene.spare_colours, strict=False):
         entity, stroke = f"{root}/{_name(stream, case)}", Stroke(colour)
         if stream.schema.full_name != LANDMARK:  # which is numbered
             named[_name(stream, case)] = colour

@@ -6,9 +6,10 @@ no dates, as those of a simulated clock in a bag, `utc` is when they reached the
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import cycle
 
 import numpy as np
 import rerun as rr
@@ -88,6 +89,12 @@ class Scene:
     def colour(self, estimator: str) -> Colour:
         """Return the one colour that `estimator` has everywhere."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
+
+    @property
+    def spare_colours(self) -> Iterator[Colour]:
+        """Return colours without end, first those that no estimator has."""
+        used = len(self.estimators) % len(PALETTE)
+        return cycle([*PALETTE[used:], *PALETTE[:used]])
 
     def width(self, estimator: str) -> float:
         """Return how wide lines of `estimator` are, in pixels, so that one on another shows both.

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import MUTED, Board, Canvas, Colour
+from replay.timeline.drawing.canvas import MUTED, Canvas, Colour
 from replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
 from replay.timeline.sinks import open_recording
 
@@ -31,12 +31,19 @@ def save_curves(title: str, panels: Sequence[CurvePanel], rrd: Path) -> None:
     with open_recording("fuselog-curves", title, save=rrd) as recording:
         recording.send_recording_name(title)
         canvas = Canvas(recording, 0, 0, np.zeros(1, np.int64))
-        views = [curve_view(canvas, f"curves/{number}", panel) for number, panel in enumerate(panels)]
+        views = []
+        for number, panel in enumerate(panels):
+            view = curve_view(canvas, f"curves/{number}", panel)
+            views.append(with_legend(canvas, str(number), _colours(panel), view))
         recording.send_blueprint(rrb.Blueprint(rrb.Grid(*views), collapse_panels=True))
 
 
-def curve_view(canvas: Canvas, root: str, panel: CurvePanel) -> Board:
-    """Draw a panel below an entity; return its view below its legend."""
+def _colours(panel: CurvePanel) -> dict[str, Colour]:
+    return {name: panel.strokes[name].colour for name in panel.curves}
+
+
+def curve_view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DView:
+    """Draw a panel below an entity and return its view."""
     turn_up(canvas, root)
     logs = {name: _drawn(places) for name, places in panel.curves.items()}
     places = np.concatenate(list(logs.values()))
@@ -44,14 +51,12 @@ def curve_view(canvas: Canvas, root: str, panel: CurvePanel) -> Board:
     _draw_decades(canvas, f"{root}/decades", low, high)
     for name, line in logs.items():
         canvas.fix(f"{root}/{name}", rr.LineStrips2D([line], **panel.strokes[name].fields()))
-    colours: dict[str, Colour] = {name: panel.strokes[name].colour for name in logs}
-    view = rrb.Spatial2DView(
+    return rrb.Spatial2DView(
         origin="/",
         contents=[f"{root}/**"],
         name=panel.name,
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )
-    return with_legend(canvas, root, colours, view)
 
 
 def _drawn(places: Floats) -> Floats:

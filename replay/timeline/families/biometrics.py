@@ -13,7 +13,6 @@ from replay.judging.consistency.verification import Floats, Fused, fused_of, roc
 from replay.timeline.drawing.canvas import (
     PALETTE,
     WRONG,
-    Board,
     Canvas,
     Scene,
     Timeline,
@@ -23,7 +22,7 @@ from replay.timeline.drawing.canvas import (
     escaped,
 )
 from replay.timeline.drawing.curves import CurvePanel, curve_view
-from replay.timeline.drawing.plane import stroke_of
+from replay.timeline.drawing.plane import stroke_of, with_legend
 from replay.timeline.drawing.plots import LINE, POINTS, below_legend, plot_view
 
 GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
@@ -48,7 +47,9 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
         boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), rates]
     if matched:
         boards.append(rrb.Horizontal(*matched))
-    return rrb.Vertical(*boards, name=case or "run")
+    colours = scene.colours(case) | {"genuine": GENUINE, "impostor": IMPOSTOR}
+    board = with_legend(canvas, entity_path("biometrics", case), colours, rrb.Vertical(*boards))
+    return rrb.Vertical(board, name=case or "run")
 
 
 def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> rrb.Container:
@@ -59,12 +60,12 @@ def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> r
     _draw_probes(canvas, f"{root}/scores", fused, time_ns)
     return rrb.Horizontal(
         _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
-        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-"),
+        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-", legend=False),
         name=estimator,
     )
 
 
-def _draw_rates(canvas: Canvas, scene: Scene, case: str) -> Board:
+def _draw_rates(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
     """Draw both rates of errors at every threshold, a curve for each fusion of a case."""
     curves, strokes = {}, {}
     for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
@@ -85,7 +86,7 @@ def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
         last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
         canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
         canvas.fix(f"{plot}/{estimator}", LINE(names=[estimator], colors=[scene.colour(estimator)]))
-    return plot_view(plot, "Wrong decisions so far", "%")
+    return plot_view(plot, "Wrong decisions so far", "%", legend=False)
 
 
 def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> None:
@@ -164,7 +165,7 @@ def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times
     return rrb.BarChartView(
         origin=escaped(entity),
         name="Scores so far (share in each bin)",
-        plot_legend=rrb.Corner2D.RightTop,
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 
@@ -186,7 +187,7 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
         without = f", without {left_out} that it could not enrol" if left_out else ""
         extent = below_legend([fused.score[fused.genuine], fused.score[~fused.genuine]])
         title = f"{matchers[index].name}: score of each probe{without}"
-        views.append(plot_view(plot, title, "-", extent, zoom_lock=False))
+        views.append(plot_view(plot, title, "-", extent, legend=False, zoom_lock=False))
     return views
 
 

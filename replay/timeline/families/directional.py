@@ -20,6 +20,8 @@ from replay.judging.consistency.disturbances import COMPONENTS, disturbances
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.canvas import (
     TRUTH,
+    WIDTH,
+    Board,
     Canvas,
     Colour,
     Scene,
@@ -32,6 +34,7 @@ from replay.timeline.drawing.canvas import (
     thin,
 )
 from replay.timeline.drawing.events import Happened, above_events, draw_events
+from replay.timeline.drawing.plane import GRID, Stroke, with_legend
 from replay.timeline.drawing.plots import draw_quality
 
 QUATERNION = COMPONENTS[:4]
@@ -40,6 +43,9 @@ PICTURES = 500
 CELLS = 96
 OUTLINE_POINTS = 145
 MEASURED: Colour = (240, 228, 66)
+SAMPLES: Colour = (255, 255, 255)
+# The radius of an estimate on the torus.
+DOT_PX = 6.0
 AXES: tuple[Colour, Colour, Colour] = ((230, 60, 60), (80, 200, 80), (80, 120, 240))
 
 
@@ -78,7 +84,7 @@ def _track(name: str, colour: Colour, stream: Stream, field: str, rows: int) -> 
 
 
 def _draw_with(
-    board: Callable[[Canvas, Scene, str], rrb.View], canvas: Canvas, scene: Scene
+    board: Callable[[Canvas, Scene, str], Board], canvas: Canvas, scene: Scene
 ) -> rrb.Container | rrb.View:
     """Draw a board above the events of each case, its errors beside it."""
 
@@ -200,7 +206,7 @@ def _draw_strips(
     canvas.fix(entity, rr.LineStrips2D.from_fields(colors=[colour], radii=radii))
 
 
-def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
+def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> Board:
     """Draw the first estimator's density as a heat map, with its five samples sized by weight.
 
     The others, truth and measurement are points. Heading 1 goes right, heading 2 up, from -pi to pi.
@@ -212,15 +218,39 @@ def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
         if track.covariances is not None and not mapped:
             mapped = track.name
             _draw_density(canvas, root, track)
-        _draw_dots(canvas, f"{root}/{track.name}", track.time_ns, track.states, track.colour, 6.0)
+        larger = 1.0 if track.name == "truth" else scene.width(track.name) / WIDTH
+        radius_px = DOT_PX * larger
+        _draw_dots(canvas, f"{root}/{track.name}", track.time_ns, track.states, track.colour, radius_px)
     if "/headings" in scene.source.topics:
         stream = scene.read("/headings")
         kept = thin(stream.publish_time_ns, PICTURES)
         seen = (stream.publish_time_ns[kept], stream["value"][kept])
         _draw_dots(canvas, f"{root}/measurement", *seen, MEASURED, 4.0)
-    bounds = rrb.VisualBounds2D(x_range=(0, CELLS), y_range=(0, CELLS))
-    name = f"Torus: density and samples of {mapped or 'none'}, truth grey, measurement yellow"
-    return rrb.Spatial2DView(origin=escaped(root), name=name, visual_bounds=bounds)
+    _draw_ticks(canvas, f"{root}/ticks")
+    bounds = rrb.VisualBounds2D(
+        x_range=(-0.12 * CELLS, 1.04 * CELLS), y_range=(-0.04 * CELLS, 1.12 * CELLS)
+    )
+    name = f"Heading 2 (deg) over heading 1 (deg); density and samples of {mapped or 'none'}"
+    view = rrb.Spatial2DView(origin=escaped(root), name=name, visual_bounds=bounds)
+    colours = scene.colours(case) | {"measured": MEASURED} | ({"samples": SAMPLES} if mapped else {})
+    return with_legend(canvas, root, colours, view)
+
+
+def _draw_ticks(canvas: Canvas, entity: str) -> None:
+    """Draw lines at quarters of both headings, with their degrees at the left and at the bottom."""
+    share, ends = np.linspace(0.0, 1.0, 5), np.array([0.0, CELLS])
+    across = [np.stack([ends, np.full(2, at)], axis=1) for at in CELLS * (1.0 - share)]
+    lines = [*across, *(line[:, ::-1] for line in across)]
+    style = Stroke(GRID).fields()
+    canvas.fix(entity, rr.LineStrips2D(lines, **style))
+    beside, below = np.full(5, -0.06 * CELLS), np.full(5, 1.05 * CELLS)
+    at = np.concatenate(
+        [np.stack([beside, CELLS * (1.0 - share)], axis=1), np.stack([CELLS * share, below], axis=1)]
+    )
+    labels = [f"{degrees:g}°" for degrees in 360.0 * share - 180.0] * 2
+    canvas.fix(
+        f"{entity}/numbers", rr.Points2D(at, labels=labels, colors=[TRUTH], radii=0.0, show_labels=True)
+    )
 
 
 def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
@@ -248,7 +278,7 @@ def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
     radii = 1.5 * np.sqrt(samples.weights / 0.2).ravel()
     points = rr.Points2D.columns(positions=spots, radii=radii)
     canvas.send(f"{root}/samples", time_ns, points.partition([5] * len(time_ns)))
-    canvas.fix(f"{root}/samples", rr.Points2D.from_fields(colors=[(255, 255, 255)], draw_order=30.0))
+    canvas.fix(f"{root}/samples", rr.Points2D.from_fields(colors=[SAMPLES], draw_order=30.0))
 
 
 def _draw_dots(
@@ -258,7 +288,9 @@ def _draw_dots(
         return
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=_on_map(headings)))
     radii = rr.Radius.ui_points(radius_px)
-    canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii, draw_order=40.0))
+    canvas.fix(
+        entity, rr.Points2D.from_fields(colors=[colour], radii=radii, draw_order=50.0 - radius_px)
+    )
 
 
 def _on_map(headings_rad: Floats) -> Floats:

@@ -1,5 +1,6 @@
 """Draws robots: each on its map of landmarks, its errors, NEES, NIS and events."""
 
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 import pandas as pd
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
+from recorders.log import Stream, schemas, topics_of
 from replay.engine.streams.measurements import PLANE, covariances_of
 from replay.judging.errors.evaluation import Floats
 from replay.timeline.drawing.canvas import (
@@ -30,6 +31,7 @@ from replay.timeline.drawing.plane import (
     draw_clouds,
     draw_ellipses,
     draw_lines,
+    draw_outlines,
     draw_path,
     draw_points,
     draw_poses,
@@ -46,9 +48,17 @@ from replay.timeline.families.sets import draw_sets
 HEADING = "heading_rad"
 # An arrow is so long, as a share of the scene.
 ARROW_SHARE = 0.04
-SIGHTINGS = tuple(each.full_name for each in (schemas.RANGE_BEARING, schemas.RANGE, schemas.BEARING))
+# Schemas of what is seen of a landmark, and the field that has its number.
+SIGHTINGS = {
+    schemas.RANGE_BEARING.full_name: "target_id",
+    schemas.RANGE.full_name: "target_id",
+    schemas.BEARING.full_name: "target_id",
+    schemas.ANCHOR_RANGE.full_name: "anchor_id",
+}
 SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
+# What states how far and how widely a sensor sees; how its view is drawn.
+VIEW, CORNERS, SEEN_UP_TO = ("maximum_range_m", "field_of_view_deg"), 49, (110, 110, 90)
 # A pose is too old to look from after so long.
 FRESH_NS = 500_000_000
 
@@ -76,7 +86,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def landmarks_of(scene: Scene) -> pd.DataFrame:
     """Return places (n, 2) by number; none where the log has no map, as that of estimates."""
-    stream = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
+    maps = topics_of(scene.source.topics, schemas.LANDMARK)
+    stream = scene.read("/landmarks" if "/landmarks" in maps else maps[0]) if maps else None
     if stream is None or not len(stream):
         return pd.DataFrame(np.empty((0, 2)), index=np.empty(0, np.int64))
     places = stream["position_m"].reshape(len(stream), -1)[:, :2]
@@ -93,6 +104,7 @@ def _draw_robot(
     paths = [draw_track(canvas, root, track, extent_of(shown)) for track in tracks]
     draw_clouds(canvas, scene, robot, root)
     sights = draw_sights(canvas, scene, robot, tracks, landmarks)
+    sights |= _draw_view(canvas, scene, robot, tracks)
     _, areas = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
     board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
@@ -147,9 +159,10 @@ def draw_sights(
         for topic in scene.topics_near(robot)
         if scene.source.topics[topic].schema_name in SIGHTINGS
     ]
-    seen = _pairs([each.take(np.isin(each["target_id"], landmarks.index)) for each in sensors])
+    seen = _pairs((each, SIGHTINGS[each.schema.full_name]) for each in sensors)
+    seen = seen[seen.get_level_values(1).isin(landmarks.index)]
     judged = [stream for _, stream in scene.outputs_of(robot, schemas.INNOVATION)]
-    gated = seen.isin(_pairs([each.take(each["accepted"] == 0) for each in judged]))
+    gated = seen.isin(_pairs((each.take(each["accepted"] == 0), "target_id") for each in judged))
     time_ns = seen.get_level_values(0).to_numpy()
     ends = landmarks.loc[seen.get_level_values(1)].to_numpy()
     lines = np.stack([_places_at(tracks, time_ns), ends], axis=1)
@@ -160,12 +173,33 @@ def draw_sights(
     return {name: colour[:3] for name, (colour, rows) in named.items() if rows.any()}
 
 
-def _pairs(streams: list[Stream]) -> pd.MultiIndex:
-    """Return the distinct (time, target) of some streams, sorted."""
-    times = [stream.publish_time_ns for stream in streams]
-    targets = [stream["target_id"].astype(np.int64) for stream in streams]
-    none = [np.empty(0, np.int64)]
-    pairs = [np.concatenate(times or none), np.concatenate(targets or none)]
+def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) -> dict[str, Colour]:
+    """Draw up to where the robot sees landmarks, if the run's parameters state it; names the colour."""
+    run, truths = scene.source.run, [track for track in tracks if track.name == "truth"]
+    for topic in scene.topics_near(robot):
+        sensor = topic.rpartition("/")[2]
+        stated = run.parameters.get(sensor) if run else None
+        is_seeing = scene.source.topics[topic].schema_name in SIGHTINGS and truths
+        if is_seeing and isinstance(stated, Mapping) and {*VIEW} <= {*stated}:
+            reach_m, opening_deg = (float(stated[name]) for name in VIEW)
+            [truth] = truths
+            angle = truth.poses[:, 2:] + np.radians(opening_deg) * np.linspace(-0.5, 0.5, CORNERS)
+            place = truth.poses[:, None, :2]
+            rim = place + reach_m * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+            outlines = rim if opening_deg == 360.0 else np.concatenate([place, rim, place], axis=1)
+            root = entity_path(ROOT, robot, "field of view")
+            draw_outlines(canvas, root, truth.time_ns, outlines, Stroke(SEEN_UP_TO, 0.5))
+            return {"field of view": SEEN_UP_TO}
+    return {}
+
+
+def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
+    """Return the distinct (time, target) of some streams, sorted; each with the field of its targets."""
+    times, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for stream, field in streams:
+        times.append(stream.publish_time_ns)
+        targets.append(stream[field].astype(np.int64))
+    pairs = [np.concatenate(times), np.concatenate(targets)]
     return pd.MultiIndex.from_arrays(pairs).unique().sort_values()
 
 

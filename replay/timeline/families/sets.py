@@ -20,6 +20,7 @@ from replay.timeline.drawing.canvas import (
     beside,
     draw_cases,
     entity_path,
+    nice,
 )
 from replay.timeline.drawing.events import above_events, draw_events
 from replay.timeline.drawing.plane import (
@@ -68,7 +69,7 @@ def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
 ) -> tuple[Floats, list[rrb.TimeSeriesView]]:
     """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas."""
-    plot, corners = entity_path("plots", case, "area"), []
+    plot, corners, areas = entity_path("plots", case, "area"), [], {}
     for estimator, sizes in scene.outputs_of(case, schemas.ESTIMATE_SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")
         if topic not in scene.outputs:
@@ -78,14 +79,18 @@ def draw_sets(
         polygons = [ring for rings in frames for ring in rings]
         time_ns = sizes.publish_time_ns
         draw_polygons(canvas, f"{root}/{estimator}", time_ns, counts, polygons, Stroke(colour, 1.5))
-        draw_curve(canvas, plot, estimator, colour, time_ns, areas_of(frames), FRAMES)
+        areas[estimator] = areas_of(frames)
+        draw_curve(canvas, plot, estimator, colour, time_ns, areas[estimator], FRAMES)
         corners += [[ring.min(axis=0), ring.max(axis=0)] for ring in polygons]
     if not corners:
         return np.empty((0, 2)), []
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     low, high = np.moveaxis(np.array(corners), 1, 0)
     reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
-    return reach, [plot_view(plot, "Area of the set", "m²")]
+    last = ", ".join(f"{each[-1]:.3g} by {estimator}" for estimator, each in areas.items())
+    largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
+    extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
+    return reach, [plot_view(plot, "Area of the set", "m²", extent, note=note, legend=False)]
 
 
 TIMELINE = Timeline(draw)

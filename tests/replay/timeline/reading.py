@@ -227,6 +227,7 @@ READERS = {
     "rays": lambda columns: _directed(_strips(columns)),
     "rays in space": lambda columns: _directed(_strips(columns, "LineStrips3D")),
     "arrows": _arrows,
+    "places in space": lambda columns: np.array(_each(columns, "Points3D:positions")),
     "ellipses": _moments,
     "ellipsoids": _ellipsoids,
     "turns": lambda columns: np.array(_each(columns, "Transform3D:quaternion")),
@@ -245,7 +246,7 @@ TOLERANCES = {
 }
 # These are in colours of their own, below whatever estimator.
 OF_NO_ESTIMATOR = {
-    *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle"),
+    *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle", "names"),
     "without_fixes",
 }
 # What a view has beside its data, and the names of columns that are data.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from recorders.log import make_stream, schemas
 from recorders.models.optical import direction
@@ -34,7 +35,8 @@ from tests.replay.timeline.reading import Titles, Wanted, check_views, compare, 
 
 
 def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> None:
-    source = record("landmarks", duration_s=2.0, robots=2, landmarks=4)
+    view = {"maximum_range_m": 7.0, "field_of_view_deg": 350.0}
+    source = record("landmarks", duration_s=2.0, robots=2, landmarks=4, range_bearing=view)
     seen = source.streams["/robot2/range_bearing"]
     values, squared = np.full((len(seen), 2), 0.1), 0.01 * np.arange(len(seen))
     values[1::3, 0] = np.nan
@@ -67,6 +69,12 @@ def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> 
             if field == "mean":
                 wanted[f"{root}/ellipse"] = ellipses(stream, places, block(stream, *PLANE))
         sights, truth = source.streams[f"/{case}/range_bearing"], run.truth(case)
+        x, y, heading = columns(truth, "state", *PLANE, "heading_rad").T[..., None]
+        angle = heading + np.radians(np.linspace(-175.0, 175.0, 49))
+        rim = np.stack([x + 7.0 * np.cos(angle), y + 7.0 * np.sin(angle)], axis=2)
+        here = np.stack([x, y], axis=2)
+        outline = np.concatenate([here, rim, here], axis=1)
+        wanted[f"/map/{case}/field\\ of\\ view"] = Wanted("lines", truth.publish_time_ns, outline)
         order = np.lexsort((sights["target_id"], sights.publish_time_ns))
         time_ns = sights.publish_time_ns[order]
         begin = columns(truth, "state", *PLANE)[np.searchsorted(truth.publish_time_ns, time_ns)]
@@ -232,7 +240,7 @@ def test_two_headings_are_cells_of_a_torus(tmp_path: Path) -> None:
     for row, mean in zip(samples["Points2D:positions"], cells(one["mean"]), strict=True):
         assert np.min(np.linalg.norm(np.array(row) - mean, axis=1)) < 0.5
     compare(run.picture.moving, wanted)
-    title = "Torus: density and samples of one, truth grey, measurement yellow"
+    title = "Heading 2 (deg) over heading 1 (deg); density and samples of one"
     check_views(run.picture, {*titles, (title, "torus")})
 
 
@@ -417,3 +425,42 @@ def test_sets_without_names_are_where_the_vehicles_are_whatever_their_frame(tmp_
             states = [truth["state"][np.searchsorted(truth.publish_time_ns, stamp)] for truth in truths]
             apart = np.array(places)[:, None] - np.array(states)[:, [0, 2]]
             assert np.linalg.norm(apart, axis=2).min(axis=1).max() < 6.0
+
+
+def test_moving_targets_are_on_the_lines_that_sensors_measure_of_them(tmp_path: Path) -> None:
+    """Without noise and biases; what is close up are the errors, with their ellipsoids."""
+    exact = {"sigma_rad": 1e-9, "bias_sigma_rad": 0.0, "clock_sigma_s": 0.0, "acceleration_density": 0.0}
+    source = record("moving-los", duration_s=3.0, **exact)
+    run = drawn(tmp_path, source, of_both(source, ""))
+    truth = run.truth()
+    targets = [[f"target_{number}_{axis}_m" for axis in "xyz"] for number in (1, 2)]
+    ends = np.array([columns(truth, "state", *names)[[0, -1]] for names in targets])
+    for number in (1, 2, 3):
+        seen = source.streams[f"/sensor{number}/moving_line_of_sight"]
+        since = (seen.publish_time_ns - truth.publish_time_ns[0]) / np.ptp(truth.publish_time_ns)
+        begin, end = ends[seen["target_id"].astype(int) - 1].swapaxes(0, 1)
+        way = begin + since[:, None] * (end - begin) - seen["position_m"]
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        line = rays(seen.publish_time_ns, seen["position_m"], way, "rays in space")
+        entity = f"/sights/measured/sensor{number}"
+        compare({entity: run.picture.moving[entity]}, {entity: line})
+    for errors in run.errors:
+        for target, names in enumerate(targets, start=1):
+            at = [errors.components.index(name) for name in names]
+            entity = f"/close/target_{target}/{errors.estimator}"
+            places = Wanted("places in space", errors.time_ns, errors.error[:, at])
+            compare({entity: run.picture.moving[f"{entity}/place"]}, {entity: places})
+            half = np.array(run.picture.moving[entity]["Ellipsoids3D:half_sizes"])[:, 0]
+            spread = errors.covariance[:, at][:, :, at]
+            wanted = np.sqrt(chi2.ppf(0.95, 3) * np.linalg.eigvalsh(spread))
+            np.testing.assert_allclose(np.sort(half, axis=1), wanted, rtol=1e-5)
+
+
+def test_ranges_lead_to_the_anchors_that_they_are_of(tmp_path: Path) -> None:
+    source = record("ranging", duration_s=1.0)
+    run = drawn(tmp_path, source, of_both(source, "trolley"))
+    anchors, truth = source.streams["/anchors"]["position_m"][:, :2], run.truth("trolley")
+    places = np.repeat(columns(truth, "state", *PLANE), len(anchors), axis=0)
+    lines = np.stack([places, np.tile(anchors, (len(truth), 1))], axis=1)
+    wanted = Wanted("lines", np.repeat(truth.publish_time_ns, len(anchors)), lines)
+    compare({"sights": run.picture.moving["/map/trolley/sights"]}, {"sights": wanted})

@@ -31,7 +31,10 @@ def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:
         "/plots/robot1/area/one": Wanted("curve", stamps, [12.0, 0.0, 12.0 - 0.75]),
     }
     compare(run.picture.moving, wanted)
-    check_views(run.picture, {("Map", "map/robot1"), ("Area of the set (m²)", "plots/robot1/area")})
+    check_views(
+        run.picture,
+        {("Map", "map/robot1"), ("Area of the set (m²), at the end 11.2 by one", "plots/robot1/area")},
+    )
 
 
 def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path: Path) -> None:
