@@ -78,7 +78,8 @@ def draw(folder: Path, rng: np.random.Generator) -> Drawn:
     kind = choose("time", *TIMES)
     is_absolute = _times(kind, truth, rng, names)
     scale = choose(
-        "place", "deg", "deg", "deg", "1e-7", "1e-6 named", "semicircle", "ddmm", "hemispheres"
+        "place",
+        *("deg", "deg", "deg", "1e-7", "1e-6 named", "semicircle", "ddmm", "hemispheres", "letters"),
     )
     _places(scale, truth, rng, names, units)
     height = choose("altitude", "none", "m", "m", "mm named", "ft named")
@@ -114,6 +115,7 @@ def draw(folder: Path, rng: np.random.Generator) -> Drawn:
 TIMES = (
     "s", "ms", "us", "ns", "iso", "iso offset", "iso T Z", "day first", "month first", "date and time",
     "secs nsecs", "relative s", "relative ms named", "rollover us named", "hhmmss and date", "zone",
+    "day of year", "year to second", "dashed",
 )  # fmt: skip
 
 
@@ -139,6 +141,13 @@ def _times(kind: str, truth: Truth, rng: np.random.Generator, names: dict[str, l
         cells = {title: [each.isoformat() for each in local]}
         if kind == "zone":
             cells = {f"{title} [{zone.key}]": [f"{each:%Y-%m-%d %H:%M:%S.%f}" for each in local]}
+    elif kind == "day of year":
+        cells = {title: [f"{each:%Y-%jT%H:%M:%S.%f}" for each in utc]}
+    elif kind == "dashed":
+        cells = {title: [f"{each:%Y-%m-%d %H-%M-%S}_{each.microsecond // 1000:03d}" for each in utc]}
+    elif kind == "year to second":
+        parts = {"year": "%Y", "doy": "%j", "hour": "%H", "minute": "%M", "second": "%S.%f"}
+        cells = {name: [f"{each:{pattern}}" for each in utc] for name, pattern in parts.items()}
     elif kind in ("day first", "month first"):
         pattern = "%d/%m/%Y %H:%M:%S.%f" if kind == "day first" else "%m/%d/%Y %H:%M:%S.%f"
         cells = {title: [f"{each:{pattern}}" for each in utc]}
@@ -194,6 +203,10 @@ def _places(
     if scale == "semicircle":
         for title, values in zip(("position_lat", "position_long"), both, strict=True):
             names[title] = [str(round(each * 2**31 / 180)) for each in values.tolist()]
+        return
+    if scale == "letters":
+        for title, values, letters in zip(titles, both, ("NS", "EW"), strict=True):
+            names[title] = [f"{abs(each):.7f}{letters[int(each < 0)]}" for each in values]
         return
     if scale == "hemispheres":
         for title, values, letters in zip(titles, both, ("NS", "EW"), strict=True):

@@ -339,8 +339,9 @@ def _text_batches(
         ),
     )
     for batch in map(_by_name, batches):
-        if decimal != ".":  # Arrow minds it in numbers alone; of texts only those are mended
-            number = rf"^\s*([-+]?\d*){re.escape(decimal)}(\d+(?:[eE][-+]?\d+)?)\s*$"
+        if decimal != ".":  # Arrow minds it in numbers alone; of texts only those are mended, and 48,1N
+            begin, end = r"[NSEWnsew]?\s*[-+]?\d*", r"\d+(?:[eE][-+]?\d+)?\s*°?\s*[NSEWnsew]?"
+            number = rf"^\s*({begin}){re.escape(decimal)}({end})\s*$"
             for name in wanted:
                 if wanted[name]:
                     batch[name] = pc.replace_substring_regex(batch[name], number, r"\1.\2")
