@@ -81,6 +81,7 @@ def _verdict(made: Made, limit: Limit, side: float) -> str:
     return claim.verdict
 
 
+@pytest.mark.paper
 def test_printed_numbers_follow() -> None:
     """What a claim says of ours changes with what it reads, but where that is a ratio of its own."""
     same = [
