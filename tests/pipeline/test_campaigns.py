@@ -21,7 +21,7 @@ from pipeline.command_line import main
 from pipeline.output.results import TIMINGS
 from pipeline.runs import campaigns, executors
 from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, version_of_code
+from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, processes, version_of_code
 from pipeline.runs.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
 from pipeline.runs.inputs import Record
 from recorders.errors import BadInput
@@ -241,6 +241,16 @@ class Dying(InlineExecutor):
             future.set_exception(BrokenExecutor("it was killed"))
             return future
         return super().submit(work, *args, **kwargs)
+
+
+def test_a_worker_has_one_thread_for_linear_algebra() -> None:
+    """Also in SciPy, whose library is another than NumPy's and is loaded later."""
+    asked = (
+        "(__import__('scipy.linalg'), "
+        "{each['num_threads'] for each in __import__('threadpoolctl').threadpool_info()})[1]"
+    )
+    with processes(1)() as pool:
+        assert pool.executor.submit(eval, asked).result() == {1}
 
 
 @pytest.mark.paper
