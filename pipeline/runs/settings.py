@@ -98,7 +98,9 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
         if not takers and key in OPTIONS:
             raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
         if not takers and isinstance(settings[key], Mapping) and key in available("estimators"):
-            raise BadInput(f"--set {key}: the estimator {key} is not replayed; add -e {key}")
+            raise BadInput(
+                f"--set {key}: the estimator {key} is not replayed, {', '.join(labels)} is; add -e {key}"
+            )
         if not takers:
             names = sorted(set(chosen).union(*known.values()))
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")

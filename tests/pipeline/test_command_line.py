@@ -247,7 +247,7 @@ def test_info_names_the_estimators_of_what_a_fitting_model_leaves(
     assert "  without a model: -e vehicle-particles vehicles; from /vehicle1/prior" in said
     replay = ("replay", "vehicles.mcap", "-e")
     assert "did you mean 'gm-phd'?" in fuselog(*replay, "GM-PHD").err
-    assert "--set ukf: the estimator ukf is not replayed; add -e ukf" in (
+    assert "--set ukf: the estimator ukf is not replayed, ekf is; add -e ukf" in (
         fuselog(*replay, "ekf", "--set", "ukf.gate_probability=1").err
     )
 
