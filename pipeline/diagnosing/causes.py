@@ -1,6 +1,8 @@
 """Finds the likeliest causes of an inconsistent filter: the hypotheses that gain most, in turn."""
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +20,9 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     noise_gain_over,
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
+from pipeline.diagnosing.joint import Supposed, fit, undone
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import DROP_95, Peak, end, peak, rival, side_by_side
+from pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import MemorySource
@@ -29,7 +32,12 @@ RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
 SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
+CONTENDS = 0.8  # of what the likeliest gains: with more faults undone it may be likelier
+HIDDEN = 0.3  # of the least gain: what gains as much may gain enough if other causes are fitted again
 LEADING = 10  # of the likeliest faults: each is tried beside all others
+
+Named = tuple[Peak, Hypothesis]
+Names = list[Named]  # of one cause: what a log does not tell from it
 
 
 class Estimated(NamedTuple):
@@ -62,8 +70,12 @@ class Cause(NamedTuple):
 
     @property
     def statement(self) -> str:
-        """Return what is wrong, and by how much."""
-        return self.hypothesis.words(self.value, *self.ends)
+        """Return what is wrong, and by how much; without an interval if the fit did not converge."""
+        words = self.hypothesis.words(self.value, *self.ends)
+        if not np.isnan(self.ends).any():
+            return words
+        without = re.sub(r" \(nan[^)]*\)", "", words)
+        return f"{without} (no interval: the fit of all causes together did not converge)"
 
     @property
     def numbers(self) -> "list[Estimated]":
@@ -120,40 +132,234 @@ def least_gain(count: int, size: int = 1) -> float:
     return float(chi2.isf(FALSE_ALARMS / max(count, 1), size)) / 2.0
 
 
+class Found(NamedTuple):
+    """Holds a cause that is being fitted.
+
+    Attributes:
+        names: what the log does not tell apart, each with its number; the first is undone.
+        over: the trial over which the names gain what they do, while the cause is the only one.
+        contenders: what gained nearly as much, while other causes were not undone yet.
+    """
+
+    names: Names
+    over: Trial
+    contenders: Sequence[Hypothesis] = ()
+
+    @property
+    def supposed(self) -> Supposed:
+        """Return the likeliest name."""
+        at, of = self.names[0]
+        return Supposed(of, at.value)
+
+
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
     """Find at most `most` causes, the likeliest first; what each hypothesis gains; and one in doubt.
 
     Each cause gains most after all before it are undone: most in log-likelihood less what its numbers
-    cost. What the hypotheses gain is of the log as it is. In doubt is what gains most after all causes,
-    or more than the last, where the parts of the log disagree about its number.
+    cost. Several are fitted together. What the hypotheses gain is of the log as it is. In doubt is what
+    gains most after all causes, or more than the last, where the parts of the log disagree about its
+    number.
     """
-    found, listed, doubtful = list[Cause](), list[Tried](), list[tuple[Peak, Hypothesis]]()
-    candidates, now = list(tried), base
-    while candidates and len(found) < most:
-        gains_of = gains_over(likelihood, now)
-        peaks = _peaks(gains_of, candidates, len(tried))
-        listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
-        alike, doubtful = _likeliest(likelihood, now, peaks, candidates, len(tried))
-        if any(_is_gross(*pair) for pair in (*alike[:1], *doubtful)):
-            beside = _companion(likelihood, now, peaks, candidates)
-            if beside is not None:
-                one_less = beside.without(now)
-                gains_of = gains_over(likelihood, one_less)
-                others = [each for each in candidates if each is not beside.of]
-                peaks = _peaks(gains_of, others, len(tried))
-                alike = _likeliest(likelihood, one_less, peaks, others, len(tried))[0] or alike
-        if not alike:
-            break
-        alike[:1] = _with_rival(gains_of, alike[0], least_gain(len(tried)))
-        causes = _causes(gains_of, alike)
-        found.append(causes[0]._replace(others=tuple(causes[1:])))
-        now = causes[0].hypothesis.without(now, causes[0].value)
-        gone = {id(each) for _, each in alike}
-        candidates = [each for each in candidates if id(each) not in gone]
-    in_doubt = _causes(gains_over(likelihood, now), doubtful[:1]) if doubtful else []
-    return found, listed, _over_halves(likelihood, now, in_doubt) if in_doubt else []
+    search = _Search(likelihood, base, most, len(tried))
+    peaks = search.peaks(base, tried)
+    found, doubtful = search.more(tried, peaks, [])
+    now = search.without(found)
+    in_doubt = _causes(gains_over(likelihood, now), doubtful[:1])
+    listed = [Tried(each, at) for each, at in zip(tried, peaks, strict=True)]
+    return search.causes(found), listed, _over_halves(likelihood, now, in_doubt) if in_doubt else []
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Looks for causes one after the other, and fits those that are found together.
+
+    Attributes:
+        likelihood: of trials.
+        base: the log as it is, and the settings.
+        most: how many causes at most.
+        count: how many hypotheses there are.
+    """
+
+    likelihood: Likelihood
+    base: Trial
+    most: int
+    count: int
+
+    def peaks(self, now: Trial, candidates: Sequence[Hypothesis]) -> list[Peak]:
+        """Find the greatest gain of each over a trial."""
+        return _peaks(gains_over(self.likelihood, now), candidates, self.count)
+
+    def without(self, found: Sequence[Found]) -> Trial:
+        """Return the log without causes."""
+        return undone(self.base, [each.supposed for each in found])
+
+    def more(
+        self,
+        tried: Sequence[Hypothesis],
+        peaks: Sequence[Peak],
+        found: Sequence[Found],
+        *,
+        hidden: bool = True,
+    ) -> tuple[list[Found], list[Named]]:
+        """Add causes to those that are found until none is sure; and say what is in doubt after them.
+
+        `peaks` are what the hypotheses gain over those that are found. `hidden` says whether those are
+        looked for, too, that gain enough only together with a new fit of the others.
+        """
+        found, doubtful = list(found), list[Named]()
+        for _ in range(2 * self.most):  # a cause may go again
+            named = {id(of) for each in found for _, of in each.names}
+            candidates = [each for each in tried if id(each) not in named]
+            if not candidates or len(found) >= self.most:
+                break
+            now = self.without(found)
+            peaks = peaks or self.peaks(now, candidates)
+            alike, doubtful = _likeliest(self.likelihood, now, peaks, candidates, self.count)
+            noises = [each for each in (*alike[:1], *doubtful) if _is_too_small(*each)]
+            if any(at.value > GROSS for at, _ in noises):
+                gross = _companion(self.likelihood, now, peaks, candidates)
+                if gross is not None:
+                    now, noises = gross.without(now), []
+                    candidates = [each for each in candidates if each is not gross.of]
+                    peaks = self.peaks(now, candidates)
+                    alike = _likeliest(self.likelihood, now, peaks, candidates, self.count)[0] or alike
+            ranked, peaks = list(zip(peaks, candidates, strict=True)), []
+            if noises and (instead := self._without_noise(ranked, found, noises)):
+                found = instead
+                continue
+            if not alike:
+                beside = self._hidden(ranked, found) if hidden else []
+                if not beside:
+                    break
+                found = self._together(beside)
+                continue
+            contenders = [
+                of
+                for at, of in ranked
+                if _is_physical(of) and at.gain > CONTENDS * alike[0][0].gain and of is not alike[0][1]
+            ]
+            alike[:1] = _with_rival(gains_over(self.likelihood, now), alike[0], least_gain(self.count))
+            found = self._together([*found, Found(alike, now, contenders)])
+        return found, doubtful
+
+    def _without_noise(
+        self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
+    ) -> list[Found]:
+        """Find causes that explain as much as a noise does, without any noise; none if there are none.
+
+        What is left out of a model looks like noise that is stated too small.
+        """
+        noise = max(at.score(of) for at, of in noises)
+        physical = [(at, of) for at, of in ranked if _is_physical(of)]
+        best = max((at.score(of) for at, of in physical), default=0.0)
+        if best * (self.most - len(found)) < noise:
+            return []
+        instead, _ = self.more(
+            [of for _, of in physical], [at for at, _ in physical], found, hidden=False
+        )
+        before, after = self.likelihood([self.without(found), self.without(instead)])
+        cost = NUMBER_COST * sum(len(each.supposed.numbers) for each in instead[len(found) :])
+        return instead if after - before - cost >= noise else []
+
+    def _hidden(self, ranked: Sequence[Named], found: Sequence[Found]) -> list[Found]:
+        """Add a cause that gains enough only if those that are found are fitted again beside it."""
+        [before] = self.likelihood([self.without(found)])
+        some = [
+            (at, of)
+            for at, of in sorted(ranked, key=lambda pair: -pair[0].gain)
+            if _is_physical(of) and of.tried and at.gain > HIDDEN * least_gain(self.count, of.size)
+        ]
+        for at, of in some[: len(found)]:
+            faults = [*(each.supposed for each in found), Supposed(of, at.value)]
+            fitted = fit(self.likelihood, self.base, faults)
+            *others, own = fitted.faults
+            most = Peak(own.value, fitted.log_likelihood - before)
+            now = undone(self.base, others)
+            alike, _ = _likeliest(self.likelihood, now, [most], [of], self.count)
+            if alike:
+                return [*found, Found(alike, now)]
+        return []
+
+    def _together(self, found: Sequence[Found]) -> list[Found]:
+        """Fit causes together: what the others make superfluous goes, what explains more is taken."""
+        if len(found) < 2:
+            return list(found)
+        fitted = fit(self.likelihood, self.base, [each.supposed for each in found])
+        found = [
+            each._replace(names=[(each.names[0][0]._replace(value=own.value), own.of), *each.names[1:]])
+            for each, own in zip(found, fitted.faults, strict=True)
+        ]
+        least = int(np.argmin(fitted.losses))
+        enough = least_gain(self.count, fitted.faults[least].of.size)
+        if fitted.losses[least] < 2.0 * enough:  # by a parabola
+            rest = [*found[:least], *found[least + 1 :]]
+            of_rest = fit(self.likelihood, self.base, [each.supposed for each in rest])
+            if fitted.log_likelihood - of_rest.log_likelihood < enough:
+                return self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
+        for place, each in enumerate(found):
+            others = [*found[:place], *found[place + 1 :]]
+            taken = {id(of) for other in others for _, of in other.names}
+            own = [*_faults(each.names), *(of for of in each.contenders if id(of) not in taken)]
+            if len(own) < 2:
+                continue
+            nearest, main = self._nearest(self.without(others), own), each.names[0][1]
+            if all(of is not main for _, of in nearest):
+                found[place] = Found(nearest, self.base, own)
+                return self._together(found)
+            rivals = [pair for pair in each.names[1:] if pair[1] is main]
+            names = [each.names[0], *rivals, *(pair for pair in nearest if pair[1] is not main)]
+            found[place] = each._replace(names=names)
+        return found
+
+    def _nearest(self, now: Trial, faults: Sequence[Hypothesis]) -> Names:
+        """Return the fault that gains most over a trial, and what the log does not tell from it."""
+        ranked = zip(self.peaks(now, faults), faults, strict=True)
+        return _alike(sorted(ranked, key=lambda pair: -pair[0].score(pair[1])))
+
+    def _alone(self, found: Found) -> Found:
+        """Return a cause with what it gains if it is the only one."""
+        return Found(self._nearest(self.base, _faults(found.names)), self.base)
+
+    def causes(self, found: Sequence[Found]) -> list[Cause]:
+        """Return the causes with gains and intervals: of several by fits of all of them."""
+        if len(found) < 2:
+            alone = [_causes(gains_over(self.likelihood, each.over), each.names) for each in found]
+            return [first._replace(others=tuple(others)) for first, *others in alone]
+        main = fit(self.likelihood, self.base, [each.supposed for each in found], has_ends=True)
+        causes = []
+        for place, each in enumerate(found):
+            before, after = main.faults[:place], main.faults[place + 1 :]
+            [without] = self.likelihood([undone(self.base, [*before, *after])])
+            gain, others = main.log_likelihood - without, []
+            for at, of in each.names[1:]:
+                faults = [*before, Supposed(of, at.value), *after]
+                other = fit(self.likelihood, self.base, faults, has_ends=True)
+                less = main.log_likelihood - other.log_likelihood
+                others.append(Cause(of, other.faults[place].value, other.ends[place], gain - less))
+            own = main.faults[place]
+            causes.append(Cause(own.of, own.value, main.ends[place], gain, tuple(others)))
+        return causes
+
+
+def _faults(names: Names) -> list[Hypothesis]:
+    """Return the faults that names are of, each once."""
+    return list({id(of): of for _, of in names}.values())
+
+
+def _alike(ranked: Sequence[Named]) -> Names:
+    """Return the likeliest, and those that a log does not tell from it; the usual names first."""
+    least = ranked[0][0].score(ranked[0][1]) - RIVAL
+    near = [
+        pair for pair in ranked if pair[0].score(pair[1]) >= least or _is_other_name(pair, ranked[0])
+    ]
+    return sorted(near, key=_is_early)
+
+
+def _is_physical(of: Hypothesis) -> bool:
+    """Tell whether it is a fault of what is measured, and no noise."""
+    return of.kind not in NOISES and of.kind != "outliers"
 
 
 def _likeliest(
@@ -162,7 +368,7 @@ def _likeliest(
     peaks: Sequence[Peak],
     candidates: Sequence[Hypothesis],
     count: int,
-) -> tuple[list[tuple[Peak, Hypothesis]], list[tuple[Peak, Hypothesis]]]:
+) -> tuple[Names, list[Named]]:
     """Find the hypothesis that gains most, not by chance, and those the log does not tell from it.
 
     And those in doubt. How much the parts of a log disagree is the log's: what they disagree about in
@@ -171,9 +377,9 @@ def _likeliest(
     """
     gains_of, inflation_of = gains_over(likelihood, now), inflation_over(likelihood, now)
     noise_gain_of = noise_gain_over(likelihood, now)
-    doubtful, inflation = list[tuple[Peak, Hypothesis]](), 1.0
+    doubtful, inflation = list[Named](), 1.0
 
-    def is_sure(pair: tuple[Peak, Hypothesis]) -> bool:
+    def is_sure(pair: Named) -> bool:
         nonlocal inflation
         at, of = pair
         if _is_at_end(gains_of, at, of) or (
@@ -197,46 +403,29 @@ def _likeliest(
     if place is None:
         return [], doubtful
     first, before = ranked[place], list(doubtful)
-    least = first[0].score(first[1]) - RIVAL
-    near = [
-        pair
-        for pair in ranked[place + 1 :]
-        if pair[0].score(pair[1]) > least or _is_other_name(pair, first)
-    ]
-    return sorted([first, *filter(is_sure, near)], key=_is_early), before
+    return [each for each in _alike(ranked[place:]) if each is first or is_sure(each)], before
 
 
-class _Supposed(NamedTuple):
-    """Holds a fault with a number."""
-
-    of: Hypothesis
-    value: Number
-
-    def without(self, trial: Trial) -> Trial:
-        """Return the trial without it."""
-        return self.of.without(trial, self.value)
-
-
-def _is_gross(at: Peak, of: Hypothesis) -> bool:
-    """Tell whether it is a noise that is stated far too small."""
-    return of.kind in NOISES and at.value > GROSS
+def _is_too_small(at: Peak, of: Hypothesis) -> bool:
+    """Tell whether it is a noise that is stated too small."""
+    return of.kind in NOISES and at.value > 0.0
 
 
 def _companion(
     likelihood: Likelihood, now: Trial, peaks: Sequence[Peak], candidates: Sequence[Hypothesis]
-) -> _Supposed | None:
+) -> Supposed | None:
     """Find one of two gross faults which gain more together than any noise does; None without.
 
     Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
     none may gain by itself what it is worth.
     """
-    supposed, most = list[_Supposed](), 0.0
+    supposed, most = list[Supposed](), 0.0
     for at, of in zip(peaks, candidates, strict=True):
         if of.kind in NOISES:
             most = max(most, at.gain)
         elif of.kind != "outliers":
             values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
-            supposed += [_Supposed(of, value) for value in values]
+            supposed += [Supposed(of, value) for value in values]
     alone = np.array(gains_over(likelihood, now)(supposed))
     best, found = most, None
     for place in np.argsort(-alone, kind="stable")[:LEADING]:
@@ -249,7 +438,7 @@ def _companion(
     return found
 
 
-def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
+def _is_other_name(pair: Named, first: Named) -> bool:
     """Tell whether a topic is late by as much as the likeliest cause has another early.
 
     These are one fault but for what is at the ends of the log.
@@ -260,7 +449,7 @@ def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]
     return abs(at.value + best.value) < SAME_SIZE * abs(best.value) and at.gain > SAME_GAIN * best.gain
 
 
-def _is_early(pair: tuple[Peak, Hypothesis]) -> bool:
+def _is_early(pair: Named) -> bool:
     """Tell whether it is the less usual name of a fault: one topic is late, or all others are early."""
     at, of = pair
     return of.kind in ("delay", "clock drift") and isinstance(at.value, float) and at.value < 0.0
@@ -294,9 +483,7 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
     return last > at.gain - DROP_95
 
 
-def _with_rival(
-    gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
-) -> list[tuple[Peak, Hypothesis]]:
+def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
     """Put beside the number of a delay or angle another one, where chance explains the difference.
 
     The likelier first; it alone, where chance does not.
@@ -312,7 +499,7 @@ def _with_rival(
     return [(each, of) for each in both if each.gain >= both[0].gain - apart]
 
 
-def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:
+def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
     """Return the causes with the intervals of their numbers."""
     asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others are, or are not
     searches = []

@@ -21,6 +21,7 @@ Cost = Callable[[Floats], Floats]
 
 STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
+TOLERANCE = 1e-13  # of a cost: what a step has to gain
 DESCENTS = 20  # each of which ends where another parameter's change costs less
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
 MOVES = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # of a calibration's parameter, in useful units
@@ -171,7 +172,12 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
 
 
 def least(
-    cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
+    cost: Cost,
+    coordinates: Coordinates,
+    start: Floats,
+    *,
+    is_smooth: bool,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Floats, bool]:
     """Find where the cost is least.
 
@@ -184,13 +190,16 @@ def least(
         coordinates: what is searched over.
         start: (k,), in coordinates.
         is_smooth: whether the cost has a gradient, so that the search may follow it.
+        tolerance: the share of a smooth cost that a step has to gain for the search to go on.
 
     Returns:
         Where the cost is least (k,), in coordinates, and whether the search came to its end.
     """
     point = scanned(cost, coordinates, start)
     for _ in range(DESCENTS):
-        ended, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
+        ended, has_converged = _minimum(
+            cost, coordinates, point, is_smooth=is_smooth, tolerance=tolerance
+        )
         point = scanned(cost, coordinates, ended)
         if point is ended or not has_converged:
             return ended, has_converged
@@ -233,7 +242,7 @@ def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
 
 
 def _minimum(
-    cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
+    cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool, tolerance: float
 ) -> tuple[Floats, bool]:
     """Find the minimum (k,) that the cost falls to from a start (k,), and whether the search converged.
 
@@ -264,7 +273,7 @@ def _minimum(
 
     bounds = list(zip(low, high, strict=True))
     if is_smooth:
-        options: dict[str, Any] = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-5}
+        options: dict[str, Any] = {"maxiter": ITERATIONS, "ftol": tolerance, "gtol": 1e-5}
         found = minimize(
             with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
         )

@@ -19,6 +19,7 @@ from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from pipeline.diagnosing.battery.car import (
     FAULTS,
     Car,
+    Noise,
     Truth,
     arcs,
     drive,
@@ -39,6 +40,7 @@ from recorders.models.orientation import heading
 from replay.engine.replaying.estimator import bind
 from replay.judging.consistency.consistency import CONSISTENT
 from replay.judging.errors.evaluation import chi_square_interval
+from tests.pipeline.several_faults import GYRO, lost_by, several
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 SEED = 2000
@@ -102,6 +104,37 @@ def test_a_delay_beside_noisy_wheels_is_found() -> None:
 def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
     """With one undone the other is still so large that a noise thousands of times larger fits."""
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("has_gyro", [False, True])
+def test_several_ordinary_faults_are_fitted_together(*, has_gyro: bool) -> None:
+    """All are named, none of them as a noise; all values are in their intervals.
+
+    The fixes are so good that 80 s tell as much as 10 minutes.
+    """
+    log = several(1, 80.0, Noise(fix_sigma_m=0.12), has_gyro=has_gyro, has_prior=True)
+    turn = (GYRO, "turn_rate_z_radps") if has_gyro else (ODOMETRY, "turn_radps")
+    planted = {
+        ("factor or sign", ODOMETRY, "forward_mps"): 1.03,
+        ("bias or turned frame", *turn): 0.01,
+        ("delay", FIX, ""): 0.25,
+        ("parameter", "lever_x_m", "lever_x_m"): 0.40,
+        ("parameter", "lever_x_m", "lever_y_m"): -0.15,
+    }
+    causes = seek(log, "ekf", OPEN, 5).causes
+    named = {
+        (cause.hypothesis.kind, cause.hypothesis.topic, each.part): each
+        for cause in causes
+        for each in cause.numbers
+    }
+    assert named.keys() == planted.keys()
+    for key, value in planted.items():
+        assert named[key].low < value < named[key].high, (key, named[key])
+    mends = [cause.hypothesis.mend(cause.value) for cause in causes]
+    settings = {key: float(value) for mend in mends for key, value in mend.settings.items()}
+    factor = settings.pop(f"{ODOMETRY}.forward_scale")
+    assert lost_by(log, {**settings, "forward_scale": factor}) < 2.0
 
 
 @pytest.mark.paper

@@ -1,5 +1,6 @@
 """Diagnosing and tuning on a log without a prior: the sheet of sensors, section 3, principle 1."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,12 @@ import fuselog as fl
 from pipeline.diagnosing import causes as seeking
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.battery.car import car
-from pipeline.diagnosing.causes import find_causes
+from pipeline.diagnosing.causes import Cause, find_causes
 from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
+from pipeline.diagnosing.joint import Supposed, fit
 from pipeline.diagnosing.likelihood import EVER_NS, Likelihood, Trial, _broad, _span, first_of_each
+from pipeline.diagnosing.search import DROP_95
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
@@ -163,6 +166,77 @@ def test_what_another_number_explains_as_well_is_not_determined(
     assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
     other = f"; this log does not determine it: as likely, {values[-1]:.2f} late;"
     assert (other in cause.words) == (len(values) > 1)
+
+
+class Paraboloid(NamedTuple):
+    """Gains of several numbers, greatest at `best` and bent so much."""
+
+    best: np.ndarray
+    bend: np.ndarray
+    count: Mapping[str, int] = {}
+
+    def __call__(self, trials: Sequence[np.ndarray]) -> list[float]:
+        """The gains over all parts."""
+        return [float(each) for [each] in self.over_parts(trials, 1)]
+
+    def disturbed(self, _: np.ndarray) -> list[Any]:
+        """No control has noise."""
+        return []
+
+    def over_parts(self, trials: Sequence[np.ndarray], count: int) -> np.ndarray:
+        """The gains over so many parts, which agree."""
+        apart = np.array(trials) - self.best
+        gains = -0.5 * np.einsum("ni,ij,nj->n", apart, self.bend, apart)
+        return np.repeat(gains[:, None] / count, count, axis=1)
+
+    @property
+    def faults(self) -> list[Hypothesis]:
+        """A fault for each number."""
+
+        def of(place: int) -> Hypothesis:
+            def without(trial: np.ndarray, value: float) -> np.ndarray:
+                return trial + value * np.eye(len(self.best))[place]
+
+            def words(at: float, low: float, high: float) -> str:
+                return f"{place} is {at:.3f} ({low:.3f} to {high:.3f})"
+
+            tried = (-0.1, 0.1, -1.0, 1.0)
+            return Hypothesis(  # type: ignore[arg-type]
+                "drifting bias", f"/{place}", "", tried, 50.0, without, words, lambda _: None
+            )
+
+        return [of(place) for place in range(len(self.best))]
+
+    def causes(self) -> list[Cause]:
+        """The causes that are named."""
+        likelihood: Any = self
+        return find_causes(likelihood, np.zeros(len(self.best)), self.faults, 5)[0]  # type: ignore[arg-type]
+
+
+def test_causes_are_fitted_together_and_what_is_superfluous_goes() -> None:
+    """The first number alone gains most, since it explains half of each other: with these it is zero."""
+    bend = 400.0 * np.array([[1.0, 0.6, 0.6], [0.6, 1.0, 0.0], [0.6, 0.0, 1.0]])
+    causes = Paraboloid(np.array([0.0, 5.0, 4.0]), bend).causes()
+    assert [cause.hypothesis.topic for cause in causes] == ["/1", "/2"]
+    assert [cause.value for cause in causes] == pytest.approx([5.0, 4.0], abs=1e-3)
+    both = Paraboloid(np.array([3.0, 4.0]), 100.0 * np.array([[1.0, 0.8], [0.8, 1.0]])).causes()
+    ends = sorted(end for cause in both for end in cause.ends)
+    error = (1.0 / (100.0 * (1.0 - 0.8**2))) ** 0.5  # not 0.1, that of either number alone
+    drop = (2.0 * DROP_95) ** 0.5
+    assert ends == pytest.approx(
+        [3.0 - drop * error, 3.0 + drop * error, *(4.0 + np.array([-drop, drop]) * error)], abs=1e-3
+    )
+
+
+def test_a_fit_that_does_not_converge_has_no_interval() -> None:
+    """Only the sum of both numbers is told."""
+    flat = Paraboloid(np.array([2.0, 1.0]), 100.0 * np.ones((2, 2)))
+    likelihood: Any = flat
+    supposed = [Supposed(of, 1.0) for of in flat.faults]
+    found = fit(likelihood, np.zeros(2), supposed, has_ends=True)  # type: ignore[arg-type]
+    assert np.isnan(found.ends).all()
+    cause = Cause(flat.faults[0], found.faults[0].value, found.ends[0], 10.0)
+    assert re.match(r"0 is \d\.\d{3} \(no interval: the fit of all causes", cause.statement)
 
 
 def test_a_part_of_a_log_has_the_same_measurements_in_any_order() -> None:

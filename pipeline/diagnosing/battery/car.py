@@ -69,6 +69,8 @@ class Car(NamedTuple):
     turn_density: float = TURN_DENSITY
     forward_density: float = FORWARD_DENSITY
     compass_sigma_rad: float = COMPASS_SIGMA_RAD
+    fix_late_s: float = 0.0
+    lever_m: tuple[float, float] = (0.0, 0.0)
 
 
 def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
@@ -94,12 +96,14 @@ def philox(key: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key))
 
 
-def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE) -> Car:
+def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE, duration_s: float = DURATION_S) -> Car:
     """Return the car without a fault."""
-    rng, n = philox(seed), round(DURATION_S / step_s)
+    rng, n = philox(seed), round(duration_s / step_s)
+    fix_s = np.arange(round(duration_s / FIX_STEP_S) + 1) * FIX_STEP_S
+    compass_s = np.arange(round(duration_s / COMPASS_STEP_S) + 1) * COMPASS_STEP_S
     start_rad = 2.0 * np.pi * rng.uniform()
-    odometry, fixes = rng.standard_normal((n, 2)), rng.standard_normal((201, 2))
-    compass = rng.standard_normal(501)
+    odometry, fixes = rng.standard_normal((n, 2)), rng.standard_normal((len(fix_s), 2))
+    compass = rng.standard_normal(len(compass_s))
     since_s = (np.arange(n) + 0.5) * step_s
     ramp = np.clip((since_s - REST_S) / RAMP_S, 0.0, 1.0)
     speed = ramp * (8.0 + 3.0 * np.sin(0.4 * (since_s - REST_S)))
@@ -109,7 +113,6 @@ def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE) -> Car:
     start = np.array([[0.0, 0.0, start_rad]])
     truth = Truth(step_s, speed, turn, start + np.concatenate([0.0 * start, np.cumsum(steps, axis=0)]))
     of_wheels = np.array([noise.forward_density, noise.turn_density]) / step_s**0.5 * odometry
-    fix_s, compass_s = np.arange(201) * FIX_STEP_S, np.arange(501) * COMPASS_STEP_S
     return Car(
         seed,
         truth,
@@ -131,25 +134,25 @@ def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE) -> Car:
 
 
 def late(by_s: float) -> Callable[[Car], Car]:
-    """Make fixes say where the car was so long before."""
-
-    def put(car: Car) -> Car:
-        moved = car.truth.at(car.fix_s - by_s) - car.truth.at(car.fix_s)
-        return car._replace(fix_m=car.fix_m + moved[:, :2])
-
-    return put
+    """Make fixes say where the antenna was so long before."""
+    return lambda car: _seen(car._replace(fix_late_s=by_s), car)
 
 
 def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
-    """Make fixes those of a point beside the car's own."""
+    """Make fixes those of an antenna beside the car's own point."""
+    return lambda car: _seen(car._replace(lever_m=(forward_m, left_m)), car)
 
-    def put(car: Car) -> Car:
-        heading = car.truth.at(car.fix_s)[:, 2]
-        cos, sin = np.cos(heading), np.sin(heading)
-        arm = np.stack([forward_m * cos - left_m * sin, forward_m * sin + left_m * cos], axis=1)
-        return car._replace(fix_m=car.fix_m + arm)
 
-    return put
+def _seen(car: Car, before: Car) -> Car:
+    """Move fixes to where the antenna is, by its place and by how late they are."""
+    return car._replace(fix_m=car.fix_m + _antenna(car) - _antenna(before))
+
+
+def _antenna(car: Car) -> Floats:
+    x, y, heading = car.truth.at(car.fix_s - car.fix_late_s).T
+    cos, sin = np.cos(heading), np.sin(heading)
+    forward_m, left_m = car.lever_m
+    return np.stack([x + forward_m * cos - left_m * sin, y + forward_m * sin + left_m * cos], axis=1)
 
 
 def half_lost(car: Car) -> Car:

@@ -103,7 +103,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
 
     def words(at: float, low: float, high: float) -> str:
         more = f", as {specials[at]}" if at in specials else ""
-        ends = sorted((abs(low), abs(high))) if low * high > 0.0 else [0.0, max(abs(low), abs(high))]
+        ends = [0.0, max(abs(low), abs(high))] if low * high <= 0.0 else sorted((abs(low), abs(high)))
         size = "large" if at > 0.0 else "small"
         factor, least, most = (number(np.exp(each), 4) for each in (abs(at), *ends))
         return f"{topic}: {entry.name} is {factor} times ({least} to {most}) too {size}{more}"

@@ -156,7 +156,7 @@ def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
 def times(at: float, low: float, high: float) -> str:
     """Say by what factor a standard deviation is wrong, from logarithms."""
     least, most = (
-        number(np.exp(abs(end))) if at * end > 0 else "1" for end in sorted((low, high), key=abs)
+        "1" if at * end <= 0 else number(np.exp(abs(end))) for end in sorted((low, high), key=abs)
     )
     factor = number(np.exp(abs(at)))
     return f"{factor} times ({least} to {most}) too {size_of(at)}"

@@ -1,0 +1,179 @@
+"""Fits the numbers of several faults together, by the search that `tune` and `calibrate` use.
+
+Each fault hides part of the others: numbers that are found one after the other, and their intervals, are
+those of a log in which the rest is still wrong.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
+from pipeline.tuning.confidence import confidence
+from pipeline.tuning.search import Coordinates, Free, coordinates_of, curvature, least
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything
+
+
+class Supposed(NamedTuple):
+    """Holds a fault with its number."""
+
+    of: Hypothesis
+    value: Number
+
+    def without(self, trial: Trial) -> Trial:
+        """Return the trial without the fault."""
+        return self.of.without(trial, self.value)
+
+    @property
+    def numbers(self) -> list[float]:
+        """Return the numbers that are searched for; a fault that is so or is not has none."""
+        if not self.of.tried:
+            return []
+        return list(self.value) if self.of.size > 1 else [self.value]
+
+    def number(self, numbers: Sequence[float]) -> Number:
+        """Return numbers as the fault takes them; the value it has if none are searched for."""
+        if not self.of.tried:
+            return self.value
+        return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
+
+
+def undone(base: Trial, faults: Sequence[Supposed]) -> Trial:
+    """Return the trial without any of the faults."""
+    return reduce(lambda trial, each: each.without(trial), faults, base)
+
+
+class Fit(NamedTuple):
+    """Holds the numbers with which faults together explain a log best.
+
+    Attributes:
+        faults: with these numbers.
+        log_likelihood: of the log without the faults.
+        losses: by fault, what the log-likelihood loses without it, all others refitted, as the curvature
+            has it; infinite if the fault has no number.
+        ends: by fault, the ends of the 95 % profile-likelihood intervals of its numbers. If the search
+            did not converge they are NaN.
+    """
+
+    faults: Sequence[Supposed]
+    log_likelihood: float
+    losses: Sequence[float]
+    ends: Sequence[tuple[Number, Number]] = ()
+
+
+def fit(
+    likelihood: Likelihood, base: Trial, faults: Sequence[Supposed], *, has_ends: bool = False
+) -> Fit:
+    """Search for the numbers of faults together, from those that they have.
+
+    Args:
+        likelihood: of trials.
+        base: the log as it is, and the settings.
+        faults: with numbers near those that are searched for.
+        has_ends: whether the ends of intervals are computed.
+    """
+    together = _Together(likelihood, base, faults)
+    unknown = [(value, value) for value in together.values(np.full(len(together.start), np.nan))]
+    try:
+        coordinates = coordinates_of(together.cost, together.free, together.start)
+        begin = coordinates.of(together.start)
+        point, has_converged = least(
+            together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
+        )
+    except BadInput:  # nothing depends on one of the numbers
+        [found] = likelihood([undone(base, faults)])
+        return Fit(faults, found, [np.inf] * len(faults), unknown)
+    bent = curvature(together.cost, coordinates, point, range(len(point)))
+    is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
+    losses, ends = [np.inf] * len(faults), unknown
+    if has_converged and is_top and not coordinates.at_bounds(point).any():
+        covariance = confidence(range(len(point)), bent).covariance
+        losses = [_loss(point[own], covariance[np.ix_(own, own)]) for own in together.places]
+        if has_ends:
+            low, high = _ends(together, coordinates, point, covariance)
+            ends = list(zip(together.values(low), together.values(high), strict=True))
+            point = _at_specials(together, coordinates, point, covariance, (low, high))
+    numbers = coordinates.values(point)
+    [cost] = together.cost(numbers[None])
+    values = together.values(numbers)
+    fitted = [each._replace(value=value) for each, value in zip(faults, values, strict=True)]
+    return Fit(fitted, -float(cost), losses, ends)
+
+
+class _Together:
+    """Has the numbers of all faults in one vector (k,)."""
+
+    def __init__(self, likelihood: Likelihood, base: Trial, faults: Sequence[Supposed]) -> None:
+        self.likelihood, self.base, self.faults = likelihood, base, faults
+        self.start = np.array([number for each in faults for number in each.numbers])
+        places = iter(range(len(self.start)))
+        self.places = [[next(places) for _ in each.numbers] for each in faults]
+        self.free = [
+            Free(each.of.name, number, -each.of.limit, each.of.limit, is_positive=False)
+            for each in faults
+            for number in each.numbers
+        ]
+
+    def values(self, numbers: Floats) -> list[Number]:
+        """Return the faults' values at numbers (k,)."""
+        return [
+            each.number(numbers[own].tolist())
+            for each, own in zip(self.faults, self.places, strict=True)
+        ]
+
+    def cost(self, points: Floats) -> Floats:
+        """Compute minus the log-likelihoods (n,) of the log without faults of numbers (n, k)."""
+        of_points = [
+            [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
+            for point in points
+        ]
+        return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
+
+
+def _loss(own: Floats, covariance: Floats) -> float:
+    """Compute what is lost without numbers (m,) of a covariance (m, m); infinite without a number."""
+    return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
+
+
+def _ends(
+    together: _Together, coordinates: Coordinates, point: Floats, covariance: Floats
+) -> tuple[Floats, Floats]:
+    """Find the ends (k,), (k,) of intervals: along each number all others follow by the curvature."""
+    [cost] = together.cost(coordinates.values(point)[None])
+    errors = np.sqrt(np.diagonal(covariance))
+    along = covariance / errors  # a column for each number
+    ways = [(place, way * 2.0**0.5 * ROOT_95) for place in range(len(point)) for way in (-1.0, 1.0)]
+
+    def gains(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
+        points = np.array([point + by * along[:, ways[search][0]] for search, by in asked])
+        return (-together.cost(coordinates.values(points))).tolist()
+
+    found = side_by_side([end(Peak(0.0, -float(cost)), way) for _, way in ways], gains)
+    low, high = np.reshape(found, (-1, 2)).T * errors + point
+    return coordinates.unbounded(low), coordinates.unbounded(high)
+
+
+def _at_specials(
+    together: _Together,
+    coordinates: Coordinates,
+    point: Floats,
+    covariance: Floats,
+    ends: tuple[Floats, Floats],
+) -> Floats:
+    """Take special values, such as the factor of a unit, if they are within the intervals."""
+    for own, each in zip(together.places, together.faults, strict=True):
+        for place in own[: each.of.size == 1]:
+            low, high = (every[place] for every in ends)
+            special = next((at for at in each.of.specials if low < at < high), None)
+            if special is not None:
+                apart = special / coordinates.units[place] - point[place]
+                point = point + apart * covariance[:, place] / covariance[place, place]
+    return point
