@@ -4,9 +4,10 @@ A set estimate is a pair of streams: its size, and its elements (see `schemas.ES
 set at a time are all targets whose truth has the estimate's components and is known then.
 """
 
+from abc import ABC
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +144,15 @@ def _judge_run(
     return rows
 
 
-def _sums(found: SetErrors | Regions) -> Sums:
+class AnySets(ABC):  # noqa: B024  # named tuples have no base of their own
+    """Stands for what the metrics of sets judge: sets of targets, and regions of one."""
+
+
+AnySets.register(SetErrors)
+AnySets.register(Regions)
+
+
+def _sums(found: Any) -> Sums:
     if isinstance(found, Regions):
         held = int((found.holds & found.known).sum())
         area_m2 = float(found.area_m2.sum())
@@ -183,7 +192,7 @@ def _means(sums: Sums) -> dict[str, float]:
 
 SETS = metric_of_sums(
     "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m; area of regions, and what they hold",
-    cast(type[SetErrors | Regions], SetErrors | Regions),
+    AnySets,
     _sums,
     _means,
 )
