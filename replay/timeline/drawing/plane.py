@@ -227,7 +227,7 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
     """Draw the whole true way of a point (n, 2), faintly: it is there before the path gets to it."""
     known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
-    style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)]}
+    style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)], "draw_order": 0.0}
     canvas.fix(entity, rr.LineStrips2D([known], **style))
 
 
