@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from replay.judging.errors.evaluation import Errors, Floats
 from replay.timeline.drawing.canvas import Board, Canvas, Scene, entity_path, escaped
+from replay.timeline.drawing.plane import LEGEND
 from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 
 
@@ -28,14 +29,14 @@ def draw_side_by_side(
 
 
 def _split(layout: Board, estimators: Sequence[str]) -> Board:
-    """Split every view of a scene in the layout by estimator."""
+    """Split every view of a scene in the layout by estimator; a legend is the same for all."""
     if isinstance(layout, rrb.Container):
         layout.contents = [
             _split(each, estimators) if isinstance(each, rrb.Container | rrb.View) else each
             for each in layout.contents
         ]
         return layout
-    if not isinstance(layout, rrb.Spatial2DView | rrb.Spatial3DView):
+    if not isinstance(layout, rrb.Spatial2DView | rrb.Spatial3DView) or layout.name == LEGEND:
         return layout
     return rrb.Horizontal(*(_alone(layout, each, estimators) for each in estimators), name=layout.name)
 

@@ -43,6 +43,7 @@ CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
 # What is left free beside the places, as a share of their side, or of so much of the longer one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
+LEGEND = "Legend"
 # A legend's row: its characters, those between names, its height in them, and that by the board's.
 LEGEND_CHARACTERS, LEGEND_GAP, LEGEND_ROW, LEGEND_SHARE = 100.0, 5.0, 6.0, 0.07
 # Points closer than this share of the map's extent share one label.
@@ -234,7 +235,7 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
     """Draw the whole true way of a point (n, 2), faintly: it is there before the path gets to it."""
     known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
-    style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)]}
+    style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)], "draw_order": 0.0}
     canvas.fix(entity, rr.LineStrips2D([known], **style))
 
 
@@ -399,7 +400,7 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
     canvas.fix(entity, dots)
     view = rrb.Spatial2DView(
         origin=escaped(entity),
-        name="Legend",
+        name=LEGEND,
         titlebar=False,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(0.0, LEGEND_CHARACTERS), y_range=(-0.3 * LEGEND_ROW, (row + 0.7) * LEGEND_ROW)

@@ -90,6 +90,10 @@ def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> 
     wanted["/events/robot2/one"] = Wanted("told", seen.publish_time_ns[[3]], [told])
     compare(run.picture.moving, wanted)
     check_views(run.picture, {*titles, ("Events", "events/robot2")})
+    widths = [
+        run.picture.still[f"/plots/robot1/nees_3/{name}"]["SeriesLines:widths"] for name in ESTIMATORS
+    ]
+    assert widths == [[[3.0]], [[1.5]]]  # the first is seen below the second
     colours = run.picture.moving["/map/robot2/sights"]["LineStrips2D:colors"]
     found = [each for row in colours for each in row or []]
     red, usual = (int.from_bytes(bytes(colour), "big") for colour in (GATED, SEEN))

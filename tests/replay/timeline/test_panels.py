@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 import rerun.chunk as rc
 
 from recorders.log import RunMetadata, Stream, make_stream, schemas
@@ -11,6 +12,8 @@ from recorders.models.states import state_metadata
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import MemorySource
 from replay.judging.errors.evaluation import chi_square_interval
+from replay.judging.judge import Judge
+from replay.timeline.drawing.plots import in_strips
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read, told, views
 
@@ -120,3 +123,44 @@ def test_events_name_the_topic_of_what_was_gated(tmp_path: Path) -> None:
     """That with a message of its stamp; a sensor has no target 0."""
     said = told(read(a_room(tmp_path / "room.rrd", inside=48))["/events/ekf"])
     assert said == ["ekf: gated window: NIS 5062.0"] * 2
+
+
+def test_many_components_are_in_tabs_by_quantity() -> None:
+    """The axes of a vector are together, single numbers up to four; eight fit without tabs."""
+    vectors = [f"{stem}{axis}_{unit}" for stem, unit in (("", "m"), ("v", "mps")) for axis in "xyz"]
+    biases = [f"sensor_1_{angle}_bias_rad" for angle in ("yaw", "pitch", "roll")]
+    names = [*vectors, *biases, "room_degC", "door_degC", "window_degC", "wall_degC", "roof_degC"]
+    views = {name: rrb.TimeSeriesView(name=name) for name in names}
+    few = in_strips({name: views[name] for name in names[:8]}, "state")
+    assert [each.name for each in few.contents] == names[:8]
+    tabs = in_strips(views, "state")
+    assert [(tab.name, [view.name for view in tab.contents]) for tab in tabs.contents] == [
+        ("position", names[:3]),
+        ("velocity", names[3:6]),
+        ("sensor 1 bias", biases),
+        ("room to wall", names[9:13]),
+        ("roof", ["roof_degC"]),
+    ]
+
+
+def test_a_single_estimate_is_a_point_between_the_ends_of_its_band(tmp_path: Path) -> None:
+    truth = make_stream(
+        "/truth", schemas.TRUTH_STATE, STAMPS[:1], metadata=state_metadata(["x_m"]), state=[[2]]
+    )
+    told = {**state_metadata(["x_m"]), "truth": "/truth"}
+    estimate = make_stream(
+        "/estimates/ekf/state",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS[:1],
+        metadata=told,
+        mean=[[5]],
+        covariance=[[4]],
+    )
+    source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
+    outputs = {estimate.topic: gather([estimate])}
+    errors = [each for each in Judge([source], {}, gap_limit_s=2.0).add(outputs).errors if each]
+    show(source, outputs, errors, save=tmp_path / "one.rrd")
+    assert read(tmp_path / "one.rrd")["/plots/error_x_m/ekf"]["Scalars:scalars"] == [[3.0, -4.0, 4.0]]
+    still = read(tmp_path / "one.rrd", static=True)
+    assert "SeriesPoints:markers" in still["/plots/error_x_m/ekf"]
+    assert "SeriesPoints:names" in still["/plots/nees_1/ekf"]
