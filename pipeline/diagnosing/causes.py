@@ -201,12 +201,13 @@ class _Search:
         peaks: Sequence[Peak],
         found: Sequence[Found],
         *,
-        hidden: bool = True,
+        target: float = -np.inf,
     ) -> tuple[list[Found], list[Named]]:
         """Add causes to those that are found until none is sure; and say what is in doubt after them.
 
-        `peaks` are what the hypotheses gain over those that are found. `hidden` says whether those are
-        looked for, too, that gain enough only together with a new fit of the others.
+        `peaks` are what the hypotheses gain over those that are found. With a `target`, the search ends
+        if as many causes as may be named would not come to that log-likelihood. Without one it also
+        looks for causes that gain enough only together with a new fit of the others.
         """
         found, doubtful = list(found), list[Named]()
         for _ in range(2 * self.most):  # a cause may go again
@@ -216,9 +217,11 @@ class _Search:
                 break
             now = self.without(found)
             peaks = peaks or self.peaks(now, candidates)
+            ranked = list(zip(peaks, candidates, strict=True))
+            if not self._reaches(ranked, found, target - self.likelihood([now])[0]):
+                break
             alike, doubtful = _likeliest(self.likelihood, now, peaks, candidates, self.count)
             noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
-            ranked = list(zip(peaks, candidates, strict=True))
             if self._is_gross(ranked, found, noises):
                 gross = _companion(self.likelihood, now, peaks, candidates)
                 if gross is not None:
@@ -237,7 +240,7 @@ class _Search:
                     found = wider
                     continue
             if not alike:
-                beside = self._hidden(ranked, found) if hidden else []
+                beside = self._hidden(ranked, found) if np.isinf(target) else []
                 if not beside:
                     break
                 found = self._together(beside)
@@ -251,13 +254,10 @@ class _Search:
             found = self._together([*found, Found(alike, now, contenders)])
         return found, doubtful
 
-    def _may_explain(
-        self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
-    ) -> bool:
-        """Tell whether as many causes as may be named would gain as much as a noise, each by itself."""
+    def _reaches(self, ranked: Sequence[Named], found: Sequence[Found], gain: float) -> bool:
+        """Tell whether as many causes as may be named would gain so much, each by itself."""
         best = max((at.score(of) for at, of in ranked if _is_physical(of)), default=0.0)
-        noise = max((at.score(of) for at, of in noises), default=np.inf)
-        return best * (self.most - len(found)) >= noise
+        return best * (self.most - len(found)) >= gain
 
     def _is_gross(
         self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
@@ -265,9 +265,8 @@ class _Search:
         """Tell whether two gross faults may look like a noise or outliers, so that pairs are tried."""
         if any(of.kind in NOISES and at.value > GROSS for at, of in noises):
             return True
-        return any(of.kind == "outliers" for _, of in noises) and self._may_explain(
-            ranked, found, noises
-        )
+        outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
+        return self._reaches(ranked, found, outliers)
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
@@ -283,14 +282,12 @@ class _Search:
         What is left out of a model looks like noise that is stated too small, and large parts of it like
         outliers.
         """
-        if not self._may_explain(ranked, found, noises):
-            return []
         noise = max(at.score(of) for at, of in noises)
         physical = [(at, of) for at, of in ranked if _is_physical(of)]
-        instead, _ = self.more(
-            [of for _, of in physical], [at for at, _ in physical], found, hidden=False
-        )
-        before, after = self.likelihood([self.without(found), self.without(instead)])
+        [before] = self.likelihood([self.without(found)])
+        own, faults = [at for at, _ in physical], [of for _, of in physical]
+        instead, _ = self.more(faults, own, found, target=before + noise)
+        [after] = self.likelihood([self.without(instead)])
         cost = NUMBER_COST * sum(len(each.supposed.numbers) for each in instead[len(found) :])
         return instead if after - before - cost >= noise else []
 
