@@ -201,12 +201,13 @@ class _Search:
         peaks: Sequence[Peak],
         found: Sequence[Found],
         *,
-        hidden: bool = True,
+        target: float = -np.inf,
     ) -> tuple[list[Found], list[Named]]:
         """Add causes to those that are found until none is sure; and say what is in doubt after them.
 
-        `peaks` are what the hypotheses gain over those that are found. `hidden` says whether those are
-        looked for, too, that gain enough only together with a new fit of the others.
+        `peaks` are what the hypotheses gain over those that are found. With a `target`, the search ends
+        if as many causes as may be named would not come to that log-likelihood. Without one it also
+        looks for causes that gain enough only together with a new fit of the others.
         """
         found, doubtful = list(found), list[Named]()
         for _ in range(2 * self.most):  # a cause may go again
@@ -216,21 +217,30 @@ class _Search:
                 break
             now = self.without(found)
             peaks = peaks or self.peaks(now, candidates)
+            ranked = list(zip(peaks, candidates, strict=True))
+            if not self._reaches(ranked, found, target - self.likelihood([now])[0]):
+                break
             alike, doubtful = _likeliest(self.likelihood, now, peaks, candidates, self.count)
-            noises = [each for each in (*alike[:1], *doubtful) if _is_too_small(*each)]
-            if any(at.value > GROSS for at, _ in noises):
+            noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
+            if self._is_gross(ranked, found, noises):
                 gross = _companion(self.likelihood, now, peaks, candidates)
                 if gross is not None:
                     now, noises = gross.without(now), []
                     candidates = [each for each in candidates if each is not gross.of]
                     peaks = self.peaks(now, candidates)
                     alike = _likeliest(self.likelihood, now, peaks, candidates, self.count)[0] or alike
-            ranked, peaks = list(zip(peaks, candidates, strict=True)), []
+                    ranked = list(zip(peaks, candidates, strict=True))
+            peaks = []
             if noises and (instead := self._without_noise(ranked, found, noises)):
                 found = instead
                 continue
+            if alike and alike[0][1].kind in NOISES and len(found) > 1:
+                wider = self._together([self._widened(each, tried) for each in found])
+                if {id(each.supposed.of) for each in wider} != {id(each.supposed.of) for each in found}:
+                    found = wider
+                    continue
             if not alike:
-                beside = self._hidden(ranked, found) if hidden else []
+                beside = self._hidden(ranked, found) if np.isinf(target) else []
                 if not beside:
                     break
                 found = self._together(beside)
@@ -244,22 +254,40 @@ class _Search:
             found = self._together([*found, Found(alike, now, contenders)])
         return found, doubtful
 
+    def _reaches(self, ranked: Sequence[Named], found: Sequence[Found], gain: float) -> bool:
+        """Tell whether as many causes as may be named would gain so much, each by itself."""
+        best = max((at.score(of) for at, of in ranked if _is_physical(of)), default=0.0)
+        return best * (self.most - len(found)) >= gain
+
+    def _is_gross(
+        self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
+    ) -> bool:
+        """Tell whether two gross faults may look like a noise or outliers, so that pairs are tried."""
+        if any(of.kind in NOISES and at.value > GROSS for at, of in noises):
+            return True
+        outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
+        return self._reaches(ranked, found, outliers)
+
+    @staticmethod
+    def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
+        """Let all faults of a cause's kind contend with it: fixes in feet may be speeds that are not."""
+        kind = found.supposed.of.kind
+        return found._replace(contenders=[of for of in tried if of.kind == kind and _is_physical(of)])
+
     def _without_noise(
         self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
     ) -> list[Found]:
-        """Find causes that explain as much as a noise does, without any noise; none if there are none.
+        """Find causes that explain as much as a noise or outliers do; none if there are none.
 
-        What is left out of a model looks like noise that is stated too small.
+        What is left out of a model looks like noise that is stated too small, and large parts of it like
+        outliers.
         """
         noise = max(at.score(of) for at, of in noises)
         physical = [(at, of) for at, of in ranked if _is_physical(of)]
-        best = max((at.score(of) for at, of in physical), default=0.0)
-        if best * (self.most - len(found)) < noise:
-            return []
-        instead, _ = self.more(
-            [of for _, of in physical], [at for at, _ in physical], found, hidden=False
-        )
-        before, after = self.likelihood([self.without(found), self.without(instead)])
+        [before] = self.likelihood([self.without(found)])
+        own, faults = [at for at, _ in physical], [of for _, of in physical]
+        instead, _ = self.more(faults, own, found, target=before + noise)
+        [after] = self.likelihood([self.without(instead)])
         cost = NUMBER_COST * sum(len(each.supposed.numbers) for each in instead[len(found) :])
         return instead if after - before - cost >= noise else []
 
@@ -301,7 +329,8 @@ class _Search:
         for place, each in enumerate(found):
             others = [*found[:place], *found[place + 1 :]]
             taken = {id(of) for other in others for _, of in other.names}
-            own = [*_faults(each.names), *(of for of in each.contenders if id(of) not in taken)]
+            free = [(Peak(0.0, 0.0), of) for of in each.contenders if id(of) not in taken]
+            own = _faults([*each.names, *free])
             if len(own) < 2:
                 continue
             nearest, main = self._nearest(self.without(others), own), each.names[0][1]
@@ -406,9 +435,9 @@ def _likeliest(
     return [each for each in _alike(ranked[place:]) if each is first or is_sure(each)], before
 
 
-def _is_too_small(at: Peak, of: Hypothesis) -> bool:
-    """Tell whether it is a noise that is stated too small."""
-    return of.kind in NOISES and at.value > 0.0
+def _takes_all(at: Peak, of: Hypothesis) -> bool:
+    """Tell whether it explains part of any fault: a noise that is stated too small, or outliers."""
+    return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
 def _companion(
@@ -421,9 +450,9 @@ def _companion(
     """
     supposed, most = list[Supposed](), 0.0
     for at, of in zip(peaks, candidates, strict=True):
-        if of.kind in NOISES:
+        if not _is_physical(of):
             most = max(most, at.gain)
-        elif of.kind != "outliers":
+        else:
             values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
             supposed += [Supposed(of, value) for value in values]
     alone = np.array(gains_over(likelihood, now)(supposed))
