@@ -106,7 +106,9 @@ class Scene:
 
     def colours(self, case: str) -> dict[str, Colour]:
         """Return the colours of the truth of `case` and of its estimators, by name."""
-        named = {"truth": TRUTH} if self.truths_of(case) else {}
+        truths = [topic for topic in self._truths if _prefix(topic) == case]
+        has_truth = any(self.source.topics[topic].messages for topic in truths)
+        named = {"truth": TRUTH} if has_truth else {}
         return named | {name: self.colour(name) for name in self.estimators_of(case)}
 
     def estimators_of(self, case: str) -> list[str]:

@@ -322,7 +322,9 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
     return [plot_view(plot, "Effective particles", "share", (-0.05, SHARES))] if found else []
 
 
-def draw_components(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:
+def draw_components(
+    canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
+) -> dict[str, rrb.TimeSeriesView]:
     """Draw one plot per component of a case's Gaussian estimates: estimators' means, and the truth."""
     found = [("truth", TRUTH, LINE, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
@@ -337,8 +339,9 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.Ti
     views = {}
     for component, curves in drawn.items():
         quantity, unit, _ = shown_unit(component)
-        plot, extent = entity_path("plots", case, component), below_legend(curves)
-        views[component] = plot_view(plot, quantity.capitalize(), unit, extent, zoom_lock=False)
+        plot, title = entity_path("plots", case, component), quantity.capitalize()
+        extent = below_legend(curves) if legend else None
+        views[component] = plot_view(plot, title, unit, extent, legend=legend, zoom_lock=False)
     return views
 
 

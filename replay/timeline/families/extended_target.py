@@ -41,7 +41,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     colours = scene.colours("") | {"measured": WRONG}
     board = with_legend(canvas, ROOT, colours, plane)
     board = above_events(board, draw_events(canvas, scene, ""))
-    sizes = [*draw_components(canvas, scene, "").values()][:2]
+    sizes = [*draw_components(canvas, scene, "", legend=False).values()][:2]
     plots = [*sizes, *draw_quality(canvas, scene, "", legend=False)]
     return beside(board, plots, "")
 

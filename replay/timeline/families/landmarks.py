@@ -59,6 +59,8 @@ SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
 # What states how far and how widely a sensor sees; how its view is drawn.
 VIEW, CORNERS, SEEN_UP_TO = ("maximum_range_m", "field_of_view_deg"), 49, (110, 110, 90)
+# At most so many views are drawn.
+VIEWS = 500
 # A pose is too old to look from after so long.
 FRESH_NS = 500_000_000
 
@@ -183,12 +185,14 @@ def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) ->
         if is_seeing and isinstance(stated, Mapping) and {*VIEW} <= {*stated}:
             reach_m, opening_deg = (float(stated[name]) for name in VIEW)
             [truth] = truths
-            angle = truth.poses[:, 2:] + np.radians(opening_deg) * np.linspace(-0.5, 0.5, CORNERS)
-            place = truth.poses[:, None, :2]
+            rows = thin(truth.time_ns, VIEWS)
+            poses = truth.poses[rows]
+            angle = poses[:, 2:] + np.radians(opening_deg) * np.linspace(-0.5, 0.5, CORNERS)
+            place = poses[:, None, :2]
             rim = place + reach_m * np.stack([np.cos(angle), np.sin(angle)], axis=2)
             outlines = rim if opening_deg == 360.0 else np.concatenate([place, rim, place], axis=1)
             root = entity_path(ROOT, robot, "field of view")
-            draw_outlines(canvas, root, truth.time_ns, outlines, Stroke(SEEN_UP_TO, 0.5))
+            draw_outlines(canvas, root, truth.time_ns[rows], outlines, Stroke(SEEN_UP_TO, 0.5))
             return {"field of view": SEEN_UP_TO}
     return {}
 
