@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.testing import assert_allclose
 import fuselog as fl
 from pipeline.altering.sources import alter
 from pipeline.diagnosing import portion
-from pipeline.diagnosing.battery import battery, consistent
+from pipeline.diagnosing.battery import battery, consistent, together
 from pipeline.diagnosing.battery import car as battery_car
 from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from pipeline.diagnosing.battery.car import (
@@ -104,6 +105,52 @@ def test_a_delay_beside_noisy_wheels_is_found() -> None:
 def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
     """With one undone the other is still so large that a noise thousands of times larger fits."""
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
+
+
+def test_pairs_and_triples_are_of_faults_that_a_log_tells_apart() -> None:
+    """Each fault is in some of them; none is of two faults of a number, or of two that are a third."""
+    pairs, triples = together.pairs(), together.triples()
+    told = {name for faults in pairs for name in faults}
+    assert told == FAULTS.keys() - {"nothing", "half of the odometry lost"}
+    excluded = {frozenset(each) for each in combinations(sorted(told), 2)} - {
+        frozenset(each) for each in pairs
+    }
+    assert frozenset({"speed x 3.6", "speed / 3.6"}) in excluded
+    assert frozenset({"turn rate's sign", "E, N exchanged"}) in excluded
+    assert len(excluded) == 18
+    assert len({*triples}) == len(triples) == 40
+    assert all(frozenset(two) not in excluded for each in triples for two in combinations(each, 2))
+
+
+@pytest.mark.paper
+def test_faults_at_once_are_named_with_values_in_their_intervals() -> None:
+    """A speed in feet with a wrong sign is no error of fixes with another variance."""
+    found = together.tried(("turn rate's sign", "speed x .3048"), 2100)
+    assert found["are_named"], found["causes"]
+    assert found["within"] == found["values"] == 1, found["causes"]
+    assert not found["is_noise_first"]
+
+
+def test_faults_at_once_are_counted() -> None:
+    """By pairs and triples, and by what was planted."""
+    rows = pd.DataFrame(
+        {
+            "faults": " + ".join("abc"[:planted]),
+            "planted": planted,
+            "are_named": seed == 1,
+            "values": 2,
+            "within": 1 + (seed == 1),
+            "is_noise_first": seed == 0,
+        }
+        for planted in (2, 3)
+        for seed in range(4)
+    )
+    counted = together.metrics_of(rows)
+    assert counted["ekf.logs.pairs"] == counted["ekf.logs.triples"] == 4.0
+    assert counted["ekf.named_share.pairs"] == 0.25
+    assert counted["ekf.within_share.triples"] == 0.625
+    assert counted["ekf.noise_first.pairs"] == 1.0
+    assert (counted["ekf.named.a-b"], counted["ekf.within.a-b-c"]) == (1.0, 5.0)
 
 
 @pytest.mark.paper
@@ -347,7 +394,7 @@ def test_the_battery_tries_every_cell_pair_and_unit_with_all_its_seeds(
     assert metrics["diagnosis.battery_first_share"] == 0.5
     for fault, own in tables["battery_unit"].groupby("fault"):
         assert own["seed"].tolist() == [*range(4, 4 + 2 * battery.UNIT_RUNS)]
-        assert metrics[f"diagnosis.unit_first.{battery._case(str(fault))}"] == 2.0
+        assert metrics[f"diagnosis.unit_first.{battery.case_of(str(fault))}"] == 2.0
 
 
 def test_faults_of_a_unit_are_what_their_names_say() -> None:

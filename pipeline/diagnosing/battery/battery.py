@@ -25,6 +25,7 @@ from pipeline.runs.ensemble import Progress
 from recorders.plausibility.checks import findings
 from recorders.plausibility.finding import Cause as Estimated
 
+OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
 UNIT, VELOCITY = "/car/inertial", "/car/velocity"
 UNIT_RUNS = 5  # of each fault of the unit, for one of each cell: they cost a tenth
@@ -136,8 +137,8 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     """Plant a fault, and look for the likeliest causes, so many at most."""
     log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
     of_log = without_filter(log, list(log.streams))
-    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, most)
-    causes = [list(_named(cause)) for cause in found.causes]
+    found = seek(log, "ekf", OPEN, most)
+    causes = [list(named_by(cause)) for cause in found.causes]
     known = {one.topic for each in causes for one in each}
     lost = [[Right(each.kind, each.topic)] for each in of_log if each.kind in FIRST]
     others = [each for each in of_log if each.kind not in FIRST and each.topic not in known]
@@ -146,7 +147,7 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     places = [any(one[:3] in right for one in each) for each in named]
     value, gain = np.nan, np.nan
     for cause in found.causes[:1] if any(places) else ():
-        values = [one.value for one in _named(cause) if one[:3] in right]
+        values = [one.value for one in named_by(cause) if one[:3] in right]
         value = values[0] if values and values[0] is not None else np.nan
         gain = cause.gain
     mends = [cause.hypothesis.mend(cause.value) for cause in found.causes[:1]]
@@ -186,18 +187,18 @@ def unit_tried(fault: str, seed: int) -> dict[str, Any]:
 def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False) -> dict[str, Any]:
     """Plant faults at once into a log with a compass, and see whether three causes name all."""
     log = recorded(faulty(seed, *faults), has_prior=has_prior)
-    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, 3)
-    named = {one[:3] for cause in found.causes for one in _named(cause)}
+    found = seek(log, "ekf", OPEN, 3)
+    named = {one[:3] for cause in found.causes for one in named_by(cause)}
     return {
         "faults": " + ".join(faults),
         "has_prior": has_prior,
         "seed": seed,
         "are_named": all(any(one[:3] in named for one in RIGHT[fault]) for fault in faults),
-        "first": " ".join(filter(None, next(_named(found.causes[0]))[:3])) if found.causes else "",
+        "first": " ".join(filter(None, next(named_by(found.causes[0]))[:3])) if found.causes else "",
     }
 
 
-def _named(cause: Cause) -> Iterator[Right]:
+def named_by(cause: Cause) -> Iterator[Right]:
     """Yield what a cause names, and what the log does not tell from it; factors as logarithms."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
@@ -252,7 +253,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
     """Count by cell the runs whose fault is named first, and with its number within 4 sigma."""
     found = {
-        f"diagnosis.battery_{quantity}.{_case(row['cell'])}": float(row[quantity])
+        f"diagnosis.battery_{quantity}.{case_of(row['cell'])}": float(row[quantity])
         for row in summary(rows).to_dict("records")
         for quantity in ("first", "within")
         if np.isfinite(row[quantity])
@@ -271,13 +272,13 @@ def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
     """Return the runs of the unit whose fault is told first, and the spread of the number, by fault."""
     found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
     for fault, own in rows.groupby("fault", sort=False):
-        found[f"diagnosis.unit_first.{_case(str(fault))}"] = float(own["is_first"].sum())
+        found[f"diagnosis.unit_first.{case_of(str(fault))}"] = float(own["is_first"].sum())
         if own["value"].notna().any():
-            found[f"diagnosis.unit_value.{_case(str(fault))}"] = float(own["value"].mean())
-            found[f"diagnosis.unit_spread.{_case(str(fault))}"] = float(own["value"].std())
+            found[f"diagnosis.unit_value.{case_of(str(fault))}"] = float(own["value"].mean())
+            found[f"diagnosis.unit_spread.{case_of(str(fault))}"] = float(own["value"].std())
     return found
 
 
-def _case(cell: str) -> str:
+def case_of(cell: str) -> str:
     """Return a cell's name as the case of a metric."""
     return re.sub(r"[^a-z0-9]+", "-", cell.lower()).strip("-")

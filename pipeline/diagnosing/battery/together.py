@@ -1,0 +1,137 @@
+"""Counts how often several faults that are planted into a car's log at once are all named, with values.
+
+The logs have a compass and a prior, so that most faults can be told apart.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
+from pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
+from pipeline.diagnosing.causes import Cause, Estimated, seek
+from pipeline.diagnosing.hypotheses.hypothesis import NOISES
+from pipeline.output.results import Outcome
+from pipeline.runs.estimates import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+
+TRIPLES = 40
+AXES = "E, N exchanged"
+MOST = 4  # causes: one more than are planted at most
+# What each fault is of. Two faults of one number hide one another, such as opposite factors.
+FIELDS: dict[str, Sequence[str]] = {
+    "stamps of fixes": ("fixes .3 s late", "fixes 18 s late"),
+    "turn rate": ("turn rate's sign", "degrees as radians", "gyro bias .02", "gyro bias .0004 t"),
+    "speed": ("speed x 3.6", "speed / 3.6", "speed x .3048"),
+    "lever": ("lever (2, .6) m",),
+    "variance of fixes": ("fix variance x 4", "fix variance / 16", "sd written as variance"),
+    "axes of fixes": (AXES,),
+    "stamps of odometry": ("odometry clock 6 % fast",),
+    "noise of turns": ("gyro density / 5",),
+    "compass": ("compass + 4.5 deg", "compass clockwise from north"),
+}
+# Any two of these are the third: each mirrors one of what turns, where the car is and its heading.
+MIRRORS = {"turn rate's sign", AXES, "compass clockwise from north"}
+# Fixes that are 3.6 times too far apart explain both: they also look 3.6 times noisier.
+ALIKE = {"speed / 3.6", "fix variance / 16"}
+# Lost messages are told by the stamps, and "nothing" is no fault.
+NOT_PAIRED = {"nothing", "half of the odometry lost"}
+
+
+def pairs() -> list[tuple[str, ...]]:
+    """Return all pairs of faults of different fields that a log can tell apart."""
+    return [each for each in combinations(_in_order(), 2) if _is_told(each)]
+
+
+def triples() -> list[tuple[str, ...]]:
+    """Return some of the triples of which a log can tell each two apart, drawn once for all."""
+    every = [each for each in combinations(_in_order(), 3) if _is_told(each)]
+    chosen = philox(63).choice(len(every), TRIPLES, replace=False)
+    return [every[place] for place in sorted(chosen.tolist())]
+
+
+def _in_order() -> list[str]:
+    """Return the faults as they are put: axes are exchanged after all else of fixes."""
+    return sorted((name for name in FAULTS if name not in NOT_PAIRED), key=lambda name: name == AXES)
+
+
+def _is_told(faults: Sequence[str]) -> bool:
+    fields = {field for name in faults for field, own in FIELDS.items() if name in own}
+    is_one = len(MIRRORS.intersection(faults)) > 1 or ALIKE.issubset(faults)
+    return len(fields) == len(faults) and not is_one
+
+
+def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
+    """Plant faults, look for causes, and see which are named and whether intervals have the values."""
+    log = recorded(faulty(seed, *faults), has_prior=True)
+    causes = seek(log, "ekf", OPEN, MOST).causes
+    planted = [RIGHT[name][0] for name in faults]
+    found = [_estimate(causes, right) for right in planted]
+    values = [
+        each.low <= right.value <= each.high
+        for each, right in zip(found, planted, strict=True)
+        if each is not None and right.value is not None and each.low != each.high
+    ]
+    first = causes[0].hypothesis.kind if causes else ""
+    return {
+        "faults": " + ".join(faults),
+        "planted": len(faults),
+        "seed": seed,
+        "are_named": all(each is not None for each in found),
+        "values": len(values),
+        "within": sum(values),
+        "is_noise_first": first in NOISES and not any(right.kind in NOISES for right in planted),
+        "causes": "; ".join(cause.statement for cause in causes),
+    }
+
+
+def _estimate(causes: Sequence[Cause], right: Right) -> Estimated | None:
+    """Return the number of a planted fault, by any name that causes have for it; of noise logarithms."""
+    for cause in causes:
+        for each in (cause, *cause.others):
+            for number in each.numbers:
+                if (each.hypothesis.kind, each.hypothesis.topic, number.part) == right[:3]:
+                    is_noise = each.hypothesis.kind in NOISES
+                    return Estimated(number.part, *np.log(number[1:])) if is_noise else number
+    return None
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
+    for faults in (*pairs(), *triples()):
+        title = " + ".join(faults)
+        rows += [tried(faults, seed) for seed in setting.progress(seeds, title, len(seeds))]
+    found = pd.DataFrame(rows)
+    outcome = Outcome(metrics={**metrics_of(found)}, tables={"together": found})
+    outcome.input_sha256 = hash_streams(
+        [recorded(faulty(experiment.seed, *faults), has_prior=True) for faults in pairs()]
+    )
+    return outcome
+
+
+def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
+    """Count over all logs, over pairs and triples, and by what was planted."""
+    metrics = dict[str, float]()
+    for case, own in (("pairs", rows[rows["planted"] == 2]), ("triples", rows[rows["planted"] == 3])):
+        metrics |= {
+            f"ekf.logs.{case}": float(len(own)),
+            f"ekf.named_share.{case}": float(own["are_named"].mean()),
+            f"ekf.values.{case}": float(own["values"].sum()),
+            f"ekf.within_share.{case}": float(own["within"].sum() / max(own["values"].sum(), 1)),
+            f"ekf.noise_first.{case}": float(own["is_noise_first"].sum()),
+        }
+    for faults, own in rows.groupby("faults", sort=False):
+        metrics[f"ekf.named.{case_of(str(faults))}"] = float(own["are_named"].sum())
+        metrics[f"ekf.within.{case_of(str(faults))}"] = float(own["within"].sum())
+    return metrics
+
+
+FAULTS_TOGETHER = Study(
+    "how often a diagnosis names two or three faults that are planted into a log, with their values",
+    study,
+    runs="logs of each pair and each triple",
+)
