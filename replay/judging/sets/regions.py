@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
@@ -88,6 +87,8 @@ def inside(regions: Sequence[Sequence[Floats]], places: Floats) -> NDArray[np.bo
     Returns:
         (n,) answers.
     """
+    from matplotlib.path import Path  # which takes long to import
+
     found = np.zeros(len(places), bool)
     for row, rings in enumerate(regions):
         for ring in rings:
