@@ -265,7 +265,10 @@ OWN = {
         "cooperative", robot({**SEEN, "robots": 3, "robots_see_each_other": True}), {"anchors": [1, 2]}
     ),
     "gm-phd": Case(
-        "gm-phd", vehicles(), {"sensor": "network", "prune_weight": 0.01, "most_components": 5}
+        "gm-phd",
+        vehicles(),
+        {"sensor": "network", "prune_weight": 0.01, "most_components": 5},
+        nothing={"variance_m2": "it is the square of sigma_m, which the case states"},
     ),
     "kalman-axis": directional("kalman-axis", "axis", [0.01, 0.02]),
     "kalman-orientation": directional("kalman-orientation", "orientation", [0.01, 0.02, 0.02, 0.03]),

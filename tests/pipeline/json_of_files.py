@@ -53,7 +53,10 @@ def of_log() -> Any:
     assert log.run is not None
     assert (log.run.scenario, log.run.seed, log.run.run) == ("navigation", 4, 2)
     [finding] = fl.lint("grave.mcap")
-    printed = run_here("info", "grave.mcap", "--json").json["models"]
+    said = run_here("info", "grave.mcap", "--json").json
+    printed, estimators = said["models"], said["estimators"]
+    assert {topic for topics in estimators.values() for topic in topics} <= {*log.topics}
+    assert estimators.keys() <= {*fl.estimators}
     assert printed.keys() == {*fl.models}
     for name, each in printed.items():
         assert bool(each["methods"]) == (not each["lacks"]) == (name == "inertial")
@@ -68,6 +71,7 @@ def of_log() -> Any:
         "topics": topics,
         "findings": [finding._asdict()],
         "models": printed,
+        "estimators": estimators,
         "lost": None,
     }
 

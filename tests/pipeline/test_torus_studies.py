@@ -95,7 +95,7 @@ def test_a_report_compares_by_the_errors_of_single_runs(tmp_path):
     assert found == pytest.approx(result.metrics["torus.angle_rmse_rad.strong-coupling"])
     tried, came = run_sentences(result, tmp_path / "out")
     assert "8 simulated runs" in tried
-    assert came.startswith("A tie so far: 8 runs do not tell torus and ukf apart")
+    assert came.startswith("A tie so far: 8 runs do not tell ukf and torus apart")
 
 
 def test_torus_filter_is_nearly_as_good_as_a_grid(tmp_path):

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy.spatial.transform import Rotation
 
 from recorders.log import Stream, schemas
 from recorders.models.optical import direction
@@ -118,6 +117,8 @@ def _draw_way(canvas: Canvas, entity: str, track: Track, label: str | None) -> N
 
 def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> None:
     """Draw a sensor's way, and its line of sight as it is measured, with the attitude as stated."""
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     rows = thin(stream.publish_time_ns)
     name = stream.topic.strip("/").partition("/")[0]
     time_ns, places = stream.publish_time_ns[rows], stream["position_m"][rows]

@@ -12,7 +12,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from recorders.log import Stream, schemas
 from recorders.models.optical import bias_components, direction
@@ -79,6 +78,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:
     """Yield the sensors of the log whose place and attitude it holds."""
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     for topic in scene.source.topics:
         number = re.fullmatch(r"/sensor(\d+)/line_of_sight", topic)
         if number is None:
@@ -179,6 +180,8 @@ def _draw_estimates(
 
 def ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
     """Return half axes (n, 3) and orientations (n, 4) of what holds Gaussians (n, 3, 3) with 95 %."""
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     half_axes = np.sqrt(chi2.ppf(0.95, 3) * np.maximum(variances, 0.0))
