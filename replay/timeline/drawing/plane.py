@@ -102,9 +102,14 @@ def draw_points(
 
 
 def neighbours(places: Floats, extent_m: float) -> list[list[int]]:
-    """Group the rows of points (n, 2) whose labels would overlap in a view that shows so much.
+    """Group points whose labels would overlap: a point joins a group that it is all close to.
 
-    A point joins the first group of which it is close to all points.
+    Args:
+        places: (n, 2), in m.
+        extent_m: what the view shows.
+
+    Returns:
+        the rows of each group.
     """
     farthest = LABEL_SHARE * extent_m
     groups: list[list[int]] = []
@@ -233,7 +238,12 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 
 
 def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
-    """Draw the whole true way of a point (n, 2), faintly: it is there before the path gets to it."""
+    """Draw the whole true way of a point, faintly: it is there before the path gets to it.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        places: (n, 2), in m; what is not known is NaN.
+    """
     known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
     style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)], "draw_order": 0.0}
     canvas.fix(entity, rr.LineStrips2D([known], **style))

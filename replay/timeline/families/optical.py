@@ -130,7 +130,15 @@ def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floa
 def draw_rays(
     canvas: Canvas, entity: str, shown_ns: Times, time_ns: Times, rays: Floats, colour: Colour
 ) -> None:
-    """Draw rays (n, 2, 3), each at its time, which is one of those when some are shown; both sorted."""
+    """Draw rays, each at its time.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        shown_ns: sorted times at which some are shown.
+        time_ns: (n,), sorted, each one of these.
+        rays: (n, 2, 3), in m, begin and end.
+        colour: theirs.
+    """
     times = np.unique(shown_ns)
     sizes = np.bincount(np.searchsorted(times, time_ns), minlength=len(times))
     columns = rr.LineStrips3D.columns(strips=rays.astype(np.float32))
