@@ -166,6 +166,8 @@ def _judge(
 ) -> Any:
     return SimpleNamespace(
         conditioning=conditioning or {},
+        uninformed={},
+        unestimated={},
         innovations=innovations or {},
         metrics=metrics or {},
         intervals=lambda _: bounds or {},
