@@ -102,7 +102,7 @@ def _made(**how: Any) -> Any:
     free, gate, by = how.pop("free", FREE), how.pop("gate", 1.0), how.pop("by", "likelihood")
     values = {"optimum": np.ones(len(free)), "evaluations": 17, **ended}
     outcome = SearchOutcome(coordinates=Coordinates(free, np.ones(len(free))), **values)
-    objective = SimpleNamespace(by=by, is_corrected=how.pop("is_corrected", False))
+    objective = SimpleNamespace(by=by, is_corrected=how.pop("is_corrected", False), left_out={})
     made = SimpleNamespace(found=outcome, gate=gate, objective=objective, held_out_costs=None, folds=[])
     vars(made).update({"held_out_logs": [], **how})
     made._scale = Tuning._scale.fget(made)  # type: ignore[attr-defined]
