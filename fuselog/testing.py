@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.planning import Kind, settings_of
-from pipeline.checking.checking import Checked, check, compared, runs_of
-from pipeline.checking.golden import Replayed, make
-from pipeline.checking.stored import Golden, read, write
-from replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.pipeline.api.planning import Kind, settings_of
+from fuselog.pipeline.checking.checking import Checked, check, compared, runs_of
+from fuselog.pipeline.checking.golden import Replayed, make
+from fuselog.pipeline.checking.stored import Golden, read, write
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 __all__ = ["Golden", "Replayed", "assert_golden", "assert_same"]
 

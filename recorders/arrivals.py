@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.arrivals import Weighting, arrivals
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.arrivals import Weighting, arrivals
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def difference_stream(
         prefix: of the topic, which ends with `/differences`.
         heard: what the microphones recorded.
         band_hz: the frequencies that are used.
-        weighting: see `recorders.models.arrivals`.
+        weighting: see `fuselog.recorders.models.arrivals`.
         speed_of_sound_mps: sets how much later a sound may come at all, and is stated.
     """
     time_ns, recordings, rate_hz, places_m, microphone_id = heard

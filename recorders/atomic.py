@@ -23,7 +23,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 _LOCK, _NEW, _OLD = "fuselog.lock", "new", "old"
 _LOG = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.states import state_metadata
-from recorders.parameters import Parameters
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.states import state_metadata
+from fuselog.recorders.parameters import Parameters
 
 
 def truth_stream(topic: str, time_ns: ArrayLike, components: Sequence[str], state: ArrayLike) -> Stream:

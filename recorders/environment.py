@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 UNCOMPILED, BOUNDSCHECK, TRACEBACK = "FUSELOG_UNCOMPILED", "FUSELOG_BOUNDSCHECK", "FUSELOG_TRACEBACK"
 CORES = "NUMBA_NUM_THREADS"

@@ -6,7 +6,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 
 @contextmanager

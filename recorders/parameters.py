@@ -20,8 +20,8 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from recorders.errors import BadInput, choices
-from recorders.parsing import DEEPEST, parse_toml
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parsing import DEEPEST, parse_toml
 
 _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML does not take
 

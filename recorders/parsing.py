@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 # The parameters of recorders and estimators are tables of tables of lists: five levels.
 DEEPEST = 50

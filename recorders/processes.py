@@ -12,7 +12,7 @@ from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 _ROOT = str(Path(__file__).parents[1])  # where our packages are, whatever the current folder is
 # Python's variable that keeps the current folder off the path, and the value that says it is ours.

@@ -9,12 +9,12 @@ from typing import Any, Generic
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream
-from recorders.log.planes import in_plane_of_log
-from recorders.log.streams import concatenate
-from recorders.parameters import Parameters, ParametersType, build
-from recorders.registry import foreign_code, load
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, RunMetadata, Stream
+from fuselog.recorders.log.planes import in_plane_of_log
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.parameters import Parameters, ParametersType, build
+from fuselog.recorders.registry import foreign_code, load
 
 # Simulated runs start at 2026-01-01T00:00:00Z: stamps are never negative and tools show a date.
 SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000

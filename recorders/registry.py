@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from textwrap import shorten
 from typing import Any
 
-from recorders.errors import BadInput, choices
+from fuselog.recorders.errors import BadInput, choices
 
 SINGULAR = {"studies": "study"}
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput, choices
+from fuselog.recorders.errors import BadInput, choices
 
 Floats = NDArray[np.float64]
 Format = Literal["tum", "kitti", "euroc"]

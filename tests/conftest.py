@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from recorders.recording import import_run
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 pytest_plugins = ["tests.goldens.keeping"]
 

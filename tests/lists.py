@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.lists import GROUPS, KEPT, places_of, told
+from fuselog.pipeline.api.lists import GROUPS, KEPT, places_of, told
 
 
 def lists() -> dict[str, dict[str, Any]]:

@@ -11,9 +11,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.models.orientation import compose, heading
-from replay.engine.streams.sources import MemorySource
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.orientation import compose, heading
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Alteration = Callable[[Stream, float], Stream]
 STRAY = 20.0  # in the unit of the vector

@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.altering import alterations as alter
-from recorders.errors import BadInput, choices
-from recorders.importers.units import conversion, unit_of
-from recorders.log import Stream, Topic, schemas
-from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
-from recorders.parameters import merge, nested
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.inference.estimators import registered_models
-from replay.inference.model.own_parameters import read_by
-from replay.inference.model.parameters import ModelParameters
-from replay.judging.tracks.errors import COVERS
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.importers.units import conversion, unit_of
+from fuselog.recorders.log import Stream, Topic, schemas
+from fuselog.recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
+from fuselog.recorders.parameters import merge, nested
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.model.own_parameters import read_by
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.judging.tracks.errors import COVERS
 
 AXES = "xyz"
 ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # of what is done to a field

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.altering.changes import AXES, names_in
-from recorders.log import Stream
-from replay.engine.replaying.estimator import Reading
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering.changes import AXES, names_in
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.replaying.estimator import Reading
 
 PROBED = 64  # messages, by which is found what is read
 

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from pipeline.altering.changes import Change
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, schemas
-from recorders.log.planes import LATITUDE, Origin, frame_of, is_planar, stated_in
-from replay.engine.streams.planes import into_plane_of
+from fuselog.pipeline.altering.changes import Change
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, schemas
+from fuselog.recorders.log.planes import LATITUDE, Origin, frame_of, is_planar, stated_in
+from fuselog.replay.engine.streams.planes import into_plane_of
 
 
 def in_one_plane(

@@ -13,12 +13,12 @@ from typing import Any, overload
 
 import numpy as np
 
-from pipeline.altering.changes import Change, by_topic, changes_of, is_of_topic
-from pipeline.altering.planes import in_one_plane
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream, Topic
-from recorders.parsing import parse_json
-from replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.pipeline.altering.changes import Change, by_topic, changes_of, is_of_topic
+from fuselog.pipeline.altering.planes import in_one_plane
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream, Topic
+from fuselog.recorders.parsing import parse_json
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 
 NOTE = "alterations"  # in the metadata of an estimates log
 Settings = Mapping[str, Any]

@@ -1,7 +1,7 @@
 """Offers in Python what the commands do: logs, recordings, experiments, lists.
 
 Everything raises BadInput as the commands do, with the same sentences. docs/python.md shows how to use
-it; `pipeline.api.replays` has the replay.
+it; `fuselog.pipeline.api.replays` has the replay.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,28 +14,28 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.api.catalog import LISTS, Entries, Entry
-from pipeline.api.lists import listed
-from pipeline.output.outputs import LOG, check_files, check_folder
-from pipeline.output.results import Result, read_table
-from pipeline.output.summary import summary_table
-from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import PoolFactory, pool_for
-from pipeline.runs.experiment import (
+from fuselog.pipeline.api.catalog import LISTS, Entries, Entry
+from fuselog.pipeline.api.lists import listed
+from fuselog.pipeline.output.outputs import LOG, check_files, check_folder
+from fuselog.pipeline.output.results import Result, read_table
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.ensemble import Progress, no_progress
+from fuselog.pipeline.runs.executors import PoolFactory, pool_for
+from fuselog.pipeline.runs.experiment import (
     Experiment,
     Stated,
     read_experiment,
     require_campaign,
     run_experiment,
 )
-from pipeline.runs.inputs import load_scenario
-from pipeline.runs.sweeps import Over, Sampling, over_of, points_of, run_sweep, settings_at
-from recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
-from recorders.log import Stream, write_log
-from recorders.parameters import merge
-from recorders.recording import import_run, record_run
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.foreign.naming import allowed
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.pipeline.runs.sweeps import Over, Sampling, over_of, points_of, run_sweep, settings_at
+from fuselog.recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
+from fuselog.recorders.log import Stream, write_log
+from fuselog.recorders.parameters import merge
+from fuselog.recorders.recording import import_run, record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.foreign.naming import allowed
 
 
 @without_warnings_of_numbers()

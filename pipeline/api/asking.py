@@ -8,21 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.changes import WHATS, is_of_topic, is_parameter
-from pipeline.api.catalog import Entry, rows_of, stated_of
-from pipeline.logs.constraints import ConstraintParameters
-from pipeline.output.terminal import print_table
-from pipeline.runs.experiment import Experiment, Study, experiment_of_logs, read_experiment
-from pipeline.runs.inputs import load_scenario
-from pipeline.runs.settings import named_by, read_settings
-from recorders.errors import BadInput, choices
-from recorders.log import open_log
-from recorders.parameters import merge, parse_settings
-from recorders.recording import Recorder
-from recorders.registry import load
-from replay.engine.replaying.estimator import Estimator, find_estimator
-from replay.inference.estimators import registered_models
-from replay.inference.observability import OBSERVABILITY
+from fuselog.pipeline.altering.changes import WHATS, is_of_topic, is_parameter
+from fuselog.pipeline.api.catalog import Entry, rows_of, stated_of
+from fuselog.pipeline.logs.constraints import ConstraintParameters
+from fuselog.pipeline.output.terminal import print_table
+from fuselog.pipeline.runs.experiment import Experiment, Study, experiment_of_logs, read_experiment
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.pipeline.runs.settings import named_by, read_settings
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import open_log
+from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.recorders.recording import Recorder
+from fuselog.recorders.registry import load
+from fuselog.replay.engine.replaying.estimator import Estimator, find_estimator
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.observability import OBSERVABILITY
 
 ASKED, OF_MODEL = "=?", " of "
 Entries = Sequence[Entry]  # what takes settings at once

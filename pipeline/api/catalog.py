@@ -8,23 +8,23 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.experiment import Experiment, Study
-from pipeline.runs.inputs import load_scenario, shipped
-from recorders.errors import BadInput, choices
-from recorders.parameters import build, describe, explain
-from recorders.parsing import read_toml
-from recorders.recording import Importer, Recorder
-from recorders.registry import available, load
-from replay.engine.replaying.estimator import Estimator, find_estimator
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import registered_models
-from replay.inference.formulas import formulas, formulas_by_function
-from replay.inference.model.binding import serving
-from replay.inference.model.model import Model
-from replay.inference.model.parameters import ModelParameters, number_fields
-from replay.inference.requirements import requirements_of
-from replay.judging.metrics.measuring import Metric
+from fuselog.pipeline.output.terminal import print_json, print_table, say
+from fuselog.pipeline.runs.experiment import Experiment, Study
+from fuselog.pipeline.runs.inputs import load_scenario, shipped
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import build, describe, explain
+from fuselog.recorders.parsing import read_toml
+from fuselog.recorders.recording import Importer, Recorder
+from fuselog.recorders.registry import available, load
+from fuselog.replay.engine.replaying.estimator import Estimator, find_estimator
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.formulas import formulas, formulas_by_function
+from fuselog.replay.inference.model.binding import serving
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.parameters import ModelParameters, number_fields
+from fuselog.replay.inference.requirements import requirements_of
+from fuselog.replay.judging.metrics.measuring import Metric
 
 
 @dataclass(frozen=True)

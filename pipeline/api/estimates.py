@@ -6,28 +6,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import setting_of
-from pipeline.api.trajectories import ComparedLogs, compare_logs
-from pipeline.output.coverage import recounted
-from pipeline.output.outputs import check_folder
-from pipeline.output.results import result_folder, write_outcome
-from pipeline.output.summary import summarise, summary_table
-from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import (
+from fuselog.pipeline.altering.sources import setting_of
+from fuselog.pipeline.api.trajectories import ComparedLogs, compare_logs
+from fuselog.pipeline.output.coverage import recounted
+from fuselog.pipeline.output.outputs import check_folder
+from fuselog.pipeline.output.results import result_folder, write_outcome
+from fuselog.pipeline.output.summary import summarise, summary_table
+from fuselog.pipeline.runs.ensemble import judge_logs
+from fuselog.pipeline.runs.estimates import (
     ErrorTables,
     hash_files,
     log_of_estimates,
     source_of_estimates,
     stated_estimators,
 )
-from pipeline.runs.initial_states import check_same_run
-from recorders.errors import BadInput
-from recorders.log import NotMcap, open_log
-from replay.engine.replaying.usage import Row
-from replay.engine.streams.sources import LogSource
-from replay.judging.errors.trajectories import Comparison
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import find_metrics
+from fuselog.pipeline.runs.initial_states import check_same_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import NotMcap, open_log
+from fuselog.replay.engine.replaying.usage import Row
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.errors.trajectories import Comparison
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import find_metrics
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.planning import Log, sources_of
-from pipeline.output.terminal import print_json, say, warn
-from pipeline.runs.settings import split_texts
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.linting.lint import lint as lint_blocks
-from recorders.log import Stream, open_log
-from recorders.log.impossible import main_span_of
-from recorders.plausibility.checks import BLOCK
-from recorders.plausibility.finding import Finding
-from replay.engine.streams.sources import LogSource, is_sensed
+from fuselog.pipeline.api.planning import Log, sources_of
+from fuselog.pipeline.output.terminal import print_json, say, warn
+from fuselog.pipeline.runs.settings import split_texts
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.linting.lint import lint as lint_blocks
+from fuselog.recorders.log import Stream, open_log
+from fuselog.recorders.log.impossible import main_span_of
+from fuselog.recorders.plausibility.checks import BLOCK
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.replay.engine.streams.sources import LogSource, is_sensed
 
 
 @without_warnings_of_numbers()

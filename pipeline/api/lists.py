@@ -8,9 +8,9 @@ imported.
 import json
 from typing import Any
 
-from pipeline.output.terminal import print_table, say
-from pipeline.runs.inputs import SHIPPED, shipped
-from recorders.registry import available
+from fuselog.pipeline.output.terminal import print_table, say
+from fuselog.pipeline.runs.inputs import SHIPPED, shipped
+from fuselog.recorders.registry import available
 
 KEPT = SHIPPED / "lists.json"
 # In which group the names of a list are registered; scenarios and experiments are files, too.
@@ -44,7 +44,7 @@ def listed(kind: str) -> dict[str, Any]:
 
 def told(kind: str) -> dict[str, Any]:
     """Return what is listed as all that is listed says it, which imports all."""
-    from pipeline.api import catalog
+    from fuselog.pipeline.api import catalog
 
     if kind == "methods":
         return catalog.methods()

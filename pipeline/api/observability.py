@@ -6,19 +6,19 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.api.planning import Log, sources_of
-from pipeline.output.terminal import print_json, print_table
-from pipeline.runs.initial_states import span_of
-from pipeline.runs.settings import sigmas_of
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.log import open_log
-from recorders.parameters import parse_settings
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.inference.model.model import Model
-from replay.inference.observability import OBSERVABILITY, Spectrum, in_words, observability_of
+from fuselog.pipeline.api.planning import Log, sources_of
+from fuselog.pipeline.output.terminal import print_json, print_table
+from fuselog.pipeline.runs.initial_states import span_of
+from fuselog.pipeline.runs.settings import sigmas_of
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.log import open_log
+from fuselog.recorders.parameters import parse_settings
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.observability import OBSERVABILITY, Spectrum, in_words, observability_of
 
 NAME = "observability"
 
@@ -50,7 +50,7 @@ def observability(
 
     Raises BadInput where no model fits, or nothing is measured.
 
-    >>> from pipeline.api.api import record
+    >>> from fuselog.pipeline.api.api import record
     >>> table = observability(record("landmarks", duration_s=2.0), window_s=1.0)
     >>> table["rank"].tolist()
     [3, 3]

@@ -9,19 +9,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter_all, split_settings
-from pipeline.runs.ensemble import Pass, Progress, Settings, cut_in_parts, no_progress, replay_parts
-from pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
-from pipeline.runs.settings import with_settings
-from recorders.errors import BadInput
-from recorders.log import Clock, Companions, RunMetadata, open_log
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.replaying.late import Late
-from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.foreign.naming import allowed, shorthand
-from replay.inference.model.model import Model
-from replay.judging.metrics.measuring import find_metrics
+from fuselog.pipeline.altering.sources import alter_all, split_settings
+from fuselog.pipeline.runs.ensemble import (
+    Pass,
+    Progress,
+    Settings,
+    cut_in_parts,
+    no_progress,
+    replay_parts,
+)
+from fuselog.pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
+from fuselog.pipeline.runs.settings import with_settings
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Companions, RunMetadata, open_log
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.replaying.late import Late
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from fuselog.replay.foreign.naming import allowed, shorthand
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.judging.metrics.measuring import find_metrics
 
 Log = str | Path | LogSource | MemorySource | Recording
 Kind = str | Estimator[Any] | Mapping[str, Any]
@@ -98,7 +105,7 @@ def plan_replay(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] | None = None,
 ) -> Plan:
-    """Check what a replay is asked for, and open its logs; see `pipeline.api.replays.replay`.
+    """Check what a replay is asked for, and open its logs; see `fuselog.pipeline.api.replays.replay`.
 
     Raises BadInput where a setting makes no sense, a log cannot be read or has nothing in the span.
     """
@@ -130,7 +137,7 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
 
     Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
 
-    >>> from pipeline.api.api import record, write
+    >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
     >>> log = open("run.mcap")
     >>> log.run.scenario, len(log)

@@ -6,22 +6,22 @@ from itertools import product
 from time import perf_counter
 from typing import Any, NamedTuple
 
-from pipeline.api.replays import replay
-from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.executors import inline_pool, processes
-from pipeline.runs.inputs import load_scenario, shipped
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from recorders.recording import Importer, Recorder, record_run
-from recorders.registry import available, load
-from replay.distributions import chi2
-from replay.engine.compiling.cache import cache_folder, is_private, kept_files
-from replay.engine.compiling.compile import core_count, is_uncompiled
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.all_methods import METHODS, modelled
-from replay.inference.estimators import registered_models
-from replay.inference.model.binding import topics_of
-from replay.inference.model.model import Model
-from replay.inference.requirements import names_state
+from fuselog.pipeline.api.replays import replay
+from fuselog.pipeline.output.terminal import print_json, print_table, say
+from fuselog.pipeline.runs.executors import inline_pool, processes
+from fuselog.pipeline.runs.inputs import load_scenario, shipped
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.recording import Importer, Recorder, record_run
+from fuselog.recorders.registry import available, load
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.compiling.cache import cache_folder, is_private, kept_files
+from fuselog.replay.engine.compiling.compile import core_count, is_uncompiled
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.all_methods import METHODS, modelled
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.model.binding import topics_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.requirements import names_state
 
 USUAL = ("ekf", "ukf", "smoother:ekf")
 SHORT_S = (2.0, 12.0)  # the first that a scenario accepts

@@ -17,26 +17,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.altering.sources import setting_of
-from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Log, Named, plan_replay
-from pipeline.output.alarming import alarms_of
-from pipeline.output.alarms import Alarm
-from pipeline.output.charts import draw
-from pipeline.output.coverage import coverage_table, sentences
-from pipeline.output.outputs import TIMELINE, check_files, check_folder
-from pipeline.output.results import in_order, result_folder, write_outcome
-from pipeline.output.summary import error_charts, summarise, summary_table
-from pipeline.runs.ensemble import Pass, Settings, judge_logs
-from pipeline.runs.estimates import add_to_hash
-from recorders.atomic import scratch_folder
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from recorders.log import open_log, schemas, topics_of
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.judging.errors.evaluation import Errors, innovations_of
-from replay.judging.judge import Judge
-from replay.judging.tables import error_table, joined
+from fuselog.pipeline.altering.sources import setting_of
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.api.planning import Log, Named, plan_replay
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.charts import draw
+from fuselog.pipeline.output.coverage import coverage_table, sentences
+from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
+from fuselog.pipeline.output.results import in_order, result_folder, write_outcome
+from fuselog.pipeline.output.summary import error_charts, summarise, summary_table
+from fuselog.pipeline.runs.ensemble import Pass, Settings, judge_logs
+from fuselog.pipeline.runs.estimates import add_to_hash
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.log import open_log, schemas, topics_of
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.judging.errors.evaluation import Errors, innovations_of
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.tables import error_table, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def replay(
 
     Raises BadInput where no run can be replayed by one of the estimators.
 
-    >>> from pipeline.api.api import record
+    >>> from fuselog.pipeline.api.api import record
     >>> done = replay(record("landmarks", duration_s=2.0), ["ekf", {"sure": {"kind": "ekf"}}])
     >>> sorted(done.metrics["estimator"].unique())
     ['ekf', 'sure']
@@ -249,7 +249,7 @@ class Replay:
 
         Raises BadInput where there is no such run or case, no viewer, or the file cannot be written.
         """
-        from replay.timeline import viewer
+        from fuselog.replay.timeline import viewer
 
         if not 0 <= run < len(self.logs):
             raise BadInput(f"no run {run} to show; the runs are 0 to {len(self.logs) - 1}")
@@ -264,7 +264,7 @@ class Replay:
             show(rrd)
 
     def _draw(self, run: int, focus: str | None, rrd: Path) -> None:
-        from replay.timeline.show import Drawing
+        from fuselog.replay.timeline.show import Drawing
 
         log = self.logs[run]
         identity = json.dumps([str(log.start_ns), self.settings], default=str)

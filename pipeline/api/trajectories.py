@@ -11,22 +11,22 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from pipeline.api.api import ResultFolder
-from pipeline.output.charts import Axis, Chart, Panel, curve, path, thinned
-from pipeline.output.outputs import check_folder
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.output.summary import summary_table
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.log import schemas
-from recorders.log.planes import stated_in
-from recorders.trajectories import Trajectory, read_trajectory
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.planes import into_plane_of
-from replay.engine.streams.sources import LogSource, Source
-from replay.judging.errors.alignment import Align, AlignedEstimates
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.errors.planes import first_fixes, unlike
-from replay.judging.errors.trajectories import (
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, path, thinned
+from fuselog.pipeline.output.outputs import check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.log import schemas
+from fuselog.recorders.log.planes import stated_in
+from fuselog.recorders.trajectories import Trajectory, read_trajectory
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.planes import into_plane_of
+from fuselog.replay.engine.streams.sources import LogSource, Source
+from fuselog.replay.judging.errors.alignment import Align, AlignedEstimates
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.planes import first_fixes, unlike
+from fuselog.replay.judging.errors.trajectories import (
     Association,
     Compared,
     Comparison,
@@ -34,8 +34,8 @@ from replay.judging.errors.trajectories import (
     compare,
     trajectory_metrics,
 )
-from replay.judging.errors.trajectory_streams import trajectory_of
-from replay.judging.metrics.measuring import metric_key
+from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
+from fuselog.replay.judging.metrics.measuring import metric_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

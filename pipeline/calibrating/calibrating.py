@@ -1,22 +1,22 @@
 """Calibrates by the search of `tune`: how sensors are mounted, scaled, biased and delayed.
 
-A model says which of its parameters these are, see `replay.inference.model.model.Model`.
+A model says which of its parameters these are, see `fuselog.replay.inference.model.model.Model`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pipeline.altering.sources import split_settings
-from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.calibrating.kalibr import FILE, kalibr_yaml
-from pipeline.calibrating.manoeuvres import advice
-from pipeline.tuning.outcome import Tuning
-from pipeline.tuning.tuning import tune
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.parameters import merge
-from replay.engine.replaying.estimator import Recursive, bind
-from replay.foreign.naming import allowed
+from fuselog.pipeline.altering.sources import split_settings
+from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
+from fuselog.pipeline.calibrating.manoeuvres import advice
+from fuselog.pipeline.tuning.outcome import Tuning
+from fuselog.pipeline.tuning.tuning import tune
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.parameters import merge
+from fuselog.replay.engine.replaying.estimator import Recursive, bind
+from fuselog.replay.foreign.naming import allowed
 
 OPTIONS = ("by", "free")  # of `tune`, which a calibration chooses itself
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.diagnosing.battery.car import Floats, Truth, arcs, philox, stamps_ns
-from recorders.common_streams import fix_stream
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.diagnosing.battery.car import Floats, Truth, arcs, philox, stamps_ns
+from fuselog.recorders.common_streams import fix_stream
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 Motion = Callable[[Floats], tuple[Floats, Floats]]
 SPEED_MPS, CIRCLE_S = 8.0, 15.708

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrating.calibrating import calibrate
-from pipeline.calibrating.ellipsoid import ellipsoid
-from pipeline.logs.folders import logs_in
-from pipeline.output.outputs import check_outputs
-from pipeline.output.terminal import print_json, print_table, say
-from pipeline.tuning.command import tune_logs
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.calibrating.calibrating import calibrate
+from fuselog.pipeline.calibrating.ellipsoid import ellipsoid
+from fuselog.pipeline.logs.folders import logs_in
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.terminal import print_json, print_table, say
+from fuselog.pipeline.tuning.command import tune_logs
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def calibrate_logs(

@@ -12,16 +12,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Log, sources_of
-from pipeline.calibrating.ellipsoid_fit import AXES, NAMES, Fit, fit, matrix_of, middle
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.outputs import check_folder
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.sensing.units import unit_of
-from pipeline.tuning.confidence import QUANTILE
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.api.planning import Log, sources_of
+from fuselog.pipeline.calibrating.ellipsoid_fit import AXES, NAMES, Fit, fit, matrix_of, middle
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.outputs import check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.sensing.units import unit_of
+from fuselog.pipeline.tuning.confidence import QUANTILE
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 Floats = NDArray[np.float64]
 GRAVITY_MPS2 = 9.80665

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pipeline.tuning.information import Undetermined, undetermined
+from fuselog.pipeline.tuning.information import Undetermined, undetermined
 
 Floats = NDArray[np.float64]
 AXES = "xyz"

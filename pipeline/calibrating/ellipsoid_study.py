@@ -13,16 +13,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
-from pipeline.calibrating.ellipsoid import GRAVITY_MPS2, Ellipsoid, ellipsoid
-from pipeline.calibrating.ellipsoid_fit import NAMES, matrix_of
-from pipeline.output.charts import coverage
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.parameters import Parameters
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.calibrating.ellipsoid import GRAVITY_MPS2, Ellipsoid, ellipsoid
+from fuselog.pipeline.calibrating.ellipsoid_fit import NAMES, matrix_of
+from fuselog.pipeline.output.charts import coverage
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
 FIELD, FORCE = "/imu.magnetic_field_ut", "/imu.specific_force_mps2"
@@ -44,7 +44,7 @@ class EllipsoidOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: EllipsoidOptions = setting.options
     rows: list[dict[str, Any]] = []
     for block, first in enumerate(options.seeds):

@@ -13,15 +13,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.calibrating.car import MOTIONS, NAMES, Motion, Steps, drive, recorded
-from pipeline.tuning.information import information
-from pipeline.tuning.objective import Run, in_memory
-from pipeline.tuning.outcome import TUNED, Tuning
-from recorders.errors import BadInput
-from recorders.log import Schema, Stream, schemas, topics_of
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.sources import Source
+from fuselog.pipeline.calibrating.car import MOTIONS, NAMES, Motion, Steps, drive, recorded
+from fuselog.pipeline.tuning.information import information
+from fuselog.pipeline.tuning.objective import Run, in_memory
+from fuselog.pipeline.tuning.outcome import TUNED, Tuning
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Stream, schemas, topics_of
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.sources import Source
 
 Floats = NDArray[np.float64]
 DURATION_S = 20.0

@@ -11,13 +11,13 @@ from typing import Any
 import pandas as pd
 from pydantic import NonNegativeInt
 
-from pipeline.calibrating.calibrating import calibrate
-from pipeline.calibrating.car import MOTIONS, NAMES, OURS, TRUTH, drive, recorded
-from pipeline.output.charts import coverage
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from recorders.parameters import Parameters
+from fuselog.pipeline.calibrating.calibrating import calibrate
+from fuselog.pipeline.calibrating.car import MOTIONS, NAMES, OURS, TRUTH, drive, recorded
+from fuselog.pipeline.output.charts import coverage
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.parameters import Parameters
 
 WIDE = (1000.0, 1000.0, 1.0)  # of a start, in m and rad
 # the car's noise is that of its motion, the model's that of the readings
@@ -35,7 +35,7 @@ class CalibrationOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: CalibrationOptions = setting.options
     [(label, settings)] = experiment.estimators.items()
     wanted = settings | NOISE

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import NOTE, alter
-from pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
-from pipeline.checking.golden import Replayed, Tolerances, make
-from pipeline.checking.stored import SUFFIX, Golden, read, write
-from pipeline.logs.folders import logs_in
-from pipeline.output.outputs import Kind, check_files
-from pipeline.output.results import RESULT_FILE, read_result
-from pipeline.runs.ensemble import Settings
-from recorders.errors import BadInput
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.foreign.naming import of_file
+from fuselog.pipeline.altering.sources import NOTE, alter
+from fuselog.pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
+from fuselog.pipeline.checking.golden import Replayed, Tolerances, make
+from fuselog.pipeline.checking.stored import SUFFIX, Golden, read, write
+from fuselog.pipeline.logs.folders import logs_in
+from fuselog.pipeline.output.outputs import Kind, check_files
+from fuselog.pipeline.output.results import RESULT_FILE, read_result
+from fuselog.pipeline.runs.ensemble import Settings
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.foreign.naming import of_file
 
 Runs = Mapping[str, LogSource | MemorySource]
 

@@ -3,15 +3,15 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pipeline.checking.checking import Runs, check, runs_of, update
-from pipeline.checking.golden import Tolerance
-from pipeline.checking.junit import JUNIT, write_junit
-from pipeline.checking.stored import Golden, read
-from pipeline.output.outputs import check_files
-from pipeline.output.terminal import print_json, say
-from pipeline.runs.ensemble import Settings
-from pipeline.runs.settings import settings_of_estimators
-from recorders.errors import BadInput
+from fuselog.pipeline.checking.checking import Runs, check, runs_of, update
+from fuselog.pipeline.checking.golden import Tolerance
+from fuselog.pipeline.checking.junit import JUNIT, write_junit
+from fuselog.pipeline.checking.stored import Golden, read
+from fuselog.pipeline.output.outputs import check_files
+from fuselog.pipeline.output.terminal import print_json, say
+from fuselog.pipeline.runs.ensemble import Settings
+from fuselog.pipeline.runs.settings import settings_of_estimators
+from fuselog.recorders.errors import BadInput
 
 
 def check_path(

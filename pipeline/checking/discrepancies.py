@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.checking.golden import (
+from fuselog.pipeline.checking.golden import (
     TOLERANCE,
     TOLERANCE_ELSEWHERE,
     Floats,
@@ -18,11 +18,11 @@ from pipeline.checking.golden import (
     Tolerance,
     kept_rows,
 )
-from pipeline.checking.stored import Golden
-from recorders.errors import BadInput, some_of
-from recorders.log import schemas
-from recorders.models.planar import wrap_angle
-from replay.judging.errors.evaluation import split_topic
+from fuselog.pipeline.checking.stored import Golden
+from fuselog.recorders.errors import BadInput, some_of
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 
 class Discrepancy(NamedTuple):

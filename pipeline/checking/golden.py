@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.checking.stored import FORMAT, Golden
-from pipeline.runs.ensemble import Settings
-from pipeline.runs.estimates import hash_files, hash_streams
-from pipeline.runs.initial_states import order_of
-from pipeline.runs.recorded import replay_in_memory
-from recorders.log import Stream, schemas
-from replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.pipeline.checking.stored import FORMAT, Golden
+from fuselog.pipeline.runs.ensemble import Settings
+from fuselog.pipeline.runs.estimates import hash_files, hash_streams
+from fuselog.pipeline.runs.initial_states import order_of
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 # Of each stream as many rows as this many numbers of the whole golden allow, between the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32

@@ -3,9 +3,9 @@
 from pathlib import Path
 from xml.etree import ElementTree
 
-from pipeline.checking.checking import Checked
-from pipeline.output.outputs import Kind
-from recorders.atomic import whole_file
+from fuselog.pipeline.checking.checking import Checked
+from fuselog.pipeline.output.outputs import Kind
+from fuselog.recorders.atomic import whole_file
 
 NAME = "fuselog check"
 

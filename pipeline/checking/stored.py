@@ -18,9 +18,9 @@ from pydantic import (
     model_validator,
 )
 
-from recorders.atomic import whole_file
-from recorders.errors import BadInput, check_format
-from recorders.parsing import parse_json
+from fuselog.recorders.atomic import whole_file
+from fuselog.recorders.errors import BadInput, check_format
+from fuselog.recorders.parsing import parse_json
 
 SUFFIX = ".golden.xz"
 # Raised when a golden is written in a way that this reader would misread.

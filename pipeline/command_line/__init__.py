@@ -3,5 +3,5 @@
 Commands import what they need when they run, so that `--help` answers at once. Begin with `group`.
 """
 
-from pipeline.command_line.group import fuselog as fuselog
-from pipeline.command_line.process import main as main
+from fuselog.pipeline.command_line.group import fuselog as fuselog
+from fuselog.pipeline.command_line.process import main as main

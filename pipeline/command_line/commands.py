@@ -9,13 +9,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter
-from pipeline.api.planning import plan_replay
-from pipeline.logs.folders import logs_in
-from pipeline.output.alarming import alarms_of
-from pipeline.output.alarms import Alarm
-from pipeline.output.coverage import sentences
-from pipeline.output.outputs import (
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.api.planning import plan_replay
+from fuselog.pipeline.logs.folders import logs_in
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.coverage import sentences
+from fuselog.pipeline.output.outputs import (
     ESTIMATES,
     PICTURE,
     TIMELINE,
@@ -23,12 +23,12 @@ from pipeline.output.outputs import (
     replaced,
     run_written,
 )
-from pipeline.output.results import (
+from fuselog.pipeline.output.results import (
     in_order,
     plain,
     split_metric,
 )
-from pipeline.output.terminal import (
+from fuselog.pipeline.output.terminal import (
     print_json,
     print_metrics,
     print_others,
@@ -40,16 +40,16 @@ from pipeline.output.terminal import (
     say,
     warn,
 )
-from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import source_of_estimates
-from pipeline.runs.initial_states import span_of
-from pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
-from recorders.atomic import scratch_folder, whole_file
-from recorders.errors import BadInput
-from recorders.log import Companions, Log, open_log
-from replay.engine.streams.sources import LogSource
-from replay.judging.errors.differences import FEWEST_RUNS
-from replay.judging.judge import Judge
+from fuselog.pipeline.runs.ensemble import judge_logs
+from fuselog.pipeline.runs.estimates import source_of_estimates
+from fuselog.pipeline.runs.initial_states import span_of
+from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
+from fuselog.recorders.atomic import scratch_folder, whole_file
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Companions, Log, open_log
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.errors.differences import FEWEST_RUNS
+from fuselog.replay.judging.judge import Judge
 
 
 def replay_logs(
@@ -140,7 +140,7 @@ def companions_if(foxglove: bool) -> Companions | None:
     """Make the messages for Foxglove, where they are asked for; it takes long to import."""
     if not foxglove:
         return None
-    from pipeline.logs.foxglove import companions
+    from fuselog.pipeline.logs.foxglove import companions
 
     return companions
 
@@ -185,7 +185,7 @@ def evaluate_logs(
     as_json: bool,
 ) -> None:
     """Judge estimates logs as `judge_estimates` does, and print the metrics."""
-    from pipeline.api.estimates import judge_estimates
+    from fuselog.pipeline.api.estimates import judge_estimates
 
     found = judge_estimates(
         estimates,
@@ -225,7 +225,7 @@ def evaluate_trajectory(
     as_json: bool,
 ) -> None:
     """Judge a trajectory file against another."""
-    from pipeline.api.trajectories import evaluate
+    from fuselog.pipeline.api.trajectories import evaluate
 
     if len(estimates) > 1:
         raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
@@ -318,7 +318,7 @@ def view_path(
     recover: bool,
 ) -> None:
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
-    from replay.timeline import viewer
+    from fuselog.replay.timeline import viewer
 
     rrd = path / "timeline.rrd" if path.is_dir() else path
     outputs = [(save, TIMELINE), (screenshot, PICTURE)]
@@ -359,7 +359,7 @@ def _draw_log(
     recover: bool,
 ) -> None:
     """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
-    from replay.timeline.show import Drawing
+    from fuselog.replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
     estimates = source = LogSource(log)

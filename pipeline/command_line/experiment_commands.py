@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.api import run, sweep
-from pipeline.output.alarms import NOT_TESTED
-from pipeline.output.results import RESULT_FILE, RUNS, keep, read_table, split_metric
-from pipeline.output.terminal import (
+from fuselog.pipeline.api.api import run, sweep
+from fuselog.pipeline.output.alarms import NOT_TESTED
+from fuselog.pipeline.output.results import RESULT_FILE, RUNS, keep, read_table, split_metric
+from fuselog.pipeline.output.terminal import (
     has_many_cases,
     print_claims,
     print_json,
@@ -19,19 +19,19 @@ from pipeline.output.terminal import (
     progress,
     say,
 )
-from pipeline.runs.experiment import (
+from fuselog.pipeline.runs.experiment import (
     Experiment,
     Stated,
     experiment_of_logs,
     read_experiment,
     require_campaign,
 )
-from pipeline.runs.settings import read_settings
-from pipeline.runs.sweeps import DRAWN, Sampling, parse_over
-from recorders.errors import BadInput
-from recorders.parameters import merge, parse_settings
-from replay.engine.replaying.estimator import configure
-from replay.foreign.naming import allowed
+from fuselog.pipeline.runs.settings import read_settings
+from fuselog.pipeline.runs.sweeps import DRAWN, Sampling, parse_over
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.foreign.naming import allowed
 
 
 def run_named(
@@ -78,11 +78,11 @@ def run_named(
     )
     result = done.result
     if diagnose:
-        from pipeline.diagnosing.likeliest import likeliest_causes
+        from fuselog.pipeline.diagnosing.likeliest import likeliest_causes
 
         result = keep(done.folder, result, causes=likeliest_causes(done.folder, result))
     if stress:
-        from pipeline.stressing.experiments import claims_under_stress, stress_result
+        from fuselog.pipeline.stressing.experiments import claims_under_stress, stress_result
 
         found = stress_result(result, workers=workers, scheduler=scheduler, progress=progress)
         claims = claims_under_stress(stated.with_settings(values, {}), result, found)
@@ -94,7 +94,7 @@ def run_named(
     for cause in result.causes:
         say(f"likeliest cause of {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
-        from pipeline.output.report.kinds import run_sentences  # it takes long to import
+        from fuselog.pipeline.output.report.kinds import run_sentences  # it takes long to import
 
         say(" ".join(run_sentences(result, done.folder)))
     runs = done.folder / RUNS

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import (
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
     PAGE,
@@ -21,7 +21,7 @@ from pipeline.command_line.options import (
     settings_option,
     workers_option,
 )
-from recorders.errors import printable
+from fuselog.recorders.errors import printable
 
 diagnose_option = click.option(
     "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
@@ -77,7 +77,7 @@ def run(
     --set gate_probability=1 of all estimators that have it, --set gap_limit_s=1 an entry of the
     experiment.
     """
-    from pipeline.command_line.experiment_commands import run_named
+    from fuselog.pipeline.command_line.experiment_commands import run_named
 
     stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
     over = {key: value for key, value in stated.items() if value is not None}
@@ -125,7 +125,7 @@ def sweep(
     A table has every metric at every point, and within what nine in ten runs lie; figures show them as
     curves, or as heat maps over two parameters. A key is as --set has it.
     """
-    from pipeline.command_line.experiment_commands import sweep_named
+    from fuselog.pipeline.command_line.experiment_commands import sweep_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     sweep_named(experiment, labels, over, **options)
@@ -141,13 +141,13 @@ def sweep(
 @diagnose_option
 def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
-    from pipeline.output.outputs import REPORT, check_files
-    from pipeline.output.report import write_report
+    from fuselog.pipeline.output.outputs import REPORT, check_files
+    from fuselog.pipeline.output.report import write_report
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     seek = None
     if diagnose:
-        from pipeline.diagnosing.likeliest import likeliest_causes
+        from fuselog.pipeline.diagnosing.likeliest import likeliest_causes
 
         seek = likeliest_causes
     write_report(list(results), out, viewer=viewer, diagnose=seek)

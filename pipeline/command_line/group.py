@@ -2,8 +2,8 @@
 
 import click
 
-from pipeline.command_line import experiments, judging, lists, logs, recording, replaying
-from pipeline.command_line.help import with_examples
+from fuselog.pipeline.command_line import experiments, judging, lists, logs, recording, replaying
+from fuselog.pipeline.command_line.help import with_examples
 
 
 @click.group(
@@ -18,7 +18,7 @@ from pipeline.command_line.help import with_examples
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
     """Hold all commands; from here on it is told how long one takes."""
-    from pipeline.output.terminal import once_a_minute
+    from fuselog.pipeline.output.terminal import once_a_minute
 
     once_a_minute.begin()
 

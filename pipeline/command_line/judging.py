@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import (
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     FORMAT,
     RESULT,
@@ -20,7 +20,7 @@ from pipeline.command_line.options import (
     replay_options,
     set_option,
 )
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 
 @command(
@@ -100,7 +100,7 @@ def evaluate(
     absolute and relative pose errors, APE and RPE, as evo has them. With --align or --delta, so are
     estimated positions of logs; all other metrics are then of the aligned estimates.
     """
-    from pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
+    from fuselog.pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
 
     given = {
         "align": align,
@@ -161,7 +161,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     with the first, metric by metric over the runs that both have, with intervals of 95 % by the
     bootstrap over runs.
     """
-    from pipeline.comparing.command import compare_candidates
+    from fuselog.pipeline.comparing.command import compare_candidates
 
     if not compare_candidates(list(sides), list(labels), **options):
         click.get_current_context().exit(1)
@@ -184,7 +184,7 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
     cause first: that without which the log-likelihood gains most.
     """
-    from pipeline.diagnosing.command import diagnose_log
+    from fuselog.pipeline.diagnosing.command import diagnose_log
 
     diagnose_log(logs, **options)
 
@@ -209,7 +209,7 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     The verdict comes first: harmless, sensitive (half the change does half as much), or discontinuous
     or chaotic (it does not). An estimator takes at most twelve replays.
     """
-    from pipeline.stressing.command import stress_logs
+    from fuselog.pipeline.stressing.command import stress_logs
 
     stress_logs(logs, labels, **options)
 
@@ -243,6 +243,6 @@ def observability(logs: tuple[Path, ...], **options: Any) -> None:
     For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
     trajectory, in units of the prior's information.
     """
-    from pipeline.api.observability import show_observability
+    from fuselog.pipeline.api.observability import show_observability
 
     show_observability(list(logs), **options)

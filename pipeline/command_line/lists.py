@@ -2,9 +2,9 @@
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import json_option
-from recorders.errors import BadInput
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import json_option
+from fuselog.recorders.errors import BadInput
 
 
 def _listing(kind: str, text: str, example: str) -> click.Command:
@@ -19,11 +19,11 @@ def _listing(kind: str, text: str, example: str) -> click.Command:
 
 def _show(kind: str, name: str | None, *, as_json: bool) -> None:
     if name is None and not as_json:
-        from pipeline.api.lists import show_list
+        from fuselog.pipeline.api.lists import show_list
 
         show_list(f"{kind}s")
     else:
-        from pipeline.api import catalog
+        from fuselog.pipeline.api import catalog
 
         catalog.show(kind, name, as_json=as_json)
 
@@ -48,7 +48,7 @@ experiments = _listing("experiment", "List the shipped experiments, or all about
 def models(name: str | None, formulas: bool, as_json: bool) -> None:
     """List the models and whether each method can estimate them or why not, or all about NAME."""
     if formulas:
-        from pipeline.api.catalog import show_formulas
+        from fuselog.pipeline.api.catalog import show_formulas
 
         show_formulas(name, as_json=as_json)
     else:
@@ -80,11 +80,11 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
     if clear and warm:
         raise BadInput("fuselog cache --clear --warm: give one of the two, and then the other")
     if warm:
-        from pipeline.api.precompiling import show_precompiling
+        from fuselog.pipeline.api.precompiling import show_precompiling
 
         show_precompiling(pairs, as_json=as_json)
         return
-    from pipeline.logs.information import show_cache
+    from fuselog.pipeline.logs.information import show_cache
 
     show_cache(clear=clear, as_json=as_json)
 
@@ -98,6 +98,6 @@ def header() -> None:
 
     cc -shared -fPIC -I "$(fuselog header)" mine.c -o mine.so
     """
-    from replay.foreign.native.library import HEADER
+    from fuselog.replay.foreign.native.library import HEADER
 
     click.echo(HEADER.parent)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import (
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     LOG_OR_FOLDER,
     PICTURE,
@@ -20,11 +20,11 @@ from pipeline.command_line.options import (
     recover_option,
     set_option,
 )
-from pipeline.command_line.recording import say_written
-from recorders.errors import BadInput, printable
+from fuselog.pipeline.command_line.recording import say_written
+from fuselog.recorders.errors import BadInput, printable
 
 if TYPE_CHECKING:
-    from pipeline.logs.rewriting import Changed
+    from fuselog.pipeline.logs.rewriting import Changed
 
 
 @command(
@@ -40,7 +40,7 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 
     LOG may be a log, an estimates log, a bag of ROS, a result folder or a timeline (.rrd).
     """
-    from pipeline.logs.information import show_log
+    from fuselog.pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
 
@@ -86,7 +86,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
     leaves it, that is said. LOG may also be what imu_utils or allan_variance_ros wrote: what its numbers
     mean is said.
     """
-    from pipeline.sensing.command import show_noise
+    from fuselog.pipeline.sensing.command import show_noise
 
     show_noise(log, list(topics), _pairs("--sheet", sheet), **options)
 
@@ -113,7 +113,7 @@ def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
     accelerometer is held still in each position. What the turns do not determine is named, and has no
     value.
     """
-    from pipeline.calibrating.command import show_ellipsoid
+    from fuselog.pipeline.calibrating.command import show_ellipsoid
 
     show_ellipsoid(list(logs), field, **options)
 
@@ -133,7 +133,7 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     Each finding says how sure it is, its evidence, and what mends it; --set tries that at once. It exits
     with 1 where something is found that is more than a hint.
     """
-    from pipeline.api.linting import show_lint
+    from fuselog.pipeline.api.linting import show_lint
 
     if not show_lint(log, settings, recover=recover, as_json=as_json):
         click.get_current_context().exit(1)
@@ -157,7 +157,7 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 @gap_option
 def view(path: Path, **options: Any) -> None:
     """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
-    from pipeline.command_line.commands import view_path
+    from fuselog.pipeline.command_line.commands import view_path
 
     view_path(path, **options)
 
@@ -189,7 +189,7 @@ def export(path: Path, to: Any, **options: Any) -> None:
     mot tracks and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a
     table; to foxglove one log of the messages that Foxglove and Rerun show.
     """
-    from pipeline.logs.exporting import export as export_log
+    from fuselog.pipeline.logs.exporting import export as export_log
 
     done = export_log(path, to=to, **options)
     for note in done.notes:
@@ -225,7 +225,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 
     Maps, priors and what was said at the first stamp of the log stay whole, whatever the span.
     """
-    from pipeline.logs.edit import cut as cut_log
+    from fuselog.pipeline.logs.edit import cut as cut_log
 
     _say_changed(cut_log(path, decimate=_pairs("--decimate", decimate), **options))
 
@@ -246,7 +246,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 @recover_option
 def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
     """Write one log of LOGS, which have no topic in common: fuselog relabel renames topics."""
-    from pipeline.logs.edit import merge as merge_logs
+    from fuselog.pipeline.logs.edit import merge as merge_logs
 
     offsets_s = {}
     for log, text in _pairs("--offset", offsets).items():
@@ -272,8 +272,8 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     The model inertial takes them as it takes sensors: a body that stands has no velocity, and one that
     rolls on wheels moves neither to the side nor up.
     """
-    from pipeline.logs.edit import constrain as constrain_log
-    from recorders.parameters import parse_settings
+    from fuselog.pipeline.logs.edit import constrain as constrain_log
+    from fuselog.recorders.parameters import parse_settings
 
     _say_changed(constrain_log(path, settings=parse_settings(settings), **options))
 
@@ -301,7 +301,7 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
 @recover_option
 def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
     """Write PATH, a log or an estimates log, with other names; what refers to them follows."""
-    from pipeline.logs.edit import relabel as relabel_log
+    from fuselog.pipeline.logs.edit import relabel as relabel_log
 
     done = relabel_log(
         path, topics=_pairs("--topic", topics), components=_pairs("--component", components), **options

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from replay.foreign.naming import allow_programs_of_files
+from fuselog.replay.foreign.naming import allow_programs_of_files
 
 
 class Output(click.Path):
@@ -70,7 +70,7 @@ class Place(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the place as a list of numbers."""
-        from recorders.log.planes import EXAMPLE, origin_of
+        from fuselog.recorders.log.planes import EXAMPLE, origin_of
 
         found = origin_of(str(value).split(","))
         if found is None:
@@ -170,7 +170,7 @@ foxglove_option = click.option(
 
 
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return the option --set of a command whose settings this takes, see `pipeline.api.asking.TAKERS`.
+    """Return the option --set of a command whose settings this takes, see `fuselog.pipeline.api.asking.TAKERS`.
 
     Where it asks, NAME=?, the command prints what that parameter means, and does nothing else. A command
     that replays logs has --origin too, which is a setting of all their topics.
@@ -190,7 +190,7 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
             if replays and (place := options.pop("origin")):
                 options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
             if any(text.endswith("=?") for text in options["settings"]):
-                from pipeline.api.asking import show_meanings
+                from fuselog.pipeline.api.asking import show_meanings
 
                 show_meanings(options["settings"], takes, options)
             else:

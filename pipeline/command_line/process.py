@@ -19,11 +19,11 @@ from typing import NoReturn
 
 import click
 
-from pipeline.command_line.group import fuselog
-from recorders import environment
-from recorders.errors import BadInput, printable, without_warnings_of_numbers
-from recorders.processes import keep_off_settings_here
-from replay.engine.compiling.trial import require_processor
+from fuselog.pipeline.command_line.group import fuselog
+from fuselog.recorders import environment
+from fuselog.recorders.errors import BadInput, printable, without_warnings_of_numbers
+from fuselog.recorders.processes import keep_off_settings_here
+from fuselog.replay.engine.compiling.trial import require_processor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

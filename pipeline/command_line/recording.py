@@ -7,9 +7,16 @@ from pathlib import Path
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, LOG, PLACE, foxglove_option, set_option
-from recorders.errors import BadInput, printable
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import (
+    ANY_PATH,
+    COUNT,
+    LOG,
+    PLACE,
+    foxglove_option,
+    set_option,
+)
+from fuselog.recorders.errors import BadInput, printable
 
 
 @command(
@@ -43,13 +50,13 @@ def record(
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
-    from pipeline.command_line.commands import companions_if
-    from pipeline.output.outputs import RECORDED, check_files, replaced, run_written
-    from pipeline.output.terminal import warn
-    from pipeline.runs.inputs import load_scenario
-    from recorders.log import open_log, write_log
-    from recorders.parameters import merge, parse_settings
-    from recorders.recording import record_run
+    from fuselog.pipeline.command_line.commands import companions_if
+    from fuselog.pipeline.output.outputs import RECORDED, check_files, replaced, run_written
+    from fuselog.pipeline.output.terminal import warn
+    from fuselog.pipeline.runs.inputs import load_scenario
+    from fuselog.recorders.log import open_log, write_log
+    from fuselog.recorders.parameters import merge, parse_settings
+    from fuselog.recorders.recording import record_run
 
     if (scenario is None) == (again is None):
         raise BadInput("give either a scenario, one that fuselog scenarios lists, or --again LOG")
@@ -121,7 +128,7 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
-    from pipeline.output.outputs import check_files, imported
+    from fuselog.pipeline.output.outputs import check_files, imported
 
     if guess:
         if source != "table":
@@ -154,12 +161,12 @@ def _import(
     stated: Mapping[str, object] | None = None,
 ) -> None:
     """Import data and write their log, which states its parameters with those that are `stated`."""
-    from pipeline.logs.information import worst
-    from pipeline.output.outputs import check_files, imported
-    from recorders.linting.lint import lint_log
-    from recorders.log import open_log
-    from recorders.parameters import parse_settings
-    from recorders.recording import import_log
+    from fuselog.pipeline.logs.information import worst
+    from fuselog.pipeline.output.outputs import check_files, imported
+    from fuselog.recorders.linting.lint import lint_log
+    from fuselog.recorders.log import open_log
+    from fuselog.recorders.parameters import parse_settings
+    from fuselog.recorders.recording import import_log
 
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
@@ -183,9 +190,9 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
     Yields where it lies until all went well; only then is it in its place.
     """
-    from pipeline.output.outputs import MAPPING, check_files
-    from recorders.atomic import whole_file
-    from recorders.importers.tables.guessing import assumptions, guess
+    from fuselog.pipeline.output.outputs import MAPPING, check_files
+    from fuselog.recorders.atomic import whole_file
+    from fuselog.recorders.importers.tables.guessing import assumptions, guess
 
     check_files([(mapping, MAPPING)], {"data": paths})
     text = guess(paths)

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from pipeline.command_line.help import command
-from pipeline.command_line.options import (
+from fuselog.pipeline.command_line.help import command
+from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
     GOLDEN,
@@ -103,7 +103,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     ekf.gate_probability=1 of one. --set /fix.delay_s=0.3 alters the topic /fix as it is read, here as in
     run, tune, diagnose and compare; --set /fix=? says what can be set.
     """
-    from pipeline.command_line.commands import replay_logs
+    from fuselog.pipeline.command_line.commands import replay_logs
 
     if not replay_logs(list(logs), list(names), **options):
         click.get_current_context().exit(1)
@@ -130,7 +130,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     The page is served to this machine only, at an address that cannot be guessed. The command ends when
     the page is closed, or by Ctrl-C.
     """
-    from pipeline.exploring.command import explore_log
+    from fuselog.pipeline.exploring.command import explore_log
 
     explore_log(log, list(names), **options)
 
@@ -179,7 +179,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
     folder is for --settings of fuselog replay and run.
     """
-    from pipeline.tuning.command import tune_logs
+    from fuselog.pipeline.tuning.command import tune_logs
 
     tune_logs(list(logs), **options)
 
@@ -220,7 +220,7 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     the logs does not determine is named, stays where it started, and has no interval. settings.toml in
     the result folder is for --settings of fuselog replay and run.
     """
-    from pipeline.calibrating.command import calibrate_logs
+    from fuselog.pipeline.calibrating.command import calibrate_logs
 
     calibrate_logs(list(logs), **options)
 
@@ -272,8 +272,8 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     intended change updates the golden in the same commit. A filter that fuselog deploy wrote is checked
     with -e lib:PATH, and has to be made of the golden's filter.
     """
-    from pipeline.checking.command import check_path
-    from pipeline.deploying.deploying import in_place_of_golden
+    from fuselog.pipeline.checking.command import check_path
+    from fuselog.pipeline.deploying.deploying import in_place_of_golden
 
     if not check_path(path, golden, **options, in_place=in_place_of_golden):
         click.get_current_context().exit(1)
@@ -304,6 +304,6 @@ def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **o
     The C does what the filter does, operation by operation, so that its estimates are the same to the
     last bit; README.md in the folder says how to build it, to test it and to replay it.
     """
-    from pipeline.deploying.command import deploy_filter
+    from fuselog.pipeline.deploying.command import deploy_filter
 
     deploy_filter(name, settings_file, list(settings), **options)

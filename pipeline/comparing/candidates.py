@@ -14,31 +14,31 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.api.replays import Replay, replay
-from pipeline.comparing.renamed import Renamed
-from pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
-from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
-from pipeline.runs.ensemble import Progress, judge_logs, parts_of
-from pipeline.runs.estimates import labels_of, source_of_estimates, stated_estimators
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.initial_states import check_same_run
-from pipeline.runs.inputs import load_scenario
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, open_log
-from recorders.parameters import build
-from recorders.trajectories import read_trajectory
-from replay.engine.replaying.estimator import configure
-from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.replaying.usage import Row
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.foreign.naming import of_file
-from replay.judging.errors.evaluation import POSITION
-from replay.judging.errors.trajectory_streams import estimates_of
-from replay.judging.errors.truths import Doubt
-from replay.judging.metrics.measuring import find_metrics
-from replay.judging.metrics.metrics import rmse_of
-from replay.judging.tables import joined
+from fuselog.pipeline.api.replays import Replay, replay
+from fuselog.pipeline.comparing.renamed import Renamed
+from fuselog.pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
+from fuselog.pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
+from fuselog.pipeline.runs.ensemble import Progress, judge_logs, parts_of
+from fuselog.pipeline.runs.estimates import labels_of, source_of_estimates, stated_estimators
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.initial_states import check_same_run
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, open_log
+from fuselog.recorders.parameters import build
+from fuselog.recorders.trajectories import read_trajectory
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
+from fuselog.replay.engine.replaying.usage import Row
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.foreign.naming import of_file
+from fuselog.replay.judging.errors.evaluation import POSITION
+from fuselog.replay.judging.errors.trajectory_streams import estimates_of
+from fuselog.replay.judging.errors.truths import Doubt
+from fuselog.replay.judging.metrics.measuring import find_metrics
+from fuselog.replay.judging.metrics.metrics import rmse_of
+from fuselog.replay.judging.tables import joined
 
 # Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.
 SAME = 1e-6

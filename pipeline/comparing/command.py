@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.comparing.comparing import compare
-from pipeline.comparing.groups import recorded_labels, with_logs_of_folders
-from pipeline.output.alarms import NOT_TESTED
-from pipeline.output.outputs import check_outputs
-from pipeline.output.terminal import print_json, print_table, progress, say, warn
-from pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.comparing.comparing import compare
+from fuselog.pipeline.comparing.groups import recorded_labels, with_logs_of_folders
+from fuselog.pipeline.output.alarms import NOT_TESTED
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.terminal import print_json, print_table, progress, say, warn
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
 
 COLUMNS = {
     "quantity": "metric",

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind
-from pipeline.comparing.candidates import Candidate
-from pipeline.comparing.groups import (
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.api.planning import Kind
+from fuselog.pipeline.comparing.candidates import Candidate
+from fuselog.pipeline.comparing.groups import (
     comparable_groups,
     inputs_of,
     kind_of,
@@ -23,23 +23,23 @@ from pipeline.comparing.groups import (
     unlike_runs,
     with_logs_of_folders,
 )
-from pipeline.comparing.paired import ALL, Paired, under_stress
-from pipeline.comparing.scenes import scene_of, side_by_side
-from pipeline.output import words
-from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
-from pipeline.output.coverage import coverage_table, sentences
-from pipeline.output.outputs import TIMELINE, check_files, check_folder
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.ensemble import Progress, judge_logs, no_progress
-from pipeline.runs.estimates import hash_files
-from pipeline.stressing.stressing import stress as stress_logs
-from pipeline.stressing.sums import verdicts_of
-from pipeline.stressing.verdicts import Stress
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.log import open_log
-from replay.engine.replaying.usage import Row
-from replay.engine.streams.sources import LogSource
-from replay.judging.errors.differences import (
+from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
+from fuselog.pipeline.comparing.scenes import scene_of, side_by_side
+from fuselog.pipeline.output import words
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve, level
+from fuselog.pipeline.output.coverage import coverage_table, sentences
+from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.runs.ensemble import Progress, judge_logs, no_progress
+from fuselog.pipeline.runs.estimates import hash_files
+from fuselog.pipeline.stressing.stressing import stress as stress_logs
+from fuselog.pipeline.stressing.sums import verdicts_of
+from fuselog.pipeline.stressing.verdicts import Stress
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.replaying.usage import Row
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.errors.differences import (
     FEWEST_RUNS,
     NATS,
     Difference,
@@ -145,7 +145,7 @@ class Differences:
 
         Raises BadInput where no such run can be drawn.
         """
-        from replay.timeline.show import Drawing  # which takes long to import
+        from fuselog.replay.timeline.show import Drawing  # which takes long to import
 
         candidates = self.groups[0]
         check_files([(save, TIMELINE)], {"input": self.inputs})
@@ -279,7 +279,7 @@ def compare(
 
     Raises BadInput where there are not two candidates, or they have nothing in common.
 
-    >>> from pipeline.api.api import record, write
+    >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=5.0))
     >>> found = compare("run.mcap", estimators=["ekf", {"sure": {"kind": "ekf", "sigma_range_m": 0.02}}])
     >>> found.table.query("quantity == 'nees'")["runs"].tolist()

@@ -6,9 +6,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.api.planning import Kind
-from pipeline.api.replays import replay
-from pipeline.comparing.candidates import (
+from fuselog.pipeline.api.planning import Kind
+from fuselog.pipeline.api.replays import replay
+from fuselog.pipeline.comparing.candidates import (
     Candidate,
     Given,
     name_of,
@@ -17,15 +17,15 @@ from pipeline.comparing.candidates import (
     of_result,
     of_trajectory,
 )
-from pipeline.logs.folders import recordings_in
-from pipeline.output.results import RESULT_FILE
-from pipeline.runs.ensemble import Progress
-from pipeline.runs.estimates import labels_of, recorded_estimators
-from recorders.errors import BadInput, choices, some_of
-from recorders.log import NotMcap, RunMetadata, open_log, schemas, topics_of
-from recorders.trajectories import read_trajectory
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.judging.errors.trajectory_streams import truth_of
+from fuselog.pipeline.logs.folders import recordings_in
+from fuselog.pipeline.output.results import RESULT_FILE
+from fuselog.pipeline.runs.ensemble import Progress
+from fuselog.pipeline.runs.estimates import labels_of, recorded_estimators
+from fuselog.recorders.errors import BadInput, choices, some_of
+from fuselog.recorders.log import NotMcap, RunMetadata, open_log, schemas, topics_of
+from fuselog.recorders.trajectories import read_trajectory
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.judging.errors.trajectory_streams import truth_of
 
 # So many settings that differ are named.
 NAMED = 8

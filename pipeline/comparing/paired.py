@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.comparing.groups import runs_of
-from pipeline.output.alarms import Stressing
-from replay.judging.errors.differences import FEWEST_RUNS, Difference, Target
+from fuselog.pipeline.comparing.groups import runs_of
+from fuselog.pipeline.output.alarms import Stressing
+from fuselog.replay.judging.errors.differences import FEWEST_RUNS, Difference, Target
 
 ALL = "all"
 DECIDED = ("worse", "better", "higher", "lower")

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from recorders.log import Clock, RunMetadata, Stream, Topic
-from recorders.log.impossible import Rejections
-from replay.engine.streams.sources import Source
+from fuselog.recorders.log import Clock, RunMetadata, Stream, Topic
+from fuselog.recorders.log.impossible import Rejections
+from fuselog.replay.engine.streams.sources import Source
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from pipeline.comparing.candidates import Candidate
-from pipeline.output.charts import Chart
-from recorders.log import RunMetadata
-from replay.engine.streams.sources import MemorySource, Source
+from fuselog.pipeline.comparing.candidates import Candidate
+from fuselog.pipeline.output.charts import Chart
+from fuselog.recorders.log import RunMetadata
+from fuselog.replay.engine.streams.sources import MemorySource, Source
 
 
 def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, MemorySource]:
@@ -22,8 +22,8 @@ def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, Mem
 
 def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
     """Draw a run from above, and a lens where errors are small; nothing without places in the plane."""
-    from pipeline.output.report.first_run import seen_from_above  # which takes long to import
-    from pipeline.output.report.scene import lens, plan
+    from fuselog.pipeline.output.report.first_run import seen_from_above  # which takes long to import
+    from fuselog.pipeline.output.report.scene import lens, plan
 
     found = seen_from_above(*side_by_side(candidates, run), gap_limit_s)
     if found is None:

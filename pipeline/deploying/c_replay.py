@@ -3,11 +3,11 @@
 import json
 from typing import Any
 
-from pipeline.deploying.c_source.braces import braced
-from pipeline.deploying.c_source.names import CFilter, filled, identifier
-from recorders.parameters import Role, field_of, meanings, unit_of
-from replay.engine.replaying.estimator import Reading
-from replay.inference.model.model import Map, Sensor
+from fuselog.pipeline.deploying.c_source.braces import braced
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
+from fuselog.recorders.parameters import Role, field_of, meanings, unit_of
+from fuselog.replay.engine.replaying.estimator import Reading
+from fuselog.replay.inference.model.model import Map, Sensor
 
 
 def why_no_replay(made: CFilter) -> str:

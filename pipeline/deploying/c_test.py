@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_source.braces import braced
-from pipeline.deploying.c_source.names import CFilter, filled
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats, Integers
-from replay.engine.replaying.estimator import Recursive
-from replay.engine.replaying.replaying import replay
-from replay.engine.streams.sources import LogSource
-from replay.inference.kalman.update import message_layout
-from replay.inference.run.filtering import Filter, FilterState
-from replay.inference.run.recursion import CONTROL, FilterEvents
+from fuselog.pipeline.deploying.c_source.braces import braced
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.replaying.estimator import Recursive
+from fuselog.replay.engine.replaying.replaying import replay
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.inference.kalman.update import message_layout
+from fuselog.replay.inference.run.filtering import Filter, FilterState
+from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 
 MOST_EVENTS = 400  # more only until every sensor has a message
 FAR = 1e4  # how far outliers are from what was measured, in units of it and one

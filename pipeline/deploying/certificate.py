@@ -11,8 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from pipeline.deploying.c_source.names import CFilter
-from pipeline.deploying.costs import NOTHING, Cost, added, costs_of
+from fuselog.pipeline.deploying.c_source.names import CFilter
+from fuselog.pipeline.deploying.costs import NOTHING, Cost, added, costs_of
 
 CERTIFICATE = "certificate.json"
 OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off")

@@ -4,11 +4,11 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.deploying.certificate import CERTIFICATE
-from pipeline.deploying.deploying import deploy
-from pipeline.deploying.folder import lost_sentence
-from pipeline.output.terminal import print_json, say
-from pipeline.runs.settings import settings_of_estimators
+from fuselog.pipeline.deploying.certificate import CERTIFICATE
+from fuselog.pipeline.deploying.deploying import deploy
+from fuselog.pipeline.deploying.folder import lost_sentence
+from fuselog.pipeline.output.terminal import print_json, say
+from fuselog.pipeline.runs.settings import settings_of_estimators
 
 
 def deploy_filter(

@@ -7,31 +7,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_source.names import CFilter
-from pipeline.deploying.c_source.statements import retriangulates
-from replay.inference.kalman.iterated_update import ITERATIONS
-from replay.inference.kalman.regression import MEANS
-from replay.inference.linear_algebra.covariances import COVARIANCES
-from replay.inference.linear_algebra.factors import FACTORS
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.pipeline.deploying.c_source.names import CFilter
+from fuselog.pipeline.deploying.c_source.statements import retriangulates
+from fuselog.replay.inference.kalman.iterated_update import ITERATIONS
+from fuselog.replay.inference.kalman.regression import MEANS
+from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES
+from fuselog.replay.inference.linear_algebra.factors import FACTORS
+from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     add_through,
     downdate,
     kalman_step,
     whiten,
 )
-from replay.inference.linear_algebra.inflation import inflate
-from replay.inference.linear_algebra.manifold import by_right_jacobian
-from replay.inference.linear_algebra.sparse import (
+from fuselog.replay.inference.linear_algebra.inflation import inflate
+from fuselog.replay.inference.linear_algebra.manifold import by_right_jacobian
+from fuselog.replay.inference.linear_algebra.sparse import (
     measuring_covariance,
     pattern_of,
     propagating_covariance,
 )
-from replay.inference.model.corrections import sloping
-from replay.inference.sampled_steps import SETTLING, SampledFunction
-from replay.inference.step_graphs import Step
-from replay.tracing.functions import Argument, Shape, trace
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed, steady
+from fuselog.replay.inference.model.corrections import sloping
+from fuselog.replay.inference.sampled_steps import SETTLING, SampledFunction
+from fuselog.replay.inference.step_graphs import Step
+from fuselog.replay.tracing.functions import Argument, Shape, trace
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed, steady
 
 _FLOPS = (operator.add, operator.sub, operator.mul, operator.truediv)
 _FREE = (

@@ -4,29 +4,29 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.planning import Named, settings_of
-from pipeline.api.planning import open as open_source
-from pipeline.checking.checking import Runs
-from pipeline.checking.stored import Golden
-from pipeline.deploying.c_replay import replay_text, why_no_replay
-from pipeline.deploying.c_source.filter import source
-from pipeline.deploying.c_source.header import header
-from pipeline.deploying.c_source.names import CFilter, identifier
-from pipeline.deploying.c_target import LINKED, STARTING
-from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
-from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
-from pipeline.deploying.folder import cmake_text, readme_text
-from pipeline.runs.ensemble import Settings
-from recorders.atomic import whole_folder
-from recorders.errors import BadInput, without_warnings_of_numbers
-from replay.engine.replaying.estimator import Recursive, bind, configure
-from replay.foreign.filters import description_of_library
-from replay.foreign.naming import shorthand
-from replay.foreign.native.library import HEADER
-from replay.inference.kalman.methods import FILTERS, filter_with
-from replay.inference.run.filtering import Filter
-from replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
-from replay.tracing.c_text import DOUBLE, SINGLE, Precision
+from fuselog.pipeline.api.planning import Named, settings_of
+from fuselog.pipeline.api.planning import open as open_source
+from fuselog.pipeline.checking.checking import Runs
+from fuselog.pipeline.checking.stored import Golden
+from fuselog.pipeline.deploying.c_replay import replay_text, why_no_replay
+from fuselog.pipeline.deploying.c_source.filter import source
+from fuselog.pipeline.deploying.c_source.header import header
+from fuselog.pipeline.deploying.c_source.names import CFilter, identifier
+from fuselog.pipeline.deploying.c_target import LINKED, STARTING
+from fuselog.pipeline.deploying.c_test import test_text, vectors_of, vectors_text
+from fuselog.pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
+from fuselog.pipeline.deploying.folder import cmake_text, readme_text
+from fuselog.pipeline.runs.ensemble import Settings
+from fuselog.recorders.atomic import whole_folder
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.replay.engine.replaying.estimator import Recursive, bind, configure
+from fuselog.replay.foreign.filters import description_of_library
+from fuselog.replay.foreign.naming import shorthand
+from fuselog.replay.foreign.native.library import HEADER
+from fuselog.replay.inference.kalman.methods import FILTERS, filter_with
+from fuselog.replay.inference.run.filtering import Filter
+from fuselog.replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
+from fuselog.replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
 # by what makes a method's steps
 KINDS = {
@@ -68,7 +68,7 @@ def deploy(
 
     Raises BadInput where the filter cannot be written so, and where the folder is not empty.
 
-    >>> from pipeline.api.api import record, write
+    >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
     >>> folder = deploy("run.mcap", "ekf", "robot_ekf", model="robot")
     >>> sorted(each.name for each in folder.iterdir())[:3]
@@ -103,12 +103,12 @@ def deploy(
 
 
 def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
-    """Put a program in the place of a golden's estimator, for `pipeline.checking.checking.check`.
+    """Put a program in the place of a golden's estimator, for `fuselog.pipeline.checking.checking.check`.
 
     Args:
         name: the program, as `lib:./robot_ekf.so`.
         runs: what the golden is of.
-        golden: as `pipeline.checking.stored.read` has it.
+        golden: as `fuselog.pipeline.checking.stored.read` has it.
 
     Returns the program's settings by the golden's label. Raises BadInput where `name` is no program,
     where the golden has not one estimator, and where the program was deployed from another filter.

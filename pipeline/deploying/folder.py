@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
 
-from pipeline.deploying.c_replay import why_no_replay
-from pipeline.deploying.c_source.header import data_of, outcomes
-from pipeline.deploying.c_source.names import CFilter, identifier
-from pipeline.deploying.c_target import target_lines
-from pipeline.deploying.certificate import OPTIONS, Certificate
-from pipeline.deploying.costs import Cost
-from replay.inference.kalman.iterated_update import ITERATIONS
-from replay.inference.kalman.regression import MEANS
+from fuselog.pipeline.deploying.c_replay import why_no_replay
+from fuselog.pipeline.deploying.c_source.header import data_of, outcomes
+from fuselog.pipeline.deploying.c_source.names import CFilter, identifier
+from fuselog.pipeline.deploying.c_target import target_lines
+from fuselog.pipeline.deploying.certificate import OPTIONS, Certificate
+from fuselog.pipeline.deploying.costs import Cost
+from fuselog.replay.inference.kalman.iterated_update import ITERATIONS
+from fuselog.replay.inference.kalman.regression import MEANS
 
 
 def cmake_text(made: CFilter) -> str:

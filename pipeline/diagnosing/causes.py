@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.diagnosing.advice import number
-from pipeline.diagnosing.hypotheses.hypothesis import (
+from fuselog.pipeline.diagnosing.advice import number
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     NOISES,
     GainsOf,
     Hypothesis,
@@ -19,13 +19,13 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     is_spike,
     noise_gain_over,
 )
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.joint import Supposed, fit, undone
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
-from replay.distributions import chi2
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.joint import Supposed, fit, undone
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out

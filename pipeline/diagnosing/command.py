@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.diagnosing.consistency import comparable
-from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.output.outputs import check_outputs
-from pipeline.output.results import plain
-from pipeline.output.terminal import print_json, print_metrics, print_table, say, status
-from pipeline.runs.estimates import recorded_estimators
-from pipeline.runs.settings import settings_of_estimators, split_texts
-from recorders.errors import BadInput
-from recorders.log import open_log
-from recorders.parameters import parse_settings
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.diagnosing.consistency import comparable
+from fuselog.pipeline.diagnosing.diagnosis import diagnose
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.results import plain
+from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status
+from fuselog.pipeline.runs.estimates import recorded_estimators
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log
+from fuselog.recorders.parameters import parse_settings
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def diagnose_log(

@@ -5,17 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.api.replays import Replay
-from pipeline.diagnosing.findings import Finding
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import MetricValue, split_metric
-from pipeline.output.words import listed
-from recorders.log import Stream, schemas
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.judging.consistency.consistency import CONSISTENT
-from replay.judging.consistency.whiteness import whitened, whiteness
-from replay.judging.errors.evaluation import chi_square_interval, split_topic
-from replay.judging.metrics.measuring import metric_key
+from fuselog.pipeline.api.replays import Replay
+from fuselog.pipeline.diagnosing.findings import Finding
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import MetricValue, split_metric
+from fuselog.pipeline.output.words import listed
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.judging.consistency.consistency import CONSISTENT
+from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
+from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
+from fuselog.replay.judging.metrics.measuring import metric_key
 
 SAME = 0.9  # of the messages: a truth that equals as many of what the filter used is the same
 SEEN = 1.5  # NIS per component, up to which innovations have seen nothing

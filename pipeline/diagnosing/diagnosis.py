@@ -16,20 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.altering.sources import alter, alterations_of, setting_of, split_settings
-from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.api.replays import Replay, replay
-from pipeline.diagnosing.advice import Advice, Trying
-from pipeline.diagnosing.causes import Estimated, Sought, least_gain, seek, tried_table
-from pipeline.diagnosing.consistency import (
+from fuselog.pipeline.altering.sources import alter, alterations_of, setting_of, split_settings
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.api.replays import Replay, replay
+from fuselog.pipeline.diagnosing.advice import Advice, Trying
+from fuselog.pipeline.diagnosing.causes import Estimated, Sought, least_gain, seek, tried_table
+from fuselog.pipeline.diagnosing.consistency import (
     judged_by_itself,
     nis_charts,
     of_each_component,
     unnamed,
     unseen_errors,
 )
-from pipeline.diagnosing.findings import (
+from fuselog.pipeline.diagnosing.findings import (
     Finding,
     component_table,
     of_estimates,
@@ -38,28 +38,28 @@ from pipeline.diagnosing.findings import (
     undone_by,
     without_filter,
 )
-from pipeline.diagnosing.hypotheses.parameters import NEVER_S
-from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
-from pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
-from pipeline.output.charts import Chart
-from pipeline.output.outputs import TIMELINE, check_files, check_folder
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.output.summary import summarise, summary_table
-from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import (
+from fuselog.pipeline.diagnosing.hypotheses.parameters import NEVER_S
+from fuselog.pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
+from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
+from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.output.summary import summarise, summary_table
+from fuselog.pipeline.runs.ensemble import judge_logs
+from fuselog.pipeline.runs.estimates import (
     labels_of,
     recorded_estimators,
     source_of_estimates,
     stated_estimators,
 )
-from pipeline.tuning.measured import until_last_measured
-from pipeline.tuning.objective import for_likelihood
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from recorders.log import Stream, schemas
-from recorders.parameters import merge
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
-from replay.foreign.naming import allowed, name_of, of_file, refuse_programs
+from fuselog.pipeline.tuning.measured import until_last_measured
+from fuselog.pipeline.tuning.objective import for_likelihood
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.parameters import merge
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
+from fuselog.replay.foreign.naming import allowed, name_of, of_file, refuse_programs
 
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
@@ -161,7 +161,7 @@ class Diagnosis:
         self._draw(Path(save))
 
     def _draw(self, rrd: Path) -> None:
-        from replay.timeline.show import Drawing
+        from fuselog.replay.timeline.show import Drawing
 
         log, estimates = self.replay.logs[0], self.replay.estimates
         with Drawing(log.whole(), identity="\n".join(self.told), save=rrd) as drawing:
@@ -227,7 +227,7 @@ def diagnose(
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
     no innovations.
 
-    >>> from pipeline.api.api import record
+    >>> from fuselog.pipeline.api.api import record
     >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')

@@ -10,18 +10,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.diagnosing.advice import number
-from pipeline.diagnosing.hypotheses.hypothesis import Kind
-from recorders.log import Stream
-from recorders.parameters import field_of
-from recorders.plausibility.checks import BLOCK, findings_in
-from recorders.plausibility.finding import Cause
-from recorders.plausibility.stamps import MOST_LOST
-from replay.distributions import chi2
-from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
-from replay.judging.consistency.whiteness import whitened, whiteness
-from replay.judging.errors.evaluation import split_topic
+from fuselog.pipeline.diagnosing.advice import number
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import field_of
+from fuselog.recorders.plausibility.checks import BLOCK, findings_in
+from fuselog.recorders.plausibility.finding import Cause
+from fuselog.recorders.plausibility.stamps import MOST_LOST
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
+from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
 FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter

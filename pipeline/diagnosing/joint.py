@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
-from pipeline.tuning.confidence import confidence
-from pipeline.tuning.search import Coordinates, Free, coordinates_of, curvature, least
-from recorders.errors import BadInput
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
+from fuselog.pipeline.tuning.confidence import confidence
+from fuselog.pipeline.tuning.search import Coordinates, Free, coordinates_of, curvature, least
+from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything

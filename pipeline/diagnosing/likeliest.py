@@ -5,15 +5,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.comparing.comparing import compare
-from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.diagnosing.sentences import Sentence
-from pipeline.output.alarms import Cause
-from pipeline.output.report.evidence import findings
-from pipeline.output.results import RUNS, Result, read_table
-from pipeline.output.words import count, meaning_alone, number, quantity, scale
-from recorders.errors import BadInput
-from recorders.parameters import merge, parse_settings
+from fuselog.pipeline.comparing.comparing import compare
+from fuselog.pipeline.diagnosing.diagnosis import diagnose
+from fuselog.pipeline.diagnosing.sentences import Sentence
+from fuselog.pipeline.output.alarms import Cause
+from fuselog.pipeline.output.report.evidence import findings
+from fuselog.pipeline.output.results import RUNS, Result, read_table
+from fuselog.pipeline.output.words import count, meaning_alone, number, quantity, scale
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import merge, parse_settings
 
 MENDED = "mended"
 STILL_WRONG = (

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.tuning.broad_starts import (
+from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
     begun_broadly,
@@ -26,13 +26,13 @@ from pipeline.tuning.broad_starts import (
     mean_likelihood,
     part_count,
 )
-from pipeline.tuning.control_noise import disturbed
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.tuning.control_noise import disturbed
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 MOST_MESSAGES = 300_000  # of the runs that are replayed together

@@ -5,19 +5,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.altering.sources import alter, split_settings
-from pipeline.api.replays import Replay, replay
-from pipeline.comparing.renamed import Renamed
-from pipeline.diagnosing.advice import number
-from pipeline.runs.ensemble import Pass, judge_logs
-from pipeline.tuning.objective import for_likelihood
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Schema, Stream, schemas, topics_of
-from recorders.log.streams import concatenate
-from recorders.parameters import merge
-from replay.engine.replaying.estimator import Bound
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.judging.metrics.measuring import find_metrics
+from fuselog.pipeline.altering.sources import alter, split_settings
+from fuselog.pipeline.api.replays import Replay, replay
+from fuselog.pipeline.comparing.renamed import Renamed
+from fuselog.pipeline.diagnosing.advice import number
+from fuselog.pipeline.runs.ensemble import Pass, judge_logs
+from fuselog.pipeline.tuning.objective import for_likelihood
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Schema, Stream, schemas, topics_of
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.parameters import merge
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.judging.metrics.measuring import find_metrics
 
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 
 Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
 Search = Generator[Sequence[Number], Sequence[float], "Peak"]

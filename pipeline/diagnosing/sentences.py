@@ -5,16 +5,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.api.replays import Replay
-from pipeline.diagnosing.advice import Trying
-from pipeline.diagnosing.causes import Cause
-from pipeline.diagnosing.findings import FIRST, Finding
-from pipeline.diagnosing.hypotheses.hypothesis import Kind
-from pipeline.output.results import split_metric
-from recorders.log import Stream, schemas
-from recorders.log.impossible import Rejections
-from replay.engine.streams.failures import reason_stream
-from replay.judging.errors.evaluation import split_topic
+from fuselog.pipeline.api.replays import Replay
+from fuselog.pipeline.diagnosing.advice import Trying
+from fuselog.pipeline.diagnosing.causes import Cause
+from fuselog.pipeline.diagnosing.findings import FIRST, Finding
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.pipeline.output.results import split_metric
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.impossible import Rejections
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 # What explains the numbers themselves, and no noise or bias that would have to be large.
 OF_FORM = (

@@ -13,18 +13,18 @@ import numpy as np
 import pandas as pd
 from pydantic import NonNegativeInt
 
-from pipeline.altering import alterations as alter
-from pipeline.diagnosing.battery import battery
-from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
-from pipeline.diagnosing.hypotheses.hypothesis import Kind
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from recorders.parameters import Parameters, merge
-from recorders.recording import record_run
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.diagnosing.battery import battery
+from fuselog.pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.parameters import Parameters, merge
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 WORTH = 10.0  # of log-likelihood: a fault whose removal gains less is not counted
 FIRST = 0.8  # of the faults that are counted, the least share to be named first
@@ -48,7 +48,7 @@ class Options(Parameters):
     """States what is diagnosed beside the scenarios.
 
     Attributes:
-        battery_seed: the first seed of the battery, see `pipeline.diagnosing.battery.battery`.
+        battery_seed: the first seed of the battery, see `fuselog.pipeline.diagnosing.battery.battery`.
         battery_runs: of each of its cells, and at most as many as of each fault; none unless given.
     """
 
@@ -198,7 +198,7 @@ SCENARIOS = {
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     rows: list[dict[str, Any]] = []
     clean: list[MemorySource] = []
     for name, scenario in SCENARIOS.items():

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.exploring.explore import explore
-from pipeline.output.terminal import say
-from pipeline.runs.settings import settings_of_estimators, split_texts
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.exploring.explore import explore
+from fuselog.pipeline.output.terminal import say
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def explore_log(

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas, topics_of
-from replay.distributions import chi2
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
-from replay.engine.vectors.tangent import tangent_components
-from replay.judging.consistency.whiteness import Whiteness, whitened, whiteness
-from replay.judging.errors.evaluation import POSITION, Errors, split_topic
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.judging.consistency.whiteness import Whiteness, whitened, whiteness
+from fuselog.replay.judging.errors.evaluation import POSITION, Errors, split_topic
 
 Floats = NDArray[np.float64]
 BIN_S = 1.0  # NIS is drawn as means over so long

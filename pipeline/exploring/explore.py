@@ -4,13 +4,13 @@ import webbrowser
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from pipeline.api.planning import Log, Named
-from pipeline.exploring.session import open_session
-from recorders.errors import BadInput
-from replay.timeline import viewer
+from fuselog.pipeline.api.planning import Log, Named
+from fuselog.pipeline.exploring.session import open_session
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.timeline import viewer
 
 if TYPE_CHECKING:
-    from pipeline.exploring.serving import Explorer
+    from fuselog.pipeline.exploring.serving import Explorer
 
 
 def explore(
@@ -42,7 +42,7 @@ def explore(
     """
     session = open_session(log, estimators, set=set, gap_limit_s=gap_limit_s)
     try:
-        from pipeline.exploring.serving import Explorer
+        from fuselog.pipeline.exploring.serving import Explorer
     except ModuleNotFoundError as error:
         if error.name != "bokeh":
             raise

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Mapping
 from html import escape
 
-from pipeline.exploring.curves import LINES, Case
-from pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
-from pipeline.exploring.session import Played
-from pipeline.exploring.sliders import Slider, in_words
-from pipeline.exploring.verdict import Verdict, numbers_of
-from pipeline.output.words import MINUS, number
+from fuselog.pipeline.exploring.curves import LINES, Case
+from fuselog.pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
+from fuselog.pipeline.exploring.session import Played
+from fuselog.pipeline.exploring.sliders import Slider, in_words
+from fuselog.pipeline.exploring.verdict import Verdict, numbers_of
+from fuselog.pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
 SIDE = 300  # the width of the sliders' column, in pixels

@@ -11,10 +11,10 @@ from bokeh.layouts import column, row
 from bokeh.models import Div, Select, Span
 from bokeh.models import Slider as SliderWidget
 
-from pipeline.exploring.curves import instant_of, true_path
-from pipeline.exploring.markup import SIDE, head_html, heading_html, label_of
-from pipeline.exploring.newest import NewestFirst
-from pipeline.exploring.plots import (
+from fuselog.pipeline.exploring.curves import instant_of, true_path
+from fuselog.pipeline.exploring.markup import SIDE, head_html, heading_html, label_of
+from fuselog.pipeline.exploring.newest import NewestFirst
+from fuselog.pipeline.exploring.plots import (
     PINNED,
     QUIET,
     Plot,
@@ -29,12 +29,19 @@ from pipeline.exploring.plots import (
     show_played,
     whiteness_plot,
 )
-from pipeline.exploring.session import Played, Session
-from pipeline.exploring.sliders import Slider
-from pipeline.exploring.widgets import NONE, buttons, filter_choices, tags_of, time_range, widget_of
-from pipeline.output.words import label_of as label_of_quantity
-from recorders.errors import BadInput
-from recorders.log import schemas, topics_of
+from fuselog.pipeline.exploring.session import Played, Session
+from fuselog.pipeline.exploring.sliders import Slider
+from fuselog.pipeline.exploring.widgets import (
+    NONE,
+    buttons,
+    filter_choices,
+    tags_of,
+    time_range,
+    widget_of,
+)
+from fuselog.pipeline.output.words import label_of as label_of_quantity
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import schemas, topics_of
 
 WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
 GROW = {"flex": "1 1 350px"}

@@ -16,7 +16,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from pipeline.exploring.curves import (
+from fuselog.pipeline.exploring.curves import (
     Case,
     Floats,
     Path,
@@ -26,11 +26,11 @@ from pipeline.exploring.curves import (
     map_points,
     true_path,
 )
-from pipeline.exploring.session import Played
-from pipeline.exploring.sliders import Slider, ticks_between
-from pipeline.output.words import label_of, quantity
-from recorders.parameters import unit_of
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.exploring.session import Played
+from fuselog.pipeline.exploring.sliders import Slider, ticks_between
+from fuselog.pipeline.output.words import label_of, quantity
+from fuselog.recorders.parameters import unit_of
+from fuselog.replay.engine.streams.sources import MemorySource
 
 # The report's ink, quiet grey and crimson; a filter has its own colour, what is pinned is a grey ghost.
 INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e7eb"

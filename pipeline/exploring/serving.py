@@ -24,10 +24,10 @@ from tornado.ioloop import IOLoop
 from tornado.web import Application as Handlers
 from tornado.web import RequestHandler
 
-from pipeline.exploring.page import Page
-from pipeline.exploring.session import Session
-from pipeline.exploring.widgets import NAME_SLIDERS
-from recorders.errors import printable
+from fuselog.pipeline.exploring.page import Page
+from fuselog.pipeline.exploring.session import Session
+from fuselog.pipeline.exploring.widgets import NAME_SLIDERS
+from fuselog.recorders.errors import printable
 
 LOOPBACK = "127.0.0.1"
 TEMPLATE = """

@@ -10,29 +10,29 @@ from typing import Any
 
 import tomli_w
 
-from pipeline.altering.changes import is_of_topic
-from pipeline.altering.sources import setting_of, split_settings
-from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.api.replays import replay as replayed
-from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.exploring.curves import Case, cases_of
-from pipeline.exploring.sliders import Slider, setting_text, sliders_of
-from pipeline.exploring.verdict import Verdict, verdict_of
-from pipeline.output.alarming import alarms_of
-from pipeline.runs.settings import parameters_by_label, with_settings
-from pipeline.tuning.objective import Run, in_memory
-from pipeline.tuning.tuning import OPEN, tune
-from recorders.atomic import scratch_folder
-from recorders.errors import BadInput, choices
-from recorders.parameters import field_of, flat, merge, nested
-from replay.engine.replaying.estimator import Bound, Estimator, bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.foreign.naming import allowed, name_of
-from replay.inference.all_methods import modelled
-from replay.inference.estimators import model_of
-from replay.judging.judge import Judge
-from replay.timeline import viewer
+from fuselog.pipeline.altering.changes import is_of_topic
+from fuselog.pipeline.altering.sources import setting_of, split_settings
+from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.api.replays import replay as replayed
+from fuselog.pipeline.diagnosing.diagnosis import diagnose
+from fuselog.pipeline.exploring.curves import Case, cases_of
+from fuselog.pipeline.exploring.sliders import Slider, setting_text, sliders_of
+from fuselog.pipeline.exploring.verdict import Verdict, verdict_of
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.runs.settings import parameters_by_label, with_settings
+from fuselog.pipeline.tuning.objective import Run, in_memory
+from fuselog.pipeline.tuning.tuning import OPEN, tune
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import field_of, flat, merge, nested
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.foreign.naming import allowed, name_of
+from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.estimators import model_of
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline import viewer
 
 Values = Mapping[str, float]
 MOST = 2  # filters side by side

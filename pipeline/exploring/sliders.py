@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.output.words import MINUS, number
-from pipeline.tuning.tuning import value_at_start
-from recorders.errors import BadInput
-from recorders.parameters import bounds_of, describe, field_of, roles_of
-from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.inference.model.parameters import number_fields
+from fuselog.pipeline.output.words import MINUS, number
+from fuselog.pipeline.tuning.tuning import value_at_start
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import bounds_of, describe, field_of, roles_of
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.inference.model.parameters import number_fields
 
 STEPS = 400  # between the ends of a slider
 FACTOR = 10.0  # a positive parameter goes from its own value divided by this to as many times it

@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.exploring.curves import Case
-from pipeline.output.alarms import Alarm
-from pipeline.output.words import quantity
+from fuselog.pipeline.exploring.curves import Case
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.words import quantity
 
 Level = Literal["good", "doubtful", "failed"]
 
@@ -30,7 +30,7 @@ class Verdict(NamedTuple):
 def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Verdict:
     """Judge one filter on one log, by the alarms of its replay; those of other cases do not count.
 
-    Whether a filter is too sure of itself is what NIS and NEES say, see `pipeline.output.alarming`.
+    Whether a filter is too sure of itself is what NIS and NEES say, see `fuselog.pipeline.output.alarming`.
     """
     if failures:
         return Verdict("failed", "It stopped.", failures[0])

@@ -8,11 +8,11 @@ from bokeh.layouts import row
 from bokeh.models import Button, Range1d, Select
 from bokeh.models import Slider as SliderWidget
 
-from pipeline.exploring.markup import SIDE
-from pipeline.exploring.plots import COLOURS
-from pipeline.exploring.sliders import STEPS, Slider
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.inference.all_methods import METHODS
+from fuselog.pipeline.exploring.markup import SIDE
+from fuselog.pipeline.exploring.plots import COLOURS
+from fuselog.pipeline.exploring.sliders import STEPS, Slider
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.inference.all_methods import METHODS
 
 NONE = "none"
 A_ROW = 2  # buttons

@@ -6,10 +6,10 @@ It becomes topics of their own, which the model `inertial` takes beside those of
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.standing import unrest
-from recorders.parameters import Parameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.standing import unrest
+from fuselog.recorders.parameters import Parameters
 
 
 class ConstraintParameters(Parameters):

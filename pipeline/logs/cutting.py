@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.logs.rewriting import stream_blocks
-from recorders.errors import BadInput
-from recorders.log import Log, Stream, schemas
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.logs.rewriting import stream_blocks
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Log, Stream, schemas
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def static_topics(log: Log, topics: Sequence[str]) -> list[str]:

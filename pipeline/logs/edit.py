@@ -10,9 +10,9 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from pipeline.logs.constraints import ConstraintParameters, constraints_of
-from pipeline.logs.cutting import Thinner, is_prior, static_topics, thinner
-from pipeline.logs.rewriting import (
+from fuselog.pipeline.logs.constraints import ConstraintParameters, constraints_of
+from fuselog.pipeline.logs.cutting import Thinner, is_prior, static_topics, thinner
+from fuselog.pipeline.logs.rewriting import (
     Blocks,
     Changed,
     joined_runs,
@@ -25,13 +25,13 @@ from pipeline.logs.rewriting import (
     with_operation,
     write_changed,
 )
-from pipeline.output.outputs import changed, check_files
-from pipeline.runs.initial_states import span_of
-from recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
-from recorders.log import Log, Stream, open_log, read_empty, schemas, topics_of
-from recorders.log.schemas import SCHEMAS
-from recorders.parameters import build
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.output.outputs import changed, check_files
+from fuselog.pipeline.runs.initial_states import span_of
+from fuselog.recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
+from fuselog.recorders.log import Log, Stream, open_log, read_empty, schemas, topics_of
+from fuselog.recorders.log.schemas import SCHEMAS
+from fuselog.recorders.parameters import build
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 @without_warnings_of_numbers()
@@ -66,7 +66,7 @@ def cut(
     Raises BadInput where a name or pattern is of no topic, nothing is in the span, or something else is
     in the place of the output.
 
-    >>> from pipeline.api.api import record, write
+    >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=2.0))
     >>> topics = ["/robot1/odometry", "*/prior"]
     >>> cut("run.mcap", "part.mcap", start_s=1, topics=topics, decimate={"*/odometry": 5}).messages
@@ -139,7 +139,7 @@ def merge(
     Raises BadInput where two logs have a topic in common, an offset is of no log or takes stamps out of
     range, or something else is in the place of the output.
 
-    >>> from pipeline.api.api import record, write
+    >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=2.0))
     >>> _ = relabel("run.mcap", "left.mcap", topics={"/": "/left/"})
     >>> done = merge(["run.mcap", "left.mcap"], "both.mcap", offsets_s={"left.mcap": -0.5})
@@ -241,7 +241,7 @@ def constrain(
 ) -> Changed:
     """Write a log with what its inertial unit says of the body: that it stands, that it rolls on wheels.
 
-    The topics `standing` and `rolling` come beside the unit's own, see `pipeline.logs.constraints`.
+    The topics `standing` and `rolling` come beside the unit's own, see `fuselog.pipeline.logs.constraints`.
 
     Args:
         path: the log.

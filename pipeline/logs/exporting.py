@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 from urllib.parse import quote
 
-from pipeline.logs.mot import mot_files
-from pipeline.output.outputs import Kind, check_files, check_folder
-from recorders.atomic import whole_file, whole_folder
-from recorders.errors import BadInput, UnknownName, choices, some_of, without_warnings_of_numbers
-from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
-from recorders.trajectories import Trajectory, kitti_lines, tum_lines
-from replay.judging.errors.trajectory_streams import trajectory_of
+from fuselog.pipeline.logs.mot import mot_files
+from fuselog.pipeline.output.outputs import Kind, check_files, check_folder
+from fuselog.recorders.atomic import whole_file, whole_folder
+from fuselog.recorders.errors import BadInput, UnknownName, choices, some_of, without_warnings_of_numbers
+from fuselog.recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
+from fuselog.recorders.trajectories import Trajectory, kitti_lines, tum_lines
+from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 
 To = Literal["tum", "kitti", "mot", "csv", "parquet", "foxglove"]
 SUFFIXES: dict[To, str] = {
@@ -57,8 +57,8 @@ def export(
         path: the log, or estimates log.
         to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
             position, and of poses; "mot" has a file of each tracker's tracks and one of all truths, see
-            `pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what its
-            viewers can show, see `pipeline.logs.foxglove`.
+            `fuselog.pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what its
+            viewers can show, see `fuselog.pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
             "foxglove", the file.
         topics: which; none stands for all that fit.
@@ -131,7 +131,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
 
 def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
     """Write one log of the companions of all topics that have some."""
-    from pipeline.logs.foxglove import companions  # which takes long to import
+    from fuselog.pipeline.logs.foxglove import companions  # which takes long to import
 
     check_files([(place, _new("foxglove"))], {"log": [log.path]})
     written = dict.fromkeys(topics, 0)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 
 def logs_in(path: Path) -> list[Path]:

@@ -13,14 +13,14 @@ import numpy as np
 from google.protobuf.message import Message
 from scipy.spatial.transform import Rotation
 
-from recorders.extras import extra
-from recorders.log import Companion, Stream, schemas
-from recorders.log.planes import FRAME, body_of
-from replay.engine.streams.measurements import PLANE, covariances_of
-from replay.judging.errors.evaluation import Floats
-from replay.judging.errors.trajectory_streams import trajectory_of
-from replay.timeline.drawing.canvas import PALETTE, TRUTH
-from replay.timeline.drawing.plane import ellipses
+from fuselog.recorders.extras import extra
+from fuselog.recorders.log import Companion, Stream, schemas
+from fuselog.recorders.log.planes import FRAME, body_of
+from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
+from fuselog.replay.timeline.drawing.canvas import PALETTE, TRUTH
+from fuselog.replay.timeline.drawing.plane import ellipses
 
 with extra("foxglove", "messages of Foxglove"):
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms

@@ -9,25 +9,25 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.output import RESULT_FILE
-from pipeline.output.terminal import print_json, print_table, say, warn
-from recorders.errors import BadInput
-from recorders.linting.lint import lint_log
-from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
-from recorders.parameters import build, describe
-from recorders.plausibility.finding import Finding
-from recorders.recording import Recorder
-from recorders.registry import available, foreign_code, load
-from replay.engine.compiling.cache import cache_folder, kept_files
-from replay.engine.replaying.estimator import Bound, Estimator, bound_to
-from replay.engine.replaying.truth import truths_among
-from replay.engine.streams.sources import LogSource
-from replay.foreign.naming import KINDS as PROGRAMS
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import bind_model, combined, registered_models
-from replay.inference.model.binding import topics_of
-from replay.inference.model.model import Model
-from replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
+from fuselog.pipeline.output import RESULT_FILE
+from fuselog.pipeline.output.terminal import print_json, print_table, say, warn
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.linting.lint import lint_log
+from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
+from fuselog.recorders.parameters import build, describe
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.recording import Recorder
+from fuselog.recorders.registry import available, foreign_code, load
+from fuselog.replay.engine.compiling.cache import cache_folder, kept_files
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to
+from fuselog.replay.engine.replaying.truth import truths_among
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.foreign.naming import KINDS as PROGRAMS
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import bind_model, combined, registered_models
+from fuselog.replay.inference.model.binding import topics_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
 MOST_TOPICS = 6  # that one line names
 ESTIMATES = "/estimates/"  # what topics of estimates logs begin with
@@ -38,15 +38,15 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
     Of a result folder or a timeline, what is in it.
     """
-    from recorders.importers.ros.files.bags import looks_like_bag
+    from fuselog.recorders.importers.ros.files.bags import looks_like_bag
 
     if path.suffix == ".rrd":
-        from pipeline.logs.made import show_timeline
+        from fuselog.pipeline.logs.made import show_timeline
 
         show_timeline(path, as_json=as_json)
         return
     if (path / RESULT_FILE).is_file():
-        from pipeline.logs.made import show_result
+        from fuselog.pipeline.logs.made import show_result
 
         show_result(path, as_json=as_json)
         return
@@ -221,7 +221,7 @@ def _say_what_to_do(path: Path, log: Log) -> None:
 
 def _show_bag(path: Path, *, as_json: bool) -> None:
     """Print what a bag of ROS holds that is no MCAP file."""
-    from recorders.importers.ros.files.bags import open_bag
+    from fuselog.recorders.importers.ros.files.bags import open_bag
 
     with open_bag(path) as bag:
         rows = [[each.topic, each.type_name, each.messages] for each in bag.connections]

@@ -4,10 +4,10 @@ from collections import Counter
 from pathlib import Path
 from shlex import quote
 
-from pipeline.output.report.kinds import run_sentences
-from pipeline.output.results import RESULT_FILE, Result, read_result
-from pipeline.output.terminal import print_json, print_others, print_table, print_worst, say
-from recorders.errors import BadInput
+from fuselog.pipeline.output.report.kinds import run_sentences
+from fuselog.pipeline.output.results import RESULT_FILE, Result, read_result
+from fuselog.pipeline.output.terminal import print_json, print_others, print_table, print_worst, say
+from fuselog.recorders.errors import BadInput
 
 
 def show_result(folder: Path, *, as_json: bool) -> None:

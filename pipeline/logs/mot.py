@@ -14,12 +14,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Log, Stream, Topic, schemas
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.engine.streams.sources import LogSource
-from replay.judging.tracks.errors import PERIOD_S, tracks_at
+from fuselog.recorders.errors import BadInput, UnknownName, choices
+from fuselog.recorders.log import Log, Stream, Topic, schemas
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.tracks.errors import PERIOD_S, tracks_at
 
 TRUTHS = "gt"
 PERIOD_NS = round(PERIOD_S * 1e9)

@@ -8,12 +8,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.output.outputs import CHANGED_BY, CHANGES
-from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Log, LogWriter, RunMetadata, Stream, read_blocks, read_empty
-from recorders.log.container.sealed import OWN_NAMES
-from recorders.log.schemas import message_class
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.output.outputs import CHANGED_BY, CHANGES
+from fuselog.recorders.errors import BadInput, UnknownName, choices
+from fuselog.recorders.log import Log, LogWriter, RunMetadata, Stream, read_blocks, read_empty
+from fuselog.recorders.log.container.sealed import OWN_NAMES
+from fuselog.recorders.log.schemas import message_class
+from fuselog.replay.engine.streams.sources import LogSource
 
 Blocks = Iterator[list[Stream]]
 

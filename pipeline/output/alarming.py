@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.output.alarms import Alarm
-from replay.distributions import chi2
-from replay.engine.replaying.usage import SILENT, UNTAKEN, Row
-from replay.judging.consistency.conditioning import LOST
-from replay.judging.consistency.consistency import CONSISTENT
-from replay.judging.errors.constant import Constant
-from replay.judging.errors.evaluation import chi_square_interval, split_topic
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import metric_key
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.replaying.usage import SILENT, UNTAKEN, Row
+from fuselog.replay.judging.consistency.conditioning import LOST
+from fuselog.replay.judging.consistency.consistency import CONSISTENT
+from fuselog.replay.judging.errors.constant import Constant
+from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import metric_key
 
 USUAL_GATE = 0.99  # where it is not known
 RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is

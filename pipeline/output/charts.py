@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, PositiveInt, field_validator, model_validator
 
-from recorders.parameters import Parameters
+from fuselog.recorders.parameters import Parameters
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,7 +1,7 @@
 """Decides claims: statements of papers with our verdicts.
 
 A claim is stated as data, beside an experiment's settings in data/experiments: a sentence, what the
-paper says, and a comparison of metrics that decides it; see `pipeline.output.expressions`.
+paper says, and a comparison of metrics that decides it; see `fuselog.pipeline.output.expressions`.
 """
 
 import re
@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import PositiveInt, model_validator
 
-from pipeline.output.expressions import (
+from fuselog.pipeline.output.expressions import (
     NoMetric,
     Values,
     evaluate,
@@ -25,10 +25,10 @@ from pipeline.output.expressions import (
     needs_runs,
     truth,
 )
-from pipeline.output.numbers import Number, Value, exactly
-from pipeline.output.words import MISSING
-from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters
+from fuselog.pipeline.output.numbers import Number, Value, exactly
+from fuselog.pipeline.output.words import MISSING
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import Parameters
 
 Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
 # What a claim has in place of one where the data are not those that it is made of.

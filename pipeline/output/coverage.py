@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.output.results import read_table
-from recorders.errors import BadInput
-from recorders.log import Clock
-from recorders.log.impossible import Rejections
-from recorders.parsing import parse_json
-from replay.engine.replaying.estimator import Bound, bind
-from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.replaying.usage import (
+from fuselog.pipeline.output.results import read_table
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock
+from fuselog.recorders.log.impossible import Rejections
+from fuselog.recorders.parsing import parse_json
+from fuselog.replay.engine.replaying.estimator import Bound, bind
+from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
+from fuselog.replay.engine.replaying.usage import (
     CONTROLS,
     INNOVATION,
     LANDMARK,
@@ -26,9 +26,9 @@ from replay.engine.replaying.usage import (
     Row,
     Usage,
 )
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource, Source, is_sensed
-from replay.judging.errors.truths import Doubt
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import LogSource, Source, is_sensed
+from fuselog.replay.judging.errors.truths import Doubt
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -19,7 +19,7 @@ from functools import cache
 from string import Formatter
 from typing import Any, NamedTuple
 
-from pipeline.output.numbers import (
+from fuselog.pipeline.output.numbers import (
     COMPARISONS,
     FUNCTIONS,
     OPERATIONS,
@@ -34,8 +34,8 @@ from pipeline.output.numbers import (
     negated,
     negative,
 )
-from pipeline.output.words import MISSING
-from recorders.errors import BadInput, choices
+from fuselog.pipeline.output.words import MISSING
+from fuselog.recorders.errors import BadInput, choices
 
 
 class NoMetric(Exception):

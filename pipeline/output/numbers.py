@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 
 class Number(NamedTuple):
@@ -197,7 +197,7 @@ def _plus_minus(number: Number, spread: Number) -> Number:
 
 def _chi_square(share: Number, size: Number) -> Number:
     """Find below what a share of chi-square numbers of so many degrees lies; NaN without any degree."""
-    from replay.distributions import chi2
+    from fuselog.replay.distributions import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
 
@@ -219,7 +219,7 @@ def _consistent(size: Number, count: Number) -> Number:
 
     NaN where one of these is missing.
     """
-    from replay.judging.errors.evaluation import chi_square_interval
+    from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
     if not (size.is_known and count.is_known):
         return exactly(None)

@@ -14,11 +14,11 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any, NamedTuple
 
-from pipeline.output.results import RESULT_FILE, read_result, require_ours
-from recorders.atomic import settled
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, open_log
-from recorders.parsing import parse_json
+from fuselog.pipeline.output.results import RESULT_FILE, read_result, require_ours
+from fuselog.recorders.atomic import settled
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, open_log
+from fuselog.recorders.parsing import parse_json
 
 MOST_SETTINGS = 3  # that one sentence names
 # The notes of a log's run that tell how it was cut, merged or relabelled, and which command did so last.
@@ -151,7 +151,7 @@ def _is_log(path: Path) -> bool:
     """Tell whether fuselog wrote a log, which is whole."""
     from mcap.reader import make_reader
 
-    from recorders.log.container.writing import LIBRARY
+    from fuselog.recorders.log.container.writing import LIBRARY
 
     try:
         open_log(path)
@@ -198,7 +198,7 @@ def imported(source: str) -> Kind:
 def _is_timeline(path: Path) -> bool:
     from rerun.chunk import RrdReader
 
-    from replay.timeline.sinks import rerun_path
+    from fuselog.replay.timeline.sinks import rerun_path
 
     with warnings.catch_warnings(action="ignore"):  # of what is cut off
         try:
@@ -211,7 +211,7 @@ def _is_timeline(path: Path) -> bool:
 def _is_picture(path: Path) -> bool:
     from PIL import Image
 
-    from replay.timeline.viewer import SOFTWARE
+    from fuselog.replay.timeline.viewer import SOFTWARE
 
     try:
         with Image.open(path) as image:
@@ -221,7 +221,7 @@ def _is_picture(path: Path) -> bool:
 
 
 def _is_report(path: Path) -> bool:
-    from pipeline.output.report import is_report
+    from fuselog.pipeline.output.report import is_report
 
     return is_report(path)
 

@@ -17,14 +17,14 @@ from urllib.parse import quote
 
 from pydantic import SerializerFunctionWrapHandler, model_serializer
 
-from pipeline.output import RESULT_FILE as RESULT_FILE
-from pipeline.output.alarms import Alarm, Cause, Stressing
-from pipeline.output.charts import Chart, draw, show_names_as_they_are
-from pipeline.output.claims import Claim, known
-from recorders.atomic import whole_file, whole_folder
-from recorders.errors import BadInput, check_format
-from recorders.parameters import Parameters, build
-from recorders.parsing import parse_json
+from fuselog.pipeline.output import RESULT_FILE as RESULT_FILE
+from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
+from fuselog.pipeline.output.charts import Chart, draw, show_names_as_they_are
+from fuselog.pipeline.output.claims import Claim, known
+from fuselog.recorders.atomic import whole_file, whole_folder
+from fuselog.recorders.errors import BadInput, check_format
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.recorders.parsing import parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -215,7 +215,7 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
     Fewer than `FEWEST_RUNS` have none. A study may have a table of runs without NEES.
     """
-    from replay.judging.errors.differences import FEWEST_RUNS, mean_interval
+    from fuselog.replay.judging.errors.differences import FEWEST_RUNS, mean_interval
 
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}

@@ -5,14 +5,14 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.output.alarming import alarms_of
-from pipeline.output.charts import Axis, Chart, Panel, Series, Style, band, curve, thinned
-from pipeline.output.coverage import coverage_table
-from pipeline.output.results import MetricValue, Outcome, split_metric
-from replay.engine.replaying.usage import Row
-from replay.judging.errors.evaluation import Errors
-from replay.judging.judge import Judge
-from replay.judging.metrics.means import INSERTED
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, Style, band, curve, thinned
+from fuselog.pipeline.output.coverage import coverage_table
+from fuselog.pipeline.output.results import MetricValue, Outcome, split_metric
+from fuselog.replay.engine.replaying.usage import Row
+from fuselog.replay.judging.errors.evaluation import Errors
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.means import INSERTED
 
 MOST_COLUMNS = 3
 

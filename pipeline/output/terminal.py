@@ -18,9 +18,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.output.alarms import Alarm
-from pipeline.output.claims import NO_VERDICT, Claim
-from pipeline.output.results import (
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.claims import NO_VERDICT, Claim
+from fuselog.pipeline.output.results import (
     Bounds,
     Measured,
     MetricTable,
@@ -28,8 +28,8 @@ from pipeline.output.results import (
     metric_tables,
     split_metric,
 )
-from pipeline.output.words import MISSING
-from recorders.errors import printable
+from fuselog.pipeline.output.words import MISSING
+from fuselog.recorders.errors import printable
 
 if TYPE_CHECKING:
     import pandas as pd

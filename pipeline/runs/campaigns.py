@@ -2,7 +2,7 @@
 
 A cell is a part of the runs. What it gives depends on its description and on the code alone, so that it
 may be worked off anywhere, and once is enough: finished cells are kept until all are done, and the same
-command goes on from there after it was stopped; see `pipeline.runs.checkpoints`.
+command goes on from there after it was stopped; see `fuselog.pipeline.runs.checkpoints`.
 """
 
 import hashlib
@@ -21,16 +21,22 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any, NamedTuple
 
-from pipeline.runs.checkpoints import Checkpoints
-from pipeline.runs.ensemble import Pass, parts_of
-from pipeline.runs.executors import PoolFactory, WorkerPool, inline_pool, states_of, version_of_code
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.inputs import Logs, Record, load_scenario
-from pipeline.runs.recorded import KEPT_BYTES, require_memory
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import merge
-from replay.foreign.naming import program_files
+from fuselog.pipeline.runs.checkpoints import Checkpoints
+from fuselog.pipeline.runs.ensemble import Pass, parts_of
+from fuselog.pipeline.runs.executors import (
+    PoolFactory,
+    WorkerPool,
+    inline_pool,
+    states_of,
+    version_of_code,
+)
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.inputs import Logs, Record, load_scenario
+from fuselog.pipeline.runs.recorded import KEPT_BYTES, require_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import merge
+from fuselog.replay.foreign.naming import program_files
 
 # A cell whose workers died so often is given up.
 ATTEMPTS = 3

@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
-from pipeline.output.results import hash_of
-from pipeline.runs.estimates import ERRORS, join_tables
-from recorders.atomic import parents_of, settled
-from recorders.errors import BadInput
-from replay.engine.compiling.cache import is_own, read_own, write_checked
+from fuselog.pipeline.output.results import hash_of
+from fuselog.pipeline.runs.estimates import ERRORS, join_tables
+from fuselog.recorders.atomic import parents_of, settled
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.cache import is_own, read_own, write_checked
 
 _LOCK, _SUFFIX = "fuselog.lock", ".bin"
 _KEY = re.compile(r"[0-9a-f]{64}")

@@ -14,27 +14,27 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.altering.sources import note_of
-from pipeline.output.coverage import added, replayed_note, rows_of, untaken
-from pipeline.runs.initial_states import Origin, start_from
-from pipeline.runs.settings import meanings_of
-from recorders.errors import BadInput
-from recorders.log import Clock, Companions, LogWriter, RunMetadata
-from recorders.log.impossible import Rejections
-from recorders.parameters import Parameters
-from replay.engine.replaying.estimator import Bound, bind
-from replay.engine.replaying.late import Late
-from replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
-from replay.engine.replaying.usage import Row, Usage
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.ensembles import ensemble_of
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import Errors, errors_at
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import Metric, find_metrics, plus
+from fuselog.pipeline.altering.sources import note_of
+from fuselog.pipeline.output.coverage import added, replayed_note, rows_of, untaken
+from fuselog.pipeline.runs.initial_states import Origin, start_from
+from fuselog.pipeline.runs.settings import meanings_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Companions, LogWriter, RunMetadata
+from fuselog.recorders.log.impossible import Rejections
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.replaying.estimator import Bound, bind
+from fuselog.replay.engine.replaying.late import Late
+from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
+from fuselog.replay.engine.replaying.usage import Row, Usage
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.ensembles import ensemble_of
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import Errors, errors_at
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import Metric, find_metrics, plus
 
 if TYPE_CHECKING:
-    from replay.timeline.show import Drawing
+    from fuselog.replay.timeline.show import Drawing
 
 # Every run of an ensemble has up to three files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
@@ -209,7 +209,7 @@ def replay_parts(
             ]
             drawing = None
             if part.first_run == 0 and (save or connect):
-                from replay.timeline.show import Drawing  # which takes long to import
+                from fuselog.replay.timeline.show import Drawing  # which takes long to import
 
                 asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
                 first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)

@@ -12,12 +12,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.altering.sources import alter, stated_alterations
-from recorders.errors import BadInput
-from recorders.log import Log, open_log
-from recorders.parsing import parse_json
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.judging.errors.evaluation import Errors, split_topic
+from fuselog.pipeline.altering.sources import alter, stated_alterations
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Log, open_log
+from fuselog.recorders.parsing import parse_json
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.judging.errors.evaluation import Errors, split_topic
 
 # Where every single error is, in a result's folder.
 ERRORS = Path("tables", "errors")
@@ -129,7 +129,7 @@ class ErrorTables:
         import pyarrow
         import pyarrow.parquet
 
-        from replay.judging.tables import error_table
+        from fuselog.replay.judging.tables import error_table
 
         table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
         what = errors.estimator, errors.case

@@ -9,23 +9,23 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
-from pipeline.altering.changes import by_topic, is_of_topic
-from pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
-from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
-from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
-from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import PoolFactory
-from pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
-from pipeline.runs.settings import named_by, parameters_by_label
-from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build, merge
-from recorders.parsing import read_toml
-from recorders.recording import Recorder
-from recorders.registry import foreign_code, load
-from replay.engine.replaying.estimator import configure
-from replay.engine.replaying.late import parse_late
-from replay.foreign.naming import allowed_in
-from replay.judging.metrics.measuring import find_metrics
+from fuselog.pipeline.altering.changes import by_topic, is_of_topic
+from fuselog.pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
+from fuselog.pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
+from fuselog.pipeline.runs.checkpoints import Checkpoints, checkpoints_of
+from fuselog.pipeline.runs.ensemble import Progress, no_progress
+from fuselog.pipeline.runs.executors import PoolFactory
+from fuselog.pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
+from fuselog.pipeline.runs.settings import named_by, parameters_by_label
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import Parameters, build, merge
+from fuselog.recorders.parsing import read_toml
+from fuselog.recorders.recording import Recorder
+from fuselog.recorders.registry import foreign_code, load
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.replaying.late import parse_late
+from fuselog.replay.foreign.naming import allowed_in
+from fuselog.replay.judging.metrics.measuring import find_metrics
 
 
 class Experiment(Parameters):
@@ -166,7 +166,7 @@ class Study:
         summary: what it does, in a line.
         run: (experiment, setting) -> what it found; logs and timeline go to the setting's folder.
         options: the type of the experiment's `options`.
-        is_campaign: whether it replays by `pipeline.runs.campaigns` alone, so that others may work on
+        is_campaign: whether it replays by `fuselog.pipeline.runs.campaigns` alone, so that others may work on
             parts of the runs.
         runs: what the number of runs counts; empty if the study makes none.
     """

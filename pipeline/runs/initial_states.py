@@ -14,20 +14,20 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput, choices
-from recorders.log import Clock, Stream, make_stream, open_log, schemas, topics_of
-from replay.engine.replaying.estimator import Bound
-from replay.engine.replaying.late import Late, parse_late
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.engine.vectors.components import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Clock, Stream, make_stream, open_log, schemas, topics_of
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.replaying.late import Late, parse_late
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.engine.vectors.components import (
     in_body_axes,
     match_components,
     match_tangent,
     stated_components,
 )
-from replay.engine.vectors.tangent import named_now, tangent_components, truth_at
-from replay.judging.errors.evaluation import split_topic
+from fuselog.replay.engine.vectors.tangent import named_now, tangent_components, truth_at
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
 # A run's prior at a time in ns, from an estimator's label and the log's own prior.

@@ -7,10 +7,10 @@ from io import BufferedIOBase
 from pathlib import Path
 from typing import Any, cast
 
-from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters
-from recorders.parsing import read_toml
-from recorders.registry import available
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.parsing import read_toml
+from fuselog.recorders.registry import available
 
 
 class Record(Parameters):
@@ -67,7 +67,10 @@ class Recording(Parameters):
 
 
 def _digest(path: Path) -> str:
-    from recorders.importers.tables.files import DAMAGED, open_decompressed  # Arrow takes long to import
+    from fuselog.recorders.importers.tables.files import (  # Arrow takes long to import
+        DAMAGED,
+        open_decompressed,
+    )
 
     try:
         with open_decompressed(path) as file:

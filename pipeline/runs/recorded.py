@@ -8,20 +8,20 @@ from functools import partial
 from itertools import chain
 from typing import Any
 
-from pipeline.runs.ensemble import Progress, Settings, no_progress, replay_blocks
-from recorders.errors import BadInput
-from recorders.log import Clock
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.late import Late
-from replay.engine.replaying.replaying import Report, collect
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.sources import MemorySource, Source, memory_source
-from replay.judging.errors.evaluation import Errors, Innovations, split_topic
-from replay.judging.judge import TIME_BINS, Judge
-from replay.judging.metrics.measuring import Output, find_metrics, measure
-from replay.judging.sets.errors import SetErrors
+from fuselog.pipeline.runs.ensemble import Progress, Settings, no_progress, replay_blocks
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.late import Late
+from fuselog.replay.engine.replaying.replaying import Report, collect
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.sources import MemorySource, Source, memory_source
+from fuselog.replay.judging.errors.evaluation import Errors, Innovations, split_topic
+from fuselog.replay.judging.judge import TIME_BINS, Judge
+from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure
+from fuselog.replay.judging.sets.errors import SetErrors
 
 # Of a run that was judged, so much is kept at least: its sums over time.
 KEPT_BYTES = 8 * TIME_BINS

@@ -10,20 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter_all
-from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
-from pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.initial_states import order_of
-from pipeline.runs.inputs import load_scenario
-from pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, open_log
-from recorders.parameters import merge
-from recorders.recording import import_run
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.sources import LogSource, MemorySource, is_sensed, memory_source
-from replay.judging.judge import Judge
+from fuselog.pipeline.altering.sources import alter_all
+from fuselog.pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
+from fuselog.pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.initial_states import order_of
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, RunMetadata, open_log
+from fuselog.recorders.parameters import merge
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed, memory_source
+from fuselog.replay.judging.judge import Judge
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Runner:
         self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
     ) -> None:
         """Draw the first of the runs `sources` with its `outputs` into `folder`."""
-        from replay.timeline.show import show
+        from fuselog.replay.timeline.show import show
 
         place = self.setting.folder / folder
         place.mkdir(parents=True, exist_ok=True)

@@ -5,13 +5,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.changes import by_topic, is_of_topic, is_parameter
-from recorders.errors import BadInput, choices
-from recorders.parameters import in_few_words, meanings, merge, parse_settings
-from recorders.parsing import read_toml
-from recorders.registry import available
-from replay.engine.replaying.estimator import Bound, specified
-from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
+from fuselog.pipeline.altering.changes import by_topic, is_of_topic, is_parameter
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import in_few_words, meanings, merge, parse_settings
+from fuselog.recorders.parsing import read_toml
+from fuselog.recorders.registry import available
+from fuselog.replay.engine.replaying.estimator import Bound, specified
+from fuselog.replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
 Settings = Mapping[str, Mapping[str, Any]]
 # Parameters of estimators that have an option of their own.

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.altering.changes import is_of_topic
-from pipeline.output.charts import Axis, Chart, Panel, band, curve
-from pipeline.output.results import (
+from fuselog.pipeline.altering.changes import is_of_topic
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve
+from fuselog.pipeline.output.results import (
     MetricValue,
     Outcome,
     Result,
@@ -19,20 +19,20 @@ from pipeline.output.results import (
     split_metric,
     write_outcome,
 )
-from pipeline.output.words import is_error, label_of
-from pipeline.runs.campaigns import judge_all
-from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.ensemble import Pass, Progress, no_progress
-from pipeline.runs.executors import PoolFactory
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.inputs import load_scenario
-from recorders.errors import BadInput
-from recorders.parameters import describe, in_few_words, merge, nested, parse_settings, unit_of
-from recorders.recording import Recorder
-from recorders.registry import load
-from replay.engine.replaying.estimator import configure
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import metric_key
+from fuselog.pipeline.output.words import is_error, label_of
+from fuselog.pipeline.runs.campaigns import judge_all
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.ensemble import Pass, Progress, no_progress
+from fuselog.pipeline.runs.executors import PoolFactory
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import describe, in_few_words, merge, nested, parse_settings, unit_of
+from fuselog.recorders.recording import Recorder
+from fuselog.recorders.registry import load
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import metric_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.sensing.terms import Terms
-from replay.distributions import chi2
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.output.outputs import check_outputs
-from pipeline.output.terminal import print_json, print_table, say, status
-from pipeline.sensing.foreign_files import explained
-from pipeline.sensing.noise import noise
-from recorders.errors import BadInput
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.terminal import print_json, print_table, say, status
+from fuselog.pipeline.sensing.foreign_files import explained
+from fuselog.pipeline.sensing.noise import noise
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def show_noise(

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from pipeline.sensing.likelihood import Likelihood, Samples, likelihood
-from pipeline.sensing.terms import Terms
-from replay.distributions import chi2
+from fuselog.pipeline.sensing.likelihood import Likelihood, Samples, likelihood
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 Objective = Callable[[Floats], float]

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.sensing.terms import Terms
-from replay.engine.compiling.compile import compiled
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.replay.engine.compiling.compile import compiled
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.api.planning import Log, sources_of
-from pipeline.sensing import preparing
-from pipeline.sensing.allan import allan_deviation, degrees_of_freedom, interval, multiples_of
-from pipeline.sensing.fitting import choose, profile_interval, walk_below
-from pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
-from pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
-from pipeline.sensing.units import parse_sheet, unit_of
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from recorders.log import Stream
+from fuselog.pipeline.api.planning import Log, sources_of
+from fuselog.pipeline.sensing import preparing
+from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom, interval, multiples_of
+from fuselog.pipeline.sensing.fitting import choose, profile_interval, walk_below
+from fuselog.pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
+from fuselog.pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
+from fuselog.pipeline.sensing.units import parse_sheet, unit_of
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.log import Stream
 
 Floats = NDArray[np.float64]
 _DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times

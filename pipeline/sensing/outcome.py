@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.api.api import ResultFolder
-from pipeline.output.charts import Axis, Chart, Panel, band, curve
-from pipeline.output.outputs import check_folder
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.sensing.allan import Curve, interval
-from pipeline.sensing.exports import FILES, Densities, Density
-from pipeline.sensing.fitting import Fit
-from pipeline.sensing.units import unit_of
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve
+from fuselog.pipeline.output.outputs import check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.sensing.allan import Curve, interval
+from fuselog.pipeline.sensing.exports import FILES, Densities, Density
+from fuselog.pipeline.sensing.fitting import Fit
+from fuselog.pipeline.sensing.units import unit_of
 
 Floats = NDArray[np.float64]
 MISFIT = "misfit: "  # what a sentence has that whoever uses the numbers reads first
@@ -173,9 +173,9 @@ class SensorNoise:
 
     def draw(self, rrd: Path) -> None:
         """Write the curves to the file `rrd` for the viewer."""
-        from replay.timeline.drawing.canvas import MUTED, PALETTE
-        from replay.timeline.drawing.curves import CurvePanel, save_curves
-        from replay.timeline.drawing.plane import Stroke
+        from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE
+        from fuselog.replay.timeline.drawing.curves import CurvePanel, save_curves
+        from fuselog.replay.timeline.drawing.plane import Stroke
 
         interval_stroke = Stroke(MUTED, 1.0)
         strokes = {

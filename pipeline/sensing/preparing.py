@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from pipeline.sensing.fitting import fit
-from pipeline.sensing.likelihood import Samples, likelihood, residuals
-from pipeline.sensing.units import unit_of
-from recorders.errors import BadInput
-from recorders.log import Stream
+from fuselog.pipeline.sensing.fitting import fit
+from fuselog.pipeline.sensing.likelihood import Samples, likelihood, residuals
+from fuselog.pipeline.sensing.units import unit_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

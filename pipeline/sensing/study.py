@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 from scipy.signal import lfilter
 
-from pipeline.output.charts import coverage
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.sensing.allan import interval
-from pipeline.sensing.noise import noise
-from pipeline.sensing.terms import Terms
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.parameters import Parameters
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.output.charts import coverage
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.sensing.allan import interval
+from fuselog.pipeline.sensing.noise import noise
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
 TURN = "/wheels.turn_radps"
@@ -42,7 +42,7 @@ class NoiseOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: NoiseOptions = setting.options
     rows: list[dict[str, Any]] = []
     for block, first in enumerate(options.seeds):

@@ -3,7 +3,7 @@
 import math
 import re
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 # How a field's name ends, and its unit.
 SUFFIXES = {

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.log.streams import concatenate
-from recorders.models.orientation import compose
-from replay.engine.streams.sources import MemorySource
-from replay.engine.vectors.tangent import manifold_blocks
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.models.orientation import compose
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.tangent import manifold_blocks
 
 SHIFT_NS = 1000
 START_SIGMAS = 0.1

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.output.outputs import check_outputs
-from pipeline.output.terminal import print_json, print_table, say, status
-from pipeline.runs.settings import settings_of_estimators, split_texts
-from pipeline.stressing.changes import CHANGES
-from pipeline.stressing.stressing import stress
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.terminal import print_json, print_table, say, status
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.stressing.changes import CHANGES
+from fuselog.pipeline.stressing.stressing import stress
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 
 COLUMNS = {
     "verdict": "verdict",

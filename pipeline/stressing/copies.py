@@ -8,25 +8,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.ensemble import parameters_of, replay_blocks, stated_of
-from pipeline.stressing.changes import (
+from fuselog.pipeline.runs.ensemble import parameters_of, replay_blocks, stated_of
+from fuselog.pipeline.stressing.changes import (
     DROPPED,
     SHIFT_NS,
     parameters_changed,
 )
-from pipeline.stressing.partings import Parting, partings
-from pipeline.stressing.verdicts import MARGIN, Tried
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream, schemas
-from recorders.parameters import merge
-from replay.engine.replaying.estimator import Bound, bind
-from replay.engine.replaying.late import Late
-from replay.engine.replaying.replaying import Report, collect
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource
-from replay.judging.judge import Judge
+from fuselog.pipeline.stressing.partings import Parting, partings
+from fuselog.pipeline.stressing.verdicts import MARGIN, Tried
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream, schemas
+from fuselog.recorders.parameters import merge
+from fuselog.replay.engine.replaying.estimator import Bound, bind
+from fuselog.replay.engine.replaying.late import Late
+from fuselog.replay.engine.replaying.replaying import Report, collect
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.judge import Judge
 
 
 class How(NamedTuple):

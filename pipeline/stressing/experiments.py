@@ -7,22 +7,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.altering.sources import alter
-from pipeline.output.alarms import Stressing
-from pipeline.output.claims import Claim, decide
-from pipeline.output.results import Result
-from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import WorkerPool, pool_for
-from pipeline.runs.experiment import Experiment, Setting, Study, numbers_of
-from pipeline.runs.initial_states import order_of
-from pipeline.runs.runner import Runner
-from pipeline.stressing.copies import How
-from pipeline.stressing.stressing import TOGETHER, stress_runs
-from pipeline.stressing.sums import StressSums
-from recorders.errors import BadInput
-from recorders.parameters import build
-from recorders.registry import load
-from replay.foreign.naming import allowed
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.output.alarms import Stressing
+from fuselog.pipeline.output.claims import Claim, decide
+from fuselog.pipeline.output.results import Result
+from fuselog.pipeline.runs.ensemble import Progress, no_progress
+from fuselog.pipeline.runs.executors import WorkerPool, pool_for
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study, numbers_of
+from fuselog.pipeline.runs.initial_states import order_of
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.stressing.copies import How
+from fuselog.pipeline.stressing.stressing import TOGETHER, stress_runs
+from fuselog.pipeline.stressing.sums import StressSums
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
+from fuselog.replay.foreign.naming import allowed
 
 
 class _Part(NamedTuple):

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from replay.distributions import chi2
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.engine.vectors.tangent import difference, tangent_components
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.tangent import difference, tangent_components
 
 Floats = NDArray[np.float64]
 PARTED = 10.0  # copies part where A is that many times its first value

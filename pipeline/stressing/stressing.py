@@ -9,23 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.altering.sources import split_settings
-from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.runs.ensemble import RUNS_AT_ONCE, Settings
-from pipeline.runs.settings import with_settings
-from pipeline.stressing.changes import (
+from fuselog.pipeline.altering.sources import split_settings
+from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Settings
+from fuselog.pipeline.runs.settings import with_settings
+from fuselog.pipeline.stressing.changes import (
     CHANGES,
     PARAMETERS,
     Inputs,
     inputs_of,
 )
-from pipeline.stressing.copies import How, compared, replayed, with_parameters
-from pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
-from recorders.errors import BadInput, without_warnings_of_numbers
-from recorders.log import RunMetadata
-from replay.engine.replaying.estimator import Bound, Recursive, bind
-from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
-from replay.foreign.naming import allowed
+from fuselog.pipeline.stressing.copies import How, compared, replayed, with_parameters
+from fuselog.pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.log import RunMetadata
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
+from fuselog.replay.foreign.naming import allowed
 
 MOST_HALVED, MOST_REPLAYS = 3, 12
 # Runs that are stressed together: with their copies about as many as a replay holds at once.
@@ -59,7 +59,7 @@ def stress(
     Raises BadInput where an estimator cannot replay a run, or fails in all of them before it has an
     estimate.
 
-    >>> from pipeline.api.api import record
+    >>> from fuselog.pipeline.api.api import record
     >>> stress(record("landmarks", duration_s=5.0), "ekf").stressed[0].worst
     'sensitive'
     """

@@ -4,9 +4,9 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from pipeline.output.alarms import Stressing, Verdict
-from pipeline.output.words import count
-from pipeline.stressing.verdicts import ORDER, Stressed
+from fuselog.pipeline.output.alarms import Stressing, Verdict
+from fuselog.pipeline.output.words import count
+from fuselog.pipeline.stressing.verdicts import ORDER, Stressed
 
 # Of so many runs one may be worse by chance: a lost message moves one of 1000 farther than it should.
 RARE_RUNS = 100

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.output.alarms import Verdict
-from pipeline.output.outputs import TIMELINE, check_files
-from pipeline.stressing.changes import CHANGES, DROPPED
-from pipeline.stressing.partings import Parting, Undetermined, undetermined
-from recorders.log import Stream
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
-from replay.judging.judge import Judge
+from fuselog.pipeline.output.alarms import Verdict
+from fuselog.pipeline.output.outputs import TIMELINE, check_files
+from fuselog.pipeline.stressing.changes import CHANGES, DROPPED
+from fuselog.pipeline.stressing.partings import Parting, Undetermined, undetermined
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.judge import Judge
 
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
 HARMLESS = 0.1  # A below this
@@ -311,8 +311,8 @@ class Stress:
 
         Raises BadInput where the file cannot be written.
         """
-        from replay.timeline.fanning import Fan  # which takes long to import
-        from replay.timeline.show import Drawing
+        from fuselog.replay.timeline.fanning import Fan  # which takes long to import
+        from fuselog.replay.timeline.show import Drawing
 
         check_files([(Path(save), TIMELINE)], {})
         source, outputs, fans = self.stressed[0].source, dict[str, Stream](), list[Fan]()

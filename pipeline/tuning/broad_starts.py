@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import Clock
-from replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive
-from replay.engine.replaying.replaying import replay
-from replay.engine.streams.blocks import Ragged, gather, side_by_side
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.sources import MemorySource
+from fuselog.recorders.log import Clock
+from fuselog.replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive
+from fuselog.replay.engine.replaying.replaying import replay
+from fuselog.replay.engine.streams.blocks import Ragged, gather, side_by_side
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated; parts of one number
 

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.logs.folders import logs_in
-from pipeline.output.outputs import check_outputs
-from pipeline.output.results import plain
-from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
-from pipeline.runs.settings import settings_of_estimators, split_texts
-from pipeline.tuning.objective import Best, By
-from pipeline.tuning.outcome import SETTINGS, Tuning
-from pipeline.tuning.tuning import tune
-from recorders.errors import BadInput
-from recorders.log import open_log
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.logs.folders import logs_in
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.results import plain
+from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.tuning.objective import Best, By
+from fuselog.pipeline.tuning.outcome import SETTINGS, Tuning
+from fuselog.pipeline.tuning.tuning import tune
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 
 
 def tune_logs(

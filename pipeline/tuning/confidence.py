@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pipeline.tuning.search import UNIT, Coordinates, Cost, Free
+from fuselog.pipeline.tuning.search import UNIT, Coordinates, Cost, Free
 
 Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7

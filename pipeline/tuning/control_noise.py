@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.altering import alterations as alter
-from pipeline.altering.entries import entries_of
-from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering.entries import entries_of
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 PAIRS = 8  # of copies with opposite noise

@@ -7,16 +7,16 @@ or what the log states; others, held out, are replayed with either values.
 from collections.abc import Collection
 from dataclasses import replace
 
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summarise
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.tuning.outcome import START, TUNED
-from pipeline.tuning.tuning import tune
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summarise
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.tuning.outcome import START, TUNED
+from fuselog.pipeline.tuning.tuning import tune
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
@@ -34,7 +34,7 @@ class HeldOutOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: HeldOutOptions = setting.options
     if not (options.free and options.tuned_by and options.held_out and len(experiment.estimators) == 1):
         raise BadInput(

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.tuning.objective import Objective, Run, innovations_in
-from pipeline.tuning.search import Free
-from recorders.log import Stream
-from replay.judging.consistency.whiteness import whitened
+from fuselog.pipeline.tuning.objective import Objective, Run, innovations_in
+from fuselog.pipeline.tuning.search import Free
+from fuselog.recorders.log import Stream
+from fuselog.replay.judging.consistency.whiteness import whitened
 
 Floats = NDArray[np.float64]
 STEP = 0.01  # of the differences, in useful units

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 BEYOND_NS = 1_000_000_000  # that what drives goes on, so that the last measurement is between two of it
 

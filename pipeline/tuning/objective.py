@@ -15,8 +15,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runs.executors import WorkerPool, threads
-from pipeline.tuning.broad_starts import (
+from fuselog.pipeline.runs.executors import WorkerPool, threads
+from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
     broad_starts,
@@ -25,19 +25,19 @@ from pipeline.tuning.broad_starts import (
     part_count,
     with_find,
 )
-from pipeline.tuning.control_noise import disturbed
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, schemas, topics_of
-from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive, bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.judging.consistency.whiteness import whitened
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import Sums, plus
+from fuselog.pipeline.tuning.control_noise import disturbed
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, schemas, topics_of
+from fuselog.recorders.parameters import merge, nested
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive, bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.judging.consistency.whiteness import whitened
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import Sums, plus
 
 Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]
@@ -333,7 +333,7 @@ class Objective:
         self.begin(start)
 
     def correct(self, values: Floats) -> None:
-        """Correct the cost for the noise of the controls, see `pipeline.tuning.control_noise`.
+        """Correct the cost for the noise of the controls, see `fuselog.pipeline.tuning.control_noise`.
 
         Of noises that are searched for, the correction keeps the values (k,): else it would take that
         noise out of the likelihood that they are found by.

@@ -13,21 +13,21 @@ import pandas as pd
 import tomli_w
 from numpy.typing import NDArray
 
-from pipeline.altering.sources import setting_of
-from pipeline.api.api import ResultFolder
-from pipeline.api.replays import Replay, replay
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.outputs import check_folder
-from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
-from pipeline.output.summary import summarise, summary_table
-from pipeline.output.words import label_of
-from pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
-from pipeline.tuning.objective import Objective, innovations_in
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.judging.consistency.whiteness import whitened, whiteness
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.metrics.measuring import metric_key
-from replay.judging.tables import joined
+from fuselog.pipeline.altering.sources import setting_of
+from fuselog.pipeline.api.api import ResultFolder
+from fuselog.pipeline.api.replays import Replay, replay
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.outputs import check_folder
+from fuselog.pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from fuselog.pipeline.output.summary import summarise, summary_table
+from fuselog.pipeline.output.words import label_of
+from fuselog.pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
+from fuselog.pipeline.tuning.objective import Objective, innovations_in
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.metrics.measuring import metric_key
+from fuselog.replay.judging.tables import joined
 
 Floats = NDArray[np.float64]
 Source = LogSource | MemorySource

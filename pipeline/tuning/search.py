@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 # Points (n, k) of k values -> what each costs (n,); infinity where it cannot be used.

@@ -12,15 +12,15 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.tuning.tuning import tune
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.tuning.tuning import tune
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
 
 COVERAGE = 0.95
 
@@ -38,7 +38,7 @@ class TuningOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: TuningOptions = setting.options
     if not options.true or len(experiment.estimators) != 1:
         raise BadInput(f"experiment '{experiment.title}': give one estimator, and [options.true]")

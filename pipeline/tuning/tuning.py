@@ -14,14 +14,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.altering.changes import is_of_topic
-from pipeline.altering.sources import split_settings
-from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.runs.executors import WorkerPool, pool_for
-from pipeline.tuning.confidence import QUANTILE, Confidence, SearchOutcome, confidence, unknown
-from pipeline.tuning.information import in_words, information, undetermined
-from pipeline.tuning.measured import until_last_measured
-from pipeline.tuning.objective import (
+from fuselog.pipeline.altering.changes import is_of_topic
+from fuselog.pipeline.altering.sources import split_settings
+from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.runs.executors import WorkerPool, pool_for
+from fuselog.pipeline.tuning.confidence import QUANTILE, Confidence, SearchOutcome, confidence, unknown
+from fuselog.pipeline.tuning.information import in_words, information, undetermined
+from fuselog.pipeline.tuning.measured import until_last_measured
+from fuselog.pipeline.tuning.objective import (
     CRITERIA,
     Best,
     By,
@@ -32,8 +32,8 @@ from pipeline.tuning.objective import (
     silent,
     with_values,
 )
-from pipeline.tuning.outcome import START, TUNED, Source, Tuning
-from pipeline.tuning.search import (
+from fuselog.pipeline.tuning.outcome import START, TUNED, Source, Tuning
+from fuselog.pipeline.tuning.search import (
     CURVATURE_STEP,
     MOVES,
     Coordinates,
@@ -44,12 +44,12 @@ from pipeline.tuning.search import (
     least_of_grid,
     scanned,
 )
-from recorders.errors import BadInput, choices, without_warnings_of_numbers
-from recorders.parameters import bounds_of, field_of, merge
-from replay.engine.replaying.estimator import Bound, Recursive, bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.channels import stated
-from replay.foreign.naming import allowed
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.parameters import bounds_of, field_of, merge
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
@@ -106,7 +106,7 @@ def tune(
     Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
     Raises BadInput where there is nothing to search, or no log can be replayed at the start.
 
-    >>> from pipeline.api.api import record
+    >>> from fuselog.pipeline.api.api import record
     >>> log = record("landmarks", duration_s=20.0)
     >>> found = tune(log, "ekf", "sigma_range_m", set={"sigma_range_m": 0.5})
     >>> found.parameters["value"].round(1).tolist()

@@ -16,11 +16,11 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane
-from recorders.parameters import Parameters
-from recorders.recording import Importer, Recording
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Importer, Recording
 
 Floats = NDArray[np.float64]
 KNOT_MPS = 1852.0 / 3600.0

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.common_streams import truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.planes import in_frame
-from recorders.models.states import state_metadata
-from recorders.parameters import Parameters
-from recorders.parsing import parse_json
-from recorders.recording import Importer, Recording
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.planes import in_frame
+from fuselog.recorders.models.states import state_metadata
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.parsing import parse_json
+from fuselog.recorders.recording import Importer, Recording
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -18,11 +18,11 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, field_validator
 
-from recorders.errors import BadInput
-from recorders.models.scores import Matcher, score_stream
-from recorders.parameters import Parameters, build
-from recorders.parsing import read_toml
-from recorders.recording import Importer, Recording, simulation_stamps_ns
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.scores import Matcher, score_stream
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.recorders.parsing import read_toml
+from fuselog.recorders.recording import Importer, Recording, simulation_stamps_ns
 
 
 class Matchers(Parameters):

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from recorders.common_streams import truth_stream
-from recorders.errors import BadInput
-from recorders.extras import extra
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.orientation import require_unit
-from recorders.models.states import ORIENTATION
-from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording, simulation_stamps_ns
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.extras import extra
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.orientation import require_unit
+from fuselog.recorders.models.states import ORIENTATION
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording, simulation_stamps_ns
 
 # Dataset and width; None for a plain column.
 DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement": None}

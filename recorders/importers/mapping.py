@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput, choices
-from recorders.importers.units import conversion
-from recorders.log import Schema, schemas
-from recorders.models.orientation import compose
-from recorders.parameters import Parameters
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.importers.units import conversion
+from fuselog.recorders.log import Schema, schemas
+from fuselog.recorders.models.orientation import compose
+from fuselog.recorders.parameters import Parameters
 
 Floats = NDArray[np.float64]
 Value = TypeVar("Value")

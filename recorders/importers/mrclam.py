@@ -13,12 +13,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
-from recorders.common_streams import prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.importers.stamps import to_ns
-from recorders.log import Stream, make_stream, schemas
-from recorders.parameters import Parameters
-from recorders.recording import Importer, Recording
+from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import to_ns
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Importer, Recording
 
 POSE = ("x_m", "y_m", "heading_rad")
 

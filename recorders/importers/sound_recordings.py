@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 from scipy.io import wavfile
 
-from recorders.arrivals import HeardSound, difference_stream, microphone_stream
-from recorders.common_streams import truth_stream
-from recorders.errors import BadInput
-from recorders.importers.stamps import to_ns
-from recorders.log import Stream
-from recorders.models.arrivals import Weighting
-from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
+from fuselog.recorders.arrivals import HeardSound, difference_stream, microphone_stream
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import to_ns
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.arrivals import Weighting
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
 
 Floats = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 Stamps = NDArray[np.int64]
 # A stamp that is missing.

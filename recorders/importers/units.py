@@ -8,7 +8,7 @@ import re
 from math import pi, prod
 from typing import NamedTuple
 
-from recorders.errors import BadInput, choices
+from fuselog.recorders.errors import BadInput, choices
 
 
 class Unit(NamedTuple):

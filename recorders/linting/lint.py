@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 
-from recorders.errors import BadInput
-from recorders.linting import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.linting import (
     columns,
     covariances,
     forces,
@@ -16,12 +16,12 @@ from recorders.linting import (
     places,
     stamps,
 )
-from recorders.log import Log, Stream, read_blocks, read_empty, read_span
-from recorders.log.impossible import main_span, main_span_of, possible
-from recorders.log.streams import concatenate
-from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
-from recorders.plausibility.finding import Finding
-from recorders.plausibility.stamps import losses
+from fuselog.recorders.log import Log, Stream, read_blocks, read_empty, read_span
+from fuselog.recorders.log.impossible import main_span, main_span_of, possible
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.plausibility.stamps import losses
 
 Check = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]
 # Of all messages; the other checks look at what is possible.

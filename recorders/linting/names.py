@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator, Mapping
 
-from recorders.log import Stream, schemas
-from recorders.plausibility.finding import Finding
-from recorders.plausibility.stamps import REGULARS
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.plausibility.stamps import REGULARS
 
 SUFFIX = re.compile(r"_(ned|frd)$", re.IGNORECASE)
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.plausibility.body import bodies
-from recorders.plausibility.finding import Finding
-from recorders.plausibility.motion import Motion, Slope
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.plausibility.body import bodies
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.plausibility.motion import Motion, Slope
 
 GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
 STEADY_M = 5.0

@@ -13,8 +13,8 @@ from google.protobuf import descriptor_pb2
 from google.protobuf.message import Message
 from mcap.opcode import Opcode
 
-from recorders.log.container.chunks import RECORD_HEAD, Span
-from recorders.log.container.packing import INDEX_ENTRY, Chunk
+from fuselog.recorders.log.container.chunks import RECORD_HEAD, Span
+from fuselog.recorders.log.container.packing import INDEX_ENTRY, Chunk
 
 # The key of a channel's metadata that names the stream.
 COMPANION_OF = "companion_of"

@@ -13,13 +13,13 @@ from google.protobuf.message import DecodeError, Message
 from mcap import records
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log.container.chunks import Contents
-from recorders.log.layout import RECORD_HEAD, Layout, columns_of, layout_of, windows
-from recorders.log.loops import HEAD_BYTES
-from recorders.log.opening import Log
-from recorders.log.schemas import PROTOBUF_TYPES, SCHEMAS, Field, message_class, schema_of
-from recorders.log.streams import Stream, empty_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.container.chunks import Contents
+from fuselog.recorders.log.layout import RECORD_HEAD, Layout, columns_of, layout_of, windows
+from fuselog.recorders.log.loops import HEAD_BYTES
+from fuselog.recorders.log.opening import Log
+from fuselog.recorders.log.schemas import PROTOBUF_TYPES, SCHEMAS, Field, message_class, schema_of
+from fuselog.recorders.log.streams import Stream, empty_stream
 
 _Decoded = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray]]
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log.schemas import BODY_POINT, LANDMARK
-from recorders.log.streams import Stream
+from fuselog.recorders.log.schemas import BODY_POINT, LANDMARK
+from fuselog.recorders.log.streams import Stream
 
 # By the unit that ends a name: far beyond what is measured, wrongly scaled integers included.
 LIMITS = {

@@ -13,9 +13,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from recorders.log.loops import HEAD_BYTES, Pattern, agree, pattern_of
-from recorders.log.schemas import Field, Schema
-from recorders.log.streams import Stream
+from fuselog.recorders.log.loops import HEAD_BYTES, Pattern, agree, pattern_of
+from fuselog.recorders.log.schemas import Field, Schema
+from fuselog.recorders.log.streams import Stream
 
 # No protobuf field can have a name with a space.
 RECORD_HEAD = np.dtype(

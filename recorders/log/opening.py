@@ -7,11 +7,11 @@ from pathlib import Path
 
 from mcap import records
 
-from recorders.errors import BadInput
-from recorders.log.companions import COMPANION_OF
-from recorders.log.container.reading import Container, open_container
-from recorders.log.run import RECORD_NAME, RunMetadata
-from recorders.log.schemas import Schema
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.companions import COMPANION_OF
+from fuselog.recorders.log.container.reading import Container, open_container
+from fuselog.recorders.log.run import RECORD_NAME, RunMetadata
+from fuselog.recorders.log.schemas import Schema
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
     Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
 
-    >>> from recorders.log import write_log
-    >>> from recorders.recording import record_run
+    >>> from fuselog.recorders.log import write_log
+    >>> from fuselog.recorders.recording import record_run
     >>> recording, run = record_run("landmarks", {"duration_s": 2.0}, seed=7)
     >>> write_log("run.mcap", recording.streams, run)
     >>> log = open_log("run.mcap")

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from recorders.errors import BadInput
-from recorders.log.schemas import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.schemas import (
     COURSE_FIX,
     GAUSSIAN_ESTIMATE,
     GEODETIC_FIX,
@@ -19,7 +19,7 @@ from recorders.log.schemas import (
     TRUTH_STATE,
     VELOCITY_FIX,
 )
-from recorders.log.streams import Stream
+from fuselog.recorders.log.streams import Stream
 
 LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
     "origin_latitude_deg",

@@ -10,14 +10,14 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log.container.ahead import ahead
-from recorders.log.container.chunks import Contents, Damaged, Span, open_region
-from recorders.log.container.reading import Region, read_bytes
-from recorders.log.container.sealed import PUBLISH_SPANS, noted_span
-from recorders.log.decoding import Decoder
-from recorders.log.opening import Log
-from recorders.log.streams import Clock, Stream, check_stream, concatenate
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.container.ahead import ahead
+from fuselog.recorders.log.container.chunks import Contents, Damaged, Span, open_region
+from fuselog.recorders.log.container.reading import Region, read_bytes
+from fuselog.recorders.log.container.sealed import PUBLISH_SPANS, noted_span
+from fuselog.recorders.log.decoding import Decoder
+from fuselog.recorders.log.opening import Log
+from fuselog.recorders.log.streams import Clock, Stream, check_stream, concatenate
 
 # Beyond every stamp that MCAP can state.
 _ALWAYS = Span(-1, 1 << 64)
@@ -47,7 +47,7 @@ def read_streams(
 ) -> dict[str, Stream]:
     """Read topics whole, each in time order; see `read_blocks`. A topic without messages is empty.
 
-    >>> from recorders.log import make_stream, open_log, schemas, write_log
+    >>> from fuselog.recorders.log import make_stream, open_log, schemas, write_log
     >>> seen = make_stream("/range", schemas.RANGE, [20, 0, 10], target_id=[1, 1, 1], range_m=[5, 3, 4])
     >>> write_log("run.mcap", [seen])
     >>> read_streams(open_log("run.mcap"), ["/range"], start_ns=10)["/range"]["range_m"].tolist()

@@ -6,8 +6,8 @@ from textwrap import shorten
 from types import NoneType
 from typing import Any
 
-from recorders.errors import BadInput, check_format
-from recorders.parsing import parse_json
+from fuselog.recorders.errors import BadInput, check_format
+from fuselog.recorders.parsing import parse_json
 
 RECORD_NAME = "fuselog.run"
 # Raised when a log is written in a way that this reader would misread; a log without it is of the first.

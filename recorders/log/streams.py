@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput, choices
-from recorders.log.schemas import NUMPY_TYPES, Kind, Schema
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log.schemas import NUMPY_TYPES, Kind, Schema
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,7 @@ class Stream:
         position: (n,), the place in the file, for a stable order among equal stamps.
         metadata: what the channel states, as text.
 
-    >>> from recorders.log import make_stream, schemas
+    >>> from fuselog.recorders.log import make_stream, schemas
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 2, 1], range_m=[5, 3, 4])
     >>> len(seen), seen["range_m"].tolist()
     (3, [5.0, 3.0, 4.0])
@@ -149,10 +149,10 @@ def make_stream(
     Returns:
         The stream, with its messages in the order given.
 
-    >>> from recorders.log import schemas
+    >>> from fuselog.recorders.log import schemas
     >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])
     Traceback (most recent call last):
-    recorders.errors.BadInput: topic /gyro: field range_m has 1 values for 2 messages
+    fuselog.recorders.errors.BadInput: topic /gyro: field range_m has 1 values for 2 messages
     """
     clock = publish_time_ns if sensor_time_ns is None else sensor_time_ns
     given = {"sensor_time_ns": clock, **columns}

@@ -7,20 +7,20 @@ from typing import Any, Self
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log.companions import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.companions import (
     COMPANION_OF,
     Companion,
     Numbered,
     chunks_of_companions,
     descriptor_set,
 )
-from recorders.log.container.packing import chunks_of
-from recorders.log.container.writing import ContainerWriter
-from recorders.log.layout import layout_of
-from recorders.log.run import RECORD_NAME, RunMetadata
-from recorders.log.schemas import Schema
-from recorders.log.streams import Stream, check_stream
+from fuselog.recorders.log.container.packing import chunks_of
+from fuselog.recorders.log.container.writing import ContainerWriter
+from fuselog.recorders.log.layout import layout_of
+from fuselog.recorders.log.run import RECORD_NAME, RunMetadata
+from fuselog.recorders.log.schemas import Schema
+from fuselog.recorders.log.streams import Stream, check_stream
 
 Companions = Callable[[Stream], Iterable[Companion]]
 
@@ -179,7 +179,7 @@ def write_log(
 ) -> None:
     """Write one log from streams that are all at hand; see `LogWriter`.
 
-    >>> from recorders.log import make_stream, open_log, read_streams, schemas
+    >>> from fuselog.recorders.log import make_stream, open_log, read_streams, schemas
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10], target_id=[1, 2], range_m=[5, 3])
     >>> write_log("run.mcap", [seen])
     >>> read_streams(open_log("run.mcap"), ["/range"])["/range"]["range_m"].tolist()

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.planar import Component, Components, wrap_angle
+from fuselog.recorders.models.planar import Component, Components, wrap_angle
 
 # The shooter's position and the bullet's direction in a state.
 SHOT_COMPONENTS = ("x_m", "y_m", "trajectory_rad")

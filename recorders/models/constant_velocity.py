@@ -3,7 +3,7 @@
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2.
 """
 
-from recorders.models.planar import Component
+from fuselog.recorders.models.planar import Component
 
 
 def noise_moments(

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
 
 _MOST_NEWTON_STEPS = 50
 

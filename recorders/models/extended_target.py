@@ -5,7 +5,7 @@ section VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multipl
 2012. Target = (half_x_m, half_y_m, x_m, y_m): half lengths of the sides, and the centre.
 """
 
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 

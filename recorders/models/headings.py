@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recorders.models.planar import Component
+from fuselog.recorders.models.planar import Component
 
 Correlation = Annotated[float, Field(gt=-1, lt=1)]
 

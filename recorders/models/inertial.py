@@ -7,13 +7,13 @@ Navigation Systems, 2nd edition, 2013, chapters 2 and 5.
 
 import numpy as np
 
-from recorders.models.geodesy import (
+from fuselog.recorders.models.geodesy import (
     ECCENTRICITY_SQUARED,
     FLATTENING,
     SEMI_MAJOR_M,
     SEMI_MINOR_M,
 )
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 EARTH_RATE_RADPS = 7.292115e-5
 EARTH_CONSTANT_M3PS2 = 3.986004418e14

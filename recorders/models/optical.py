@@ -7,7 +7,7 @@ array whose first axis is the component; components are numbers or arrays and br
 
 import numpy as np
 
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 Triple = tuple[Component, Component, Component]
 ANGLES = ("yaw", "pitch", "roll")

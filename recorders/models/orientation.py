@@ -7,7 +7,7 @@ section 5.3. Quaternions are (w, x, y, z); all arrays keep their components on t
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 # Basis elements multiply as e_j e_k = SIGNS[j, k] e_(j xor k). The complex numbers are the first two.
 SIGNS = np.array(

@@ -4,7 +4,7 @@ Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filt
 (29) and (30); state = partial pressures (a, b), for which the paper has no unit.
 """
 
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 CONSUMED = -0.32
 PRODUCED = 0.16

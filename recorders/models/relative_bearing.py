@@ -6,7 +6,7 @@ anticlockwise of the second.
 
 import numpy as np
 
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 
 def relative_bearing(position: Components, first: Components, second: Components) -> Component:

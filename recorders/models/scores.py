@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.parameters import Parameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
 
 TOPIC = "/scores"
 # Part of a file's name, of a topic's and of a list.

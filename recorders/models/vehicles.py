@@ -6,7 +6,7 @@ the symmetric measurement equation filter", 2016, (12)-(14). Component-first: sc
 
 import numpy as np
 
-from recorders.models.planar import Component, Components
+from fuselog.recorders.models.planar import Component, Components
 
 
 def turn(

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.models.geodesy import local_metres
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.geodesy import local_metres
 
 Floats = NDArray[np.float64]
 FEWEST = 20  # messages, below which nothing is said of a topic

@@ -5,12 +5,12 @@ A check of motion takes a body's topics compared in pairs, one of stamps a topic
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from recorders.log import Stream
-from recorders.log.streams import concatenate
-from recorders.plausibility import speeds, stamps, turns
-from recorders.plausibility.body import bodies
-from recorders.plausibility.finding import Finding
-from recorders.plausibility.motion import Motion
+from fuselog.recorders.log import Stream
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.plausibility import speeds, stamps, turns
+from fuselog.recorders.plausibility.body import bodies
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.plausibility.motion import Motion
 
 MOST = 1 << 19  # messages that are looked at: the first of a log, however long it is
 BLOCK = 1 << 16

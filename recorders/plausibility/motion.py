@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.orientation import heading
-from recorders.models.planar import wrap_angle
-from recorders.plausibility.body import Body, Floats, Series
-from recorders.plausibility.timing import Timing, timing
-from recorders.plausibility.windows import (
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.plausibility.body import Body, Floats, Series
+from fuselog.recorders.plausibility.timing import Timing, timing
+from fuselog.recorders.plausibility.windows import (
     FEWEST,
     Windows,
     chords,

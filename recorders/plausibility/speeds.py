@@ -5,10 +5,10 @@ from itertools import chain
 
 import numpy as np
 
-from recorders.plausibility.body import Fixes, Floats, Series
-from recorders.plausibility.finding import Finding, digits
-from recorders.plausibility.motion import Motion
-from recorders.plausibility.windows import JUMP, jumps, travelled
+from fuselog.recorders.plausibility.body import Fixes, Floats, Series
+from fuselog.recorders.plausibility.finding import Finding, digits
+from fuselog.recorders.plausibility.motion import Motion
+from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
 UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from recorders.common_streams import fix_stream, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.acoustic import (
+from fuselog.recorders.common_streams import fix_stream, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.acoustic import (
     SHOT_COMPONENTS,
     Medium,
     Noise,
@@ -21,9 +21,9 @@ from recorders.models.acoustic import (
     sensor_components,
     stated_metadata,
 )
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Array = NDArray[np.float64]
 Place = tuple[float, float]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeInt, PositiveFloat
 
-from recorders.models.scores import Matcher, score_stream
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.models.scores import Matcher, score_stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 FAILURE = -1.0

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.common_streams import truth_stream
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.planar import drive
-from recorders.models.states import PLANE_MOTION
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.planar import drive
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Probability = Annotated[float, Field(gt=0, le=1)]

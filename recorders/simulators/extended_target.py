@@ -9,11 +9,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.common_streams import prior_stream, stated_numbers, truth_stream
-from recorders.log import make_stream, schemas
-from recorders.models.extended_target import surface_point
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.extended_target import surface_point
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = ("half_x_m", "half_y_m", "x_m", "y_m")
 Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
-from recorders.common_streams import prior_stream, truth_stream
-from recorders.log import make_stream, schemas
-from recorders.models.headings import Correlation, equal_sigmas, turn_together
-from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import prior_stream, truth_stream
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.headings import Correlation, equal_sigmas, turn_together
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.models.states import state_metadata
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 HEADINGS = ("heading1_rad", "heading2_rad")
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.common_streams import outage_stream, prior_stream, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.constant_velocity import noise_moments
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import outage_stream, prior_stream, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = ("x_m", "y_m", "vx_mps", "vy_mps")
 Probability = Annotated[float, Field(ge=0, le=1)]

@@ -11,24 +11,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.common_streams import (
+from fuselog.recorders.common_streams import (
     fix_stream,
     outage_stream,
     prior_stream,
     stated_numbers,
     truth_stream,
 )
-from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.models.geodesy import out_of_tangent_plane
-from recorders.models.planar import drive, range_bearing, wrap_angle
-from recorders.recording import (
+from fuselog.recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
+from fuselog.recorders.recording import (
     SIMULATION_EPOCH_NS,
     Recording,
     Simulator,
     named_generator,
     simulation_stamps_ns,
 )
-from recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
+from fuselog.recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
 SENSORS = {
     "range_bearing": schemas.RANGE_BEARING,

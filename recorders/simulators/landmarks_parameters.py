@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.parameters import Parameters
+from fuselog.recorders.parameters import Parameters
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 

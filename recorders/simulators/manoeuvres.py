@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
-from recorders.models.planar import drive
-from recorders.models.states import PLANE_MOTION
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.models.planar import drive
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Simulates optical sensors on aircraft: each has its own clock, and is turned by biases that drift.
 
 Sensors fly at known poses, straight or weaving, and see the targets in turn, each at times of its own.
-The frame is that of `recorders.models.optical`: y points up, and a sensor looks ahead, along its own z.
+The frame is that of `fuselog.recorders.models.optical`: y points up, and a sensor looks ahead, along its own z.
 All white noise that drives targets and biases is continuous, so that they are exact at any time.
 """
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
-from recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.optical import (
+from fuselog.recorders.common_streams import fix_stream, prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.optical import (
     SENSORS,
     TARGETS,
     azimuth_elevation,
@@ -25,9 +25,9 @@ from recorders.models.optical import (
     moving_target_components,
     rotate,
 )
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]

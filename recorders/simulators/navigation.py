@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from recorders.common_streams import outage_stream, prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.inertial import earth_rate, gravity
-from recorders.models.states import NAVIGATION
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
-from recorders.simulators.navigation_parameters import NavigationParameters, Span, Unit
+from fuselog.recorders.common_streams import outage_stream, prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.inertial import earth_rate, gravity
+from fuselog.recorders.models.states import NAVIGATION
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.simulators.navigation_parameters import NavigationParameters, Span, Unit
 
 Floats = NDArray[np.float64]
 

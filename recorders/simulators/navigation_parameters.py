@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.parameters import Parameters
+from fuselog.recorders.parameters import Parameters
 
 WayPoint = tuple[float, float, float]
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 from scipy.spatial.transform import Rotation
 
-from recorders.common_streams import fix_stream, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.optical import bias_components, line_of_sight, target_components
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import fix_stream, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.optical import bias_components, line_of_sight, target_components
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

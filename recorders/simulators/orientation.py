@@ -12,11 +12,11 @@ from typing import Self
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt, model_validator
 
-from recorders.log import Schema, make_stream, schemas
-from recorders.models.directional_noise import DirectionalNoise
-from recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS, compose
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.log import Schema, make_stream, schemas
+from fuselog.recorders.models.directional_noise import DirectionalNoise
+from fuselog.recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS, compose
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class AxisParameters(Parameters):

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.common_streams import prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.planes import in_frame
-from recorders.models.constant_velocity import noise_moments
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.planes import in_frame
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]

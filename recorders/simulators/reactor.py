@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.common_streams import prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.models.reactor import react, total_pressure
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.reactor import react, total_pressure
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = ("pressure_a", "pressure_b")
 Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]

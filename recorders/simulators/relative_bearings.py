@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.common_streams import truth_stream
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.models.planar import wrap_angle
-from recorders.models.relative_bearing import relative_bearing
-from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.models.relative_bearing import relative_bearing
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
 
 PAPER_LANDMARKS_M = np.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.0]])
 PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.common_streams import fix_stream, stated_numbers, truth_stream
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.acoustic import (
+from fuselog.recorders.common_streams import fix_stream, stated_numbers, truth_stream
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.acoustic import (
     SHOT_COMPONENTS,
     clear_side,
     hear,
@@ -23,10 +23,10 @@ from recorders.models.acoustic import (
     stated_metadata,
     trajectory_from_shockwave,
 )
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.planar import wrap_angle
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
-from recorders.simulators.acoustic import AcousticParameters, require_time_to_hear
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.simulators.acoustic import AcousticParameters, require_time_to_hear
 
 Floats = NDArray[np.float64]
 Probability = Annotated[float, Field(ge=0, le=1)]

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 from scipy import fft
 
-from recorders.arrivals import HeardSound, difference_stream, microphone_stream
-from recorders.common_streams import truth_stream
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.arrivals import HeardSound, difference_stream, microphone_stream
+from fuselog.recorders.common_streams import truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]

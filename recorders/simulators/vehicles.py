@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.common_streams import prior_stream, stated_numbers, truth_stream
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.planes import FRAME, body_of
-from recorders.models.geodesy import out_of_tangent_plane
-from recorders.models.states import PLANE_MOTION
-from recorders.models.vehicles import into_frame, turn
-from recorders.parameters import Parameters
-from recorders.recording import Recording, Simulator, simulation_stamps_ns
+from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.planes import FRAME, body_of
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.models.vehicles import into_frame, turn
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
-from recorders.models.directional_noise import sample_bingham
-from recorders.models.orientation import conjugate, left_matrix, require_unit, right_matrix
-from replay.distributions import bingham_kernels as kernels
-from replay.distributions.batches import flatten
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.directional_noise import sample_bingham
+from fuselog.recorders.models.orientation import conjugate, left_matrix, require_unit, right_matrix
+from fuselog.replay.distributions import bingham_kernels as kernels
+from fuselog.replay.distributions.batches import flatten
 
 
 class Bingham(NamedTuple):

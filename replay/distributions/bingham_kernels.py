@@ -17,9 +17,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.models.orientation import SIGNS
-from replay.distributions.gaussian_kernels import solve_in_place
-from replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.models.orientation import SIGNS
+from fuselog.replay.distributions.gaussian_kernels import solve_in_place
+from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 Vector = NDArray | tuple[float, ...]
 

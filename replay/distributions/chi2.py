@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 _ROUNDING = 2.0**-53
 _STEPS = 100  # of Newton's method; it takes 3 to 12

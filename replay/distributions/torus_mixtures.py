@@ -11,10 +11,10 @@ from scipy.optimize import minimize
 from scipy.special import i0e, i1e, log_softmax, logsumexp
 from threadpoolctl import threadpool_limits
 
-from recorders.errors import BadInput
-from recorders.extras import extra
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.extras import extra
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats
 
 Interaction = Literal["sine", "cosine"]
 

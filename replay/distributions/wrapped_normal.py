@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
-from recorders.models.planar import wrap_angle
-from replay.distributions import wrapped_normal_kernels as kernels
-from replay.distributions.batches import flatten
-from replay.distributions.wrapped_normal_kernels import Mixture
-from replay.engine.compiling.compile import compiled
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.distributions import wrapped_normal_kernels as kernels
+from fuselog.replay.distributions.batches import flatten
+from fuselog.replay.distributions.wrapped_normal_kernels import Mixture
+from fuselog.replay.engine.compiling.compile import compiled
 
 _product_mixture = compiled(kernels.product_mixture, allocates=False)
 

@@ -12,7 +12,7 @@ from hashlib import sha256
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Floats
 
 Words = NDArray[np.uint64]
 

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator
 
-from recorders.errors import BadInput
-from recorders.log import Topic
-from recorders.parameters import Parameters, Role, build, has_role, unit_of
-from recorders.parsing import parse_json
-from replay.engine.streams.channels import resolved
-from replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic
+from fuselog.recorders.parameters import Parameters, Role, build, has_role, unit_of
+from fuselog.recorders.parsing import parse_json
+from fuselog.replay.engine.streams.channels import resolved
+from fuselog.replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
 
 MOST_COMPONENTS = 1000  # of a state: its covariance has a million numbers
 

@@ -13,18 +13,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Schema, Topic, schemas
-from replay.engine.arrays import Floats, Integers
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
-from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.channels import given_or_stated, resolved
-from replay.engine.streams.failures import Failure
-from replay.engine.streams.priors import gaussians
-from replay.foreign.description import Description, ForeignParameters, read_description
-from replay.foreign.messages import events_of, joined, of_run, static_of, static_of_run, streams_of
-from replay.foreign.naming import what_runs
-from replay.foreign.native.following import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Topic, schemas
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.engine.streams.channels import given_or_stated, resolved
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.engine.streams.priors import gaussians
+from fuselog.replay.foreign.description import Description, ForeignParameters, read_description
+from fuselog.replay.foreign.messages import (
+    events_of,
+    joined,
+    of_run,
+    static_of,
+    static_of_run,
+    streams_of,
+)
+from fuselog.replay.foreign.naming import what_runs
+from fuselog.replay.foreign.native.following import (
     Filters,
     Static,
     copies_of,
@@ -34,19 +41,19 @@ from replay.foreign.native.following import (
     offsets_of,
     reason_of_code,
 )
-from replay.foreign.native.library import Library
-from replay.foreign.native.out_of_sequence import gone_back
-from replay.foreign.processes.isolation import (
+from fuselog.replay.foreign.native.library import Library
+from fuselog.replay.foreign.native.out_of_sequence import gone_back
+from fuselog.replay.foreign.processes.isolation import (
     Limits,
     Ran,
     describe_apart,
     follow_here,
     follow_runs_apart,
 )
-from replay.foreign.processes.tasks import IN_ORDER, RunGiven, sizes_of
-from replay.foreign.results import begun, results
-from replay.inference.run.recursion import FilterEvents
-from replay.inference.run.timing import add_output_times
+from fuselog.replay.foreign.processes.tasks import IN_ORDER, RunGiven, sizes_of
+from fuselog.replay.foreign.results import begun, results
+from fuselog.replay.inference.run.recursion import FilterEvents
+from fuselog.replay.inference.run.timing import add_output_times
 
 Prior = tuple[Integers, Floats, Floats]
 # Takes runs through their filters in other processes; None of a run that takes no part.

@@ -5,18 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from recorders.errors import BadInput, choices
-from recorders.log import Stream, Topic
-from recorders.log.streams import check_stream
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, by_runs
-from replay.engine.streams.failures import Failure
-from replay.engine.streams.measurements import check_width
-from replay.engine.streams.results import failures_by_run, state_stream
-from replay.foreign.description import Description, TopicRead
-from replay.foreign.native.following import Followed, Static
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, recorded_innovations
-from replay.inference.run.timing import at_stamps_of
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Stream, Topic
+from fuselog.recorders.log.streams import check_stream
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, by_runs
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.engine.streams.measurements import check_width
+from fuselog.replay.engine.streams.results import failures_by_run, state_stream
+from fuselog.replay.foreign.description import Description, TopicRead
+from fuselog.replay.foreign.native.following import Followed, Static
+from fuselog.replay.inference.run.recursion import (
+    Estimates,
+    FilterEvents,
+    Innovations,
+    recorded_innovations,
+)
+from fuselog.replay.inference.run.timing import at_stamps_of
 
 
 def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:

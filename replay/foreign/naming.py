@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 KINDS = {"lib": "path", "exec": "command"}  # and the entry that says what is run
 _INTERPRETER = re.compile(

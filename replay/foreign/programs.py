@@ -11,25 +11,25 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, create_model
 
-from recorders.atomic import scratch_folder
-from recorders.errors import BadInput, choices
-from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
-from recorders.parameters import build, has_role
-from replay.engine.compiling.compile import core_count
-from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
-from replay.engine.replaying.truth import TRUTH, truths_among
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.failures import Failure
-from replay.engine.streams.results import failures_by_run
-from replay.foreign.description import Description, ForeignParameters
-from replay.foreign.files.estimates import read_estimates
-from replay.foreign.files.tables import write_tables
-from replay.foreign.filters import bind_all, bind_apart, unspecified
-from replay.foreign.naming import split_command, what_runs
-from replay.foreign.processes.isolation import Ended, Limits, Ran, in_threads
-from replay.foreign.processes.process import Program
-from replay.foreign.processes.streaming import describe_stream, follow_runs_streaming
-from replay.foreign.processes.tasks import RunGiven
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import RunMetadata, Stream, Topic, schemas, write_log
+from fuselog.recorders.parameters import build, has_role
+from fuselog.replay.engine.compiling.compile import core_count
+from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
+from fuselog.replay.engine.replaying.truth import TRUTH, truths_among
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.engine.streams.results import failures_by_run
+from fuselog.replay.foreign.description import Description, ForeignParameters
+from fuselog.replay.foreign.files.estimates import read_estimates
+from fuselog.replay.foreign.files.tables import write_tables
+from fuselog.replay.foreign.filters import bind_all, bind_apart, unspecified
+from fuselog.replay.foreign.naming import split_command, what_runs
+from fuselog.replay.foreign.processes.isolation import Ended, Limits, Ran, in_threads
+from fuselog.replay.foreign.processes.process import Program
+from fuselog.replay.foreign.processes.streaming import describe_stream, follow_runs_streaming
+from fuselog.replay.foreign.processes.tasks import RunGiven
 
 _PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 LOG, TABLES, OUT = "log", "csv", "out"

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Integers
-from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
-from replay.inference.run.recursion import Estimates, Innovations
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.inference.linear_algebra.gaussian import LOG_TWO_PI
+from fuselog.replay.inference.run.recursion import Estimates, Innovations
 
 
 class Sizes(NamedTuple):

@@ -1,23 +1,23 @@
 """Lists all methods by name, and makes estimators of them: of one model, or of any.
 
 A method is registered by its entry in METHODS, and by an entry point that names this module and the
-method, as `replay.inference.all_methods:ekf`.
+method, as `fuselog.replay.inference.all_methods:ekf`.
 """
 
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from recorders.errors import BadInput, choices
-from replay.engine.replaying.estimator import Estimator, set_by_variant
-from replay.inference.estimators import modelled_by, of_any_model
-from replay.inference.kalman.methods import FILTERS, Method
-from replay.inference.model.model import Model
-from replay.inference.modes.gaussian_sum import GAUSSIAN_SUM
-from replay.inference.modes.imm import INTERACTING
-from replay.inference.particles.filter import BOOTSTRAP
-from replay.inference.smoothing.bound import POSTERIOR_BOUND
-from replay.inference.smoothing.iterated import SMOOTHING
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.replay.engine.replaying.estimator import Estimator, set_by_variant
+from fuselog.replay.inference.estimators import modelled_by, of_any_model
+from fuselog.replay.inference.kalman.methods import FILTERS, Method
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.modes.gaussian_sum import GAUSSIAN_SUM
+from fuselog.replay.inference.modes.imm import INTERACTING
+from fuselog.replay.inference.particles.filter import BOOTSTRAP
+from fuselog.replay.inference.smoothing.bound import POSTERIOR_BOUND
+from fuselog.replay.inference.smoothing.iterated import SMOOTHING
 
 METHODS: Mapping[str, Method] = {
     **FILTERS,
@@ -41,7 +41,7 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
 
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
-    >>> from replay.estimators.models.landmarks import ROBOT
+    >>> from fuselog.replay.estimators.models.landmarks import ROBOT
     >>> modelled(ROBOT, "particles:500").parameters().particles
     500
     """

@@ -9,14 +9,14 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 from pydantic.fields import FieldInfo
 
-from recorders.errors import BadInput, choices
-from recorders.log import Topic
-from recorders.parameters import Parameters, build, meanings
-from recorders.registry import available, load
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
-from replay.engine.replaying.truth import refuse_named_truths
-from replay.inference.kalman.methods import Method
-from replay.inference.model.augmentation import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Topic
+from fuselog.recorders.parameters import Parameters, build, meanings
+from fuselog.recorders.registry import available, load
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from fuselog.replay.engine.replaying.truth import refuse_named_truths
+from fuselog.replay.inference.kalman.methods import Method
+from fuselog.replay.inference.model.augmentation import (
     Start,
     augmented,
     augmented_stage,
@@ -25,7 +25,7 @@ from replay.inference.model.augmentation import (
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import (
+from fuselog.replay.inference.model.binding import (
     first_and_more,
     in_its_plane,
     offers_of,
@@ -33,25 +33,25 @@ from replay.inference.model.binding import (
     topics_of,
     with_more,
 )
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.own_parameters import check_tables, with_own_parameters
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.settings import (
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.own_parameters import check_tables, with_own_parameters
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.settings import (
     assumed_of,
     settings_of,
 )
-from replay.inference.model.stage import Stage, stage_of
-from replay.inference.requirements import (
+from fuselog.replay.inference.model.stage import Stage, stage_of
+from fuselog.replay.inference.requirements import (
     OWN_MODEL,
     elsewhere,
     names_state,
     nearest,
     requirements_of,
 )
-from replay.inference.run.filtering import Filter, samplers_of
-from replay.inference.run.initialization import Initializer
-from replay.inference.run.out_of_sequence import OutOfSequenceFilter
-from replay.inference.run.reading import reading_of
+from fuselog.replay.inference.run.filtering import Filter, samplers_of
+from fuselog.replay.inference.run.initialization import Initializer
+from fuselog.replay.inference.run.out_of_sequence import OutOfSequenceFilter
+from fuselog.replay.inference.run.reading import reading_of
 
 
 @lru_cache(maxsize=256)

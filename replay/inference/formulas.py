@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from recorders.registry import load
-from replay.engine.vectors.tangent import tangent_components
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.stage import stage_of
-from replay.tracing.formulas import formulas_of
-from replay.tracing.functions import Shape, TracedFunction
+from fuselog.recorders.registry import load
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.stage import stage_of
+from fuselog.replay.tracing.formulas import formulas_of
+from fuselog.replay.tracing.functions import Shape, TracedFunction
 
 Names = Sequence[str]
 # What a function is given, by the argument's name: the names of a tuple's entries or of an array's

@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
-from recorders.errors import BadInput, choices
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.streams.blocks import Ragged, copied, run_of_rows
-from replay.engine.vectors.tangent import named_now, tangent_components
-from replay.inference.estimators import modelled_by, of_any_model
-from replay.inference.kalman.methods import Method, MethodParameters
-from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.steps import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.streams.blocks import Ragged, copied, run_of_rows
+from fuselog.replay.engine.vectors.tangent import named_now, tangent_components
+from fuselog.replay.inference.estimators import modelled_by, of_any_model
+from fuselog.replay.inference.kalman.methods import Method, MethodParameters
+from fuselog.replay.inference.kalman.predict import motion_derivative
+from fuselog.replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     InnovationRecord,
     Interval,
@@ -35,27 +35,27 @@ from replay.inference.kalman.steps import (
     Workspace,
     workspace,
 )
-from replay.inference.kalman.update import (
+from fuselog.replay.inference.kalman.update import (
     innovation_components,
     message_layout,
     sensor_derivative,
     sensor_noise,
 )
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.linear_algebra.gaussian import (
     drop_missing,
     fill_identity,
     kalman_step,
     multiply_into,
     whiten,
 )
-from replay.inference.linear_algebra.manifold import boxminus, is_flat
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.model import Model
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import (
+from fuselog.replay.inference.linear_algebra.manifold import boxminus, is_flat
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.stage import Stage, title_of
+from fuselog.replay.inference.run.filtering import FilterState
+from fuselog.replay.inference.run.recursion import (
     Estimates,
     RunInputs,
     RunResults,
@@ -63,8 +63,8 @@ from replay.inference.run.recursion import (
     no_results,
     recursion,
 )
-from replay.inference.smoothing.affine import carrying
-from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
+from fuselog.replay.inference.smoothing.affine import carrying
+from fuselog.replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
 
 RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors

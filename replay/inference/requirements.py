@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from recorders.log import Schema, Topic, schemas
-from replay.engine.streams.channels import resolved
-from replay.inference.model.binding import UnderPrefix, measures_state, serving, topics_of
-from replay.inference.model.model import (
+from fuselog.recorders.log import Schema, Topic, schemas
+from fuselog.replay.engine.streams.channels import resolved
+from fuselog.replay.inference.model.binding import UnderPrefix, measures_state, serving, topics_of
+from fuselog.replay.inference.model.model import (
     Model,
 )
 

@@ -1,4 +1,4 @@
-"""Traces functions at weighted samples as graphs, see `replay.inference.kalman.regression`.
+"""Traces functions at weighted samples as graphs, see `fuselog.replay.inference.kalman.regression`.
 
 Samples and rounds are left to loops: a graph is of one sample, or of one round of a mean.
 """
@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.tangent import WIDTHS
-from replay.inference.kalman.wide_angles import turning, unsuspected_rad
-from replay.inference.linear_algebra.manifold import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import WIDTHS
+from fuselog.replay.inference.kalman.wide_angles import turning, unsuspected_rad
+from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
     manifold_blocks,
     recentring,
     tangent_size,
 )
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.step_graphs import Step, traced_step
-from replay.sampling.sets import SampleSets
-from replay.tracing.functions import Argument, Shape, TracedFunction
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.step_graphs import Step, traced_step
+from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Kinds = tuple[str, ...]
 SETTLING = (3,)  # which argument of `SampledFunction.recentre` differs from sample to sample: value

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Function
-from replay.tracing.functions import Argument, trace
-from replay.tracing.graph import Graph, Node
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.tracing.functions import Argument, trace
+from fuselog.replay.tracing.graph import Graph, Node
 
 _SPARSE = ("F", "H", "G", "N")
 
@@ -44,7 +44,7 @@ def traced_step(what: str, function: Function, arguments: tuple[Argument, ...]) 
     Args:
         what: it is, for the error.
         function: of the arguments.
-        arguments: as `replay.tracing.functions.trace` takes them.
+        arguments: as `fuselog.replay.tracing.functions.trace` takes them.
 
     Raises BadInput where it is no graph.
     """

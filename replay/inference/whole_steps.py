@@ -10,20 +10,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Function
-from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.regression import measured_with_noise, moved_with_noise, no_variances
-from replay.inference.kalman.update import message_layout, residual_of, sensor_derivative
-from replay.inference.linear_algebra.manifold import boxplus
-from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.corrections import relinearising, stepping
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import number_fields
-from replay.inference.run.filtering import Filter
-from replay.inference.run.samples import sample_sets
-from replay.inference.sampled_steps import Sampled, SampledFunction, sampled_function
-from replay.inference.step_graphs import Step, traced_step, zeros
-from replay.tracing.functions import Argument, Shape, traced
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.inference.kalman.predict import motion_derivative
+from fuselog.replay.inference.kalman.regression import (
+    measured_with_noise,
+    moved_with_noise,
+    no_variances,
+)
+from fuselog.replay.inference.kalman.update import message_layout, residual_of, sensor_derivative
+from fuselog.replay.inference.linear_algebra.manifold import boxplus
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from fuselog.replay.inference.model.corrections import relinearising, stepping
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.run.filtering import Filter
+from fuselog.replay.inference.run.samples import sample_sets
+from fuselog.replay.inference.sampled_steps import Sampled, SampledFunction, sampled_function
+from fuselog.replay.inference.step_graphs import Step, traced_step, zeros
+from fuselog.replay.tracing.functions import Argument, Shape, traced
 
 
 class WholeSteps(NamedTuple):

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from recorders.log import Stream, schemas
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import tangent_components
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.metrics.measuring import Output, Sums, plus
-from replay.judging.metrics.metrics import covered, estimated_share
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.vectors.components import stated_components
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.metrics.measuring import Output, Sums, plus
+from fuselog.replay.judging.metrics.metrics import covered, estimated_share
 
 ESTIMATE = schemas.GAUSSIAN_ESTIMATE.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import schemas
-from recorders.log.planes import Origin, frame_of
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.judging.consistency.bounds import Bounds
-from replay.judging.consistency.conditioning import Conditioning, conditioning_of
-from replay.judging.diagnostics import LEAVES, Diagnostics
-from replay.judging.errors.constant import Constant
-from replay.judging.errors.evaluation import (
+from fuselog.recorders.log import schemas
+from fuselog.recorders.log.planes import Origin, frame_of
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.consistency.bounds import Bounds
+from fuselog.replay.judging.consistency.conditioning import Conditioning, conditioning_of
+from fuselog.replay.judging.diagnostics import LEAVES, Diagnostics
+from fuselog.replay.judging.errors.constant import Constant
+from fuselog.replay.judging.errors.evaluation import (
     Errors,
     Innovations,
     chi_square_interval,
@@ -29,24 +29,24 @@ from replay.judging.errors.evaluation import (
     unestimated,
     unjudged_sentence,
 )
-from replay.judging.errors.planes import first_fixes
-from replay.judging.errors.truths import Doubt, Truths
-from replay.judging.errors.uninformed import Uninformed
-from replay.judging.metrics.means import MeansOfAll
-from replay.judging.metrics.measuring import (
+from fuselog.replay.judging.errors.planes import first_fixes
+from fuselog.replay.judging.errors.truths import Doubt, Truths
+from fuselog.replay.judging.errors.uninformed import Uninformed
+from fuselog.replay.judging.metrics.means import MeansOfAll
+from fuselog.replay.judging.metrics.measuring import (
     Metric,
     MetricCollection,
     Output,
     find_metrics,
     metric_key,
 )
-from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
-from replay.judging.metrics.sums import BinnedSums
-from replay.judging.sets.errors import SetErrors, set_errors, unjudged_sets
-from replay.judging.sets.regions import regions_of
-from replay.judging.tracks.errors import SOME_ARE_KNOWN
-from replay.judging.tracks.errors import Judged as Targets
-from replay.judging.tracks.evaluation import targets_of, track_blocks, unjudged_tracks
+from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
+from fuselog.replay.judging.metrics.sums import BinnedSums
+from fuselog.replay.judging.sets.errors import SetErrors, set_errors, unjudged_sets
+from fuselog.replay.judging.sets.regions import regions_of
+from fuselog.replay.judging.tracks.errors import SOME_ARE_KNOWN
+from fuselog.replay.judging.tracks.errors import Judged as Targets
+from fuselog.replay.judging.tracks.evaluation import targets_of, track_blocks, unjudged_tracks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -335,7 +335,7 @@ class Judge:
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
         """Return by topic, for estimates with truth, a row per step: see `tables.step_table`."""
-        from replay.judging.tables import step_table
+        from fuselog.replay.judging.tables import step_table
 
         return {
             topic: step_table(each, self._bounds.get(split_topic(topic)))
@@ -345,35 +345,35 @@ class Judge:
     @property
     def runs_table(self) -> "pd.DataFrame":
         """Return one row per estimator, case and run: see `tables.table_of_runs`."""
-        from replay.judging.tables import table_of_runs
+        from fuselog.replay.judging.tables import table_of_runs
 
         return table_of_runs(self._quantities.values(), self.innovations)
 
     @property
     def times(self) -> "pd.DataFrame":
         """Return the same by run and span of time; `until_s` is where a span ends, after the epoch."""
-        from replay.judging.tables import joined, time_table
+        from fuselog.replay.judging.tables import joined, time_table
 
         return joined(time_table(each) for each in self._quantities.values())
 
     @property
     def modes(self) -> "pd.DataFrame":
         """Return modes' probabilities: a row per estimator, case, span and mode; see `MeansOfAll`."""
-        from replay.judging.tables import joined
+        from fuselog.replay.judging.tables import joined
 
         return joined(self._means.modes())
 
     @property
     def effective(self) -> "pd.DataFrame":
         """Return the effective share of the particles: a row per estimator, case and span of time."""
-        from replay.judging.tables import joined
+        from fuselog.replay.judging.tables import joined
 
         return joined(self._means.effective())
 
     @property
     def late(self) -> "pd.DataFrame":
         """Return messages that came late: a row per estimator, case, what became of them, and span."""
-        from replay.judging.tables import joined
+        from fuselog.replay.judging.tables import joined
 
         return joined(self._means.late())
 

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import pandas as pd
 
-from replay.judging.consistency.bounds import Bounds
-from replay.judging.errors.evaluation import Errors, Floats, rmse_interval, split_topic
-from replay.judging.metrics.metrics import step_bounds
-from replay.judging.metrics.quantities import InnovationSums, Quantities
+from fuselog.replay.judging.consistency.bounds import Bounds
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, rmse_interval, split_topic
+from fuselog.replay.judging.metrics.metrics import step_bounds
+from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities
 
 
 def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recorders.errors import BadInput
-from recorders.models.planar import drive, wrap_angle
-from recorders.models.relative_bearing import relative_bearing
-from replay.engine.arrays import Floats, Integers
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.planar import drive, wrap_angle
+from fuselog.recorders.models.relative_bearing import relative_bearing
+from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class Pairs(NamedTuple):

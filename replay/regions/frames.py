@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.regions.feasible_sets import Arena, Pairs, arena_around, make_pairs
-from replay.regions.moving_sets import Growth
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.regions.feasible_sets import Arena, Pairs, arena_around, make_pairs
+from fuselog.replay.regions.moving_sets import Growth
 
 CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
 FINDINGS = (

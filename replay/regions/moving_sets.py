@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from recorders.extras import AtFirstUse
-from recorders.models.planar import drive, wrap_angle
-from replay.engine.arrays import Floats, Integers
-from replay.regions.feasible_sets import Arena
-from replay.regions.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
+from fuselog.recorders.extras import AtFirstUse
+from fuselog.recorders.models.planar import drive, wrap_angle
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.regions.feasible_sets import Arena
+from fuselog.replay.regions.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
 
 if TYPE_CHECKING:
     import shapely

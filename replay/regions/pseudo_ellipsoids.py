@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 import contourpy
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats
-from replay.regions.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.regions.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
 
 Order = Literal[4, 8]
 Weighting = Literal["area", "batch", "determinant", "equal"]

@@ -3,11 +3,11 @@
 Begin with `samplers`.
 """
 
-from replay.sampling.cache import SetName, cached_set
-from replay.sampling.distance import lcd_distance
-from replay.sampling.lcd import lcd_samples, moment_corrected
-from replay.sampling.names import Sampling, parse_sampling
-from replay.sampling.samplers import Sampler, Samples
+from fuselog.replay.sampling.cache import SetName, cached_set
+from fuselog.replay.sampling.distance import lcd_distance
+from fuselog.replay.sampling.lcd import lcd_samples, moment_corrected
+from fuselog.replay.sampling.names import Sampling, parse_sampling
+from fuselog.replay.sampling.samplers import Sampler, Samples
 
 __all__ = [
     "Sampler",

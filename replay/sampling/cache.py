@@ -1,7 +1,7 @@
 """Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
 
-A file (see `replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named after
-their sets. Common sets ship with the package (see `replay.sampling.ship`); others are kept in the user's
+A file (see `fuselog.replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named after
+their sets. Common sets ship with the package (see `fuselog.replay.sampling.ship`); others are kept in the user's
 cache.
 """
 
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.compiling.cache import cache_folder, is_private, read_checked, write_checked
-from replay.sampling.distance import Array
-from replay.sampling.lcd import Report, check_count, lcd_samples, moment_corrected, silent
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.cache import cache_folder, is_private, read_checked, write_checked
+from fuselog.replay.sampling.distance import Array
+from fuselog.replay.sampling.lcd import Report, check_count, lcd_samples, moment_corrected, silent
 
 SHIPPED = files("fuselog_data") / "lcd-samples.bin"
 

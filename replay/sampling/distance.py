@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from replay.engine.compiling.compile import compiled
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.compile import compiled
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.random import Generator
 from threadpoolctl import threadpool_limits
 
-from recorders.errors import BadInput
-from replay.sampling.distance import Array, lcd_distance_and_gradient
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling.distance import Array, lcd_distance_and_gradient
 
 Report = Callable[[str], object]
 

@@ -23,10 +23,18 @@ from pydantic import (
     ValidationError,
 )
 
-from recorders.errors import BadInput
-from replay.sampling.cache import SetName, cached_set
-from replay.sampling.lcd import Report, silent
-from replay.sampling.samplers import Sampler, Samples, axis_points, fixed, randomised, rotated, unscented
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling.cache import SetName, cached_set
+from fuselog.replay.sampling.lcd import Report, silent
+from fuselog.replay.sampling.samplers import (
+    Sampler,
+    Samples,
+    axis_points,
+    fixed,
+    randomised,
+    rotated,
+    unscented,
+)
 
 PROBLEMS = {"missing": "is missing", "extra_forbidden": "is not known"}
 PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-z]+(=[^:=]+)?)*)")

@@ -3,7 +3,7 @@
 Kitagawa, Journal of Computational and Graphical Statistics 5(1), 1996.
 """
 
-from replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.arrays import Floats, Integers
 
 
 def choose_systematically(weights: Floats, start: float, chosen: Integers) -> None:

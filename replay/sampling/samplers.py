@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import Generator
 
-from recorders.errors import BadInput
-from replay.sampling.distance import Array
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling.distance import Array
 
 Shape = tuple[int, ...]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from replay.sampling.distance import Array
-from replay.sampling.samplers import Sampler
+from fuselog.replay.sampling.distance import Array
+from fuselog.replay.sampling.samplers import Sampler
 
 Generators = tuple[Generator | None, ...]
 DRAWN_AT_ONCE = 1 << 23  # numbers

@@ -1,11 +1,11 @@
-"""Computes the sample sets that ship with fuselog, in data/: `python -m replay.sampling.ship`.
+"""Computes the sample sets that ship with fuselog, in data/: `python -m fuselog.replay.sampling.ship`.
 
 Another CPU may end in another optimum of (nearly) the same D, so sets that are there stay as they are.
 """
 
 from pathlib import Path
 
-from replay.sampling.cache import SHIPPED, SetName, compute_set, read_set, write_sets
+from fuselog.replay.sampling.cache import SHIPPED, SetName, compute_set, read_set, write_sets
 
 COMMON = (
     *(SetName(dimension, count) for dimension in range(1, 9) for count in (25, 50, 100, 200)),
@@ -22,7 +22,7 @@ def main() -> None:
         name: compute_set(name, lambda message: print(message, flush=True)) if points is None else points
         for name, points in found.items()
     }
-    write_sets(Path(str(SHIPPED)), sets, made_by="python -m replay.sampling.ship")
+    write_sets(Path(str(SHIPPED)), sets, made_by="python -m fuselog.replay.sampling.ship")
 
 
 if __name__ == "__main__":

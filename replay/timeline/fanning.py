@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import rerun.blueprint as rrb
 
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import PALETTE, Board, Canvas, Times, entity_path
-from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import PALETTE, Board, Canvas, Times, entity_path
+from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 
 
 class Fan(NamedTuple):

@@ -12,13 +12,13 @@ from itertools import cycle
 import numpy as np
 import rerun.blueprint as rrb
 
-from recorders.errors import BadInput
-from recorders.log import Field, Stream, schemas
-from recorders.models.geodesy import out_of_tangent_plane
-from replay.engine.streams.geodetic import stated_origin
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.about import draw_about
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Field, Stream, schemas
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.replay.engine.streams.geodetic import stated_origin
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.about import draw_about
+from fuselog.replay.timeline.drawing.canvas import (
     PALETTE,
     Board,
     Canvas,
@@ -30,9 +30,9 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     thin,
 )
-from replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events
-from replay.timeline.drawing.geodetic import degrees_of, draw_fixes, draw_way, map_view
-from replay.timeline.drawing.plane import (
+from fuselog.replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events
+from fuselog.replay.timeline.drawing.geodetic import degrees_of, draw_fixes, draw_way, map_view
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_clouds,
@@ -45,7 +45,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import (
+from fuselog.replay.timeline.drawing.plots import (
     POINTS,
     below_legend,
     draw_components,
@@ -56,17 +56,17 @@ from replay.timeline.drawing.plots import (
     plot_view,
     shown_unit,
 )
-from replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
-from replay.timeline.families.directional import draw_triads, space_view
-from replay.timeline.families.landmarks import (
+from fuselog.replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
+from fuselog.replay.timeline.families.directional import draw_triads, space_view
+from fuselog.replay.timeline.families.landmarks import (
     ARROW_SHARE,
     draw_sights,
     draw_track,
     landmarks_of,
     tracks_of,
 )
-from replay.timeline.families.moving_sights import draw_moving_sights
-from replay.timeline.families.navigation import draw_navigation
+from fuselog.replay.timeline.families.moving_sights import draw_moving_sights
+from fuselog.replay.timeline.families.navigation import draw_navigation
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name

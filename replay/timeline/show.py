@@ -11,18 +11,18 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.errors import BadInput, choices, printable
-from recorders.log import Stream
-from recorders.registry import available, load
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import Errors, errors_at
-from replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
-from replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
-from replay.timeline.fanning import Fan, draw_fans
-from replay.timeline.generic import TIMELINE as GENERIC
-from replay.timeline.side_by_side import draw_side_by_side
-from replay.timeline.sinks import open_recording
+from fuselog.recorders.errors import BadInput, choices, printable
+from fuselog.recorders.log import Stream
+from fuselog.recorders.registry import available, load
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import Errors, errors_at
+from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
+from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
+from fuselog.replay.timeline.fanning import Fan, draw_fans
+from fuselog.replay.timeline.generic import TIMELINE as GENERIC
+from fuselog.replay.timeline.side_by_side import draw_side_by_side
+from fuselog.replay.timeline.sinks import open_recording
 
 # A receiver is sent so many messages of outputs at once.
 LIVE_MESSAGES = 20_000

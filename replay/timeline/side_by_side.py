@@ -11,10 +11,10 @@ from uuid import uuid4
 import numpy as np
 import rerun.blueprint as rrb
 
-from replay.judging.errors.evaluation import Errors, Floats
-from replay.timeline.drawing.canvas import Board, Canvas, Scene, entity_path, escaped
-from replay.timeline.drawing.plane import LEGEND
-from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
+from fuselog.replay.judging.errors.evaluation import Errors, Floats
+from fuselog.replay.timeline.drawing.canvas import Board, Canvas, Scene, entity_path, escaped
+from fuselog.replay.timeline.drawing.plane import LEGEND
+from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 
 
 def draw_side_by_side(

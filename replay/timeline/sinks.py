@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 
 import rerun as rr
 
-from recorders.atomic import whole_file
-from recorders.errors import BadInput
+from fuselog.recorders.atomic import whole_file
+from fuselog.recorders.errors import BadInput
 
 # The first bytes of an HTTP/2 client: its preface and empty settings. A server answers with its own.
 _HTTP2_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])

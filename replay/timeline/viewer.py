@@ -19,10 +19,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from rerun.experimental import ViewerClient
 
-from recorders.atomic import scratch_folder, whole_file
-from recorders.errors import BadInput
-from recorders.processes import start_module
-from replay.timeline.sinks import rerun_path
+from fuselog.recorders.atomic import scratch_folder, whole_file
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.processes import start_module
+from fuselog.replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
 # What a picture says of who made it, in the PNG keyword `Software`.
@@ -157,7 +157,7 @@ def _running(
     """Run `rerun OPTIONS`, which says what it has to say in a file of the folder."""
     with (folder / _SAID).open("wb") as output:
         process = start_module(
-            "replay.timeline.keeper",
+            "fuselog.replay.timeline.keeper",
             *options,
             environment=environment,
             stdout=output,

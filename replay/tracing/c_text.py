@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.tracing.formulas import Text
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.formulas import Text
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
 SHORTEST, LONGEST = 16, 90  # characters: what is shorter is repeated, what is longer gets a line
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
-from replay.tracing.traced import Trace, Traced, where
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.traced import Trace, Traced, where
 
 
 def _sinc_slope(value: Any, x: Any) -> tuple[Any]:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.compiling.kernels.functions import FUNCTIONS
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
+from fuselog.replay.engine.compiling.kernels.numbers import (
     REAL,
     Emitter,
     Number,
@@ -18,7 +18,7 @@ from replay.engine.compiling.kernels.numbers import (
     negative,
     power,
 )
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
 _BINARY = (operator.add, operator.sub, operator.mul, operator.truediv, operator.mod, operator.floordiv)
 _COMPARISONS = (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)

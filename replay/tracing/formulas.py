@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.tracing.derivatives import slopes_of
-from replay.tracing.functions import TracedFunction
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
-from replay.tracing.traced import Trace
+from fuselog.replay.tracing.derivatives import slopes_of
+from fuselog.replay.tracing.functions import TracedFunction
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.traced import Trace
 
 SHORTEST, LONGEST = 20, 100  # characters: what is shorter is repeated, what is longer gets a line
 

@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.compiling.identity import digest_of
-from replay.engine.compiling.kernels.numbers import REAL, Emitter, Number, constant
-from replay.engine.compiling.kernels.program import Instance, Program, called
-from replay.engine.compiling.kernels.values import Array, Record, entries, load, part_of, store
-from replay.tracing.derivatives import slopes_of
-from replay.tracing.emission import emit, python_of
-from replay.tracing.graph import INPUT, Graph, Node, described, needed
-from replay.tracing.inlining import Parameters, inlined, trace_of, tracing
-from replay.tracing.reads import Reads, reads_of
-from replay.tracing.traced import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.identity import digest_of
+from fuselog.replay.engine.compiling.kernels.numbers import REAL, Emitter, Number, constant
+from fuselog.replay.engine.compiling.kernels.program import Instance, Program, called
+from fuselog.replay.engine.compiling.kernels.values import Array, Record, entries, load, part_of, store
+from fuselog.replay.tracing.derivatives import slopes_of
+from fuselog.replay.tracing.emission import emit, python_of
+from fuselog.replay.tracing.graph import INPUT, Graph, Node, described, needed
+from fuselog.replay.tracing.inlining import Parameters, inlined, trace_of, tracing
+from fuselog.replay.tracing.reads import Reads, reads_of
+from fuselog.replay.tracing.traced import (
     MOST_WAYS,
     CannotTrace,
     Trace,
@@ -101,7 +101,7 @@ class TracedFunction:
         )
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
-        """Write a call of it; see `replay.engine.compiling.kernels.expressions`."""
+        """Write a call of it; see `fuselog.replay.engine.compiling.kernels.expressions`."""
         numbers = _called(program, emitter, self, self.outputs, arguments)
         count = len(self.result.returned)
         for (argument, place, _), number in zip(self.result.written, numbers[count:], strict=True):
@@ -350,7 +350,7 @@ def place_of(function: Callable[..., Any], error: Exception | None = None) -> st
 
 def _digest(words: Sequence[str]) -> str:
     """Return the digest of a graph and of how its instructions are written."""
-    return sha256("\n".join([digest_of("replay.tracing"), *words]).encode()).hexdigest()
+    return sha256("\n".join([digest_of("fuselog.replay.tracing"), *words]).encode()).hexdigest()
 
 
 _KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 MOST_NODES = 50_000
 INPUT, CONSTANT, POWER, SELECT = "input", "constant", "power", "select"

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
-from replay.tracing.traced import Trace, Traced
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.traced import Trace, Traced
 
 
 class Parameters:

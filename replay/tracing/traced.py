@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from replay.tracing.graph import Graph, Node
+from fuselog.replay.tracing.graph import Graph, Node
 
 
 class CannotTrace(TypeError):

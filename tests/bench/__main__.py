@@ -11,7 +11,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pipeline.output.terminal import format_value, print_table
+from fuselog.pipeline.output.terminal import format_value, print_table
 from tests.claims.pages import SPEED
 
 COLUMNS = ("what", "ours", "theirs", "ratio")

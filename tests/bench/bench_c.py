@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.recorded import record_ensemble
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource
 from tests.bench.bench_models import sightings
 from tests.bench.columns import Floats, column, offsets, prior, stamps_ns
 from tests.bench.loops import calls_of

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from pipeline.runs.campaigns import cells_of, judge_all
-from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.executors import PoolFactory, processes
-from pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
+from fuselog.pipeline.runs.campaigns import cells_of, judge_all
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.executors import PoolFactory, processes
+from fuselog.pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
 from tests.bench.timing import cpu_seconds, seconds
 
 RUNS = 2000

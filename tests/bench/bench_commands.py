@@ -11,12 +11,12 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from recorders.log import write_log
-from recorders.recording import record_run
+from fuselog.recorders.log import write_log
+from fuselog.recorders.recording import record_run
 
 REPEATS = 7
 LEAST = "import numpy, pydantic.main, rich.table, google.protobuf.message"
-MAIN = "import sys; from pipeline.command_line import main; sys.exit(main(sys.argv[1:]))"
+MAIN = "import sys; from fuselog.pipeline.command_line import main; sys.exit(main(sys.argv[1:]))"
 COMMANDS = {
     "--help": ["--help"],
     "info of a minute's log": ["info", "run.mcap"],

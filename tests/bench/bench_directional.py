@@ -9,9 +9,14 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from replay.distributions import bingham
-from replay.distributions.bingham import Bingham, make_bingham
-from replay.estimators.directional.bingham import BinghamNoise, Steps, make_steps, run_bingham_filter
+from fuselog.replay.distributions import bingham
+from fuselog.replay.distributions.bingham import Bingham, make_bingham
+from fuselog.replay.estimators.directional.bingham import (
+    BinghamNoise,
+    Steps,
+    make_steps,
+    run_bingham_filter,
+)
 from tests.bench.timing import median_seconds, seconds
 
 REVERSE = np.eye(4)[::-1]

@@ -25,10 +25,10 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import UnscentedKalmanUpdater
 
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.bench.timing import cpu_seconds
 
 TOLERANCE = 1e-6

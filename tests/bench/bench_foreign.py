@@ -20,15 +20,15 @@ from unittest.mock import patch
 import numpy as np
 import psutil
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import copied
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.foreign import filters
-from replay.foreign.naming import Allowed
-from replay.foreign.native.library import HEADER
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import copied
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.foreign import filters
+from fuselog.replay.foreign.naming import Allowed
+from fuselog.replay.foreign.native.library import HEADER
 from tests.docs.test_worked_pages import DOCS, blocks_of
 
 Row = tuple[str, str, str, str]

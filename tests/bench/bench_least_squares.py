@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from recorders.models.optical import line_of_sight
-from replay.estimators.localization import optical
-from replay.estimators.localization.optical import Scene
+from fuselog.recorders.models.optical import line_of_sight
+from fuselog.replay.estimators.localization import optical
+from fuselog.replay.estimators.localization.optical import Scene
 from tests.bench.timing import seconds
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"

@@ -21,7 +21,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 from rerun.chunk import McapReader
 
-from recorders.log import (
+from fuselog.recorders.log import (
     LogWriter,
     Stream,
     make_stream,

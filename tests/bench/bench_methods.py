@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runs.recorded import record_ensemble
-from recorders.parameters import build
-from replay.engine.replaying.estimator import Bound
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.models.landmarks import ROBOT
-from replay.estimators.models.vehicle_kalman import VEHICLE
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import bind_model, combined
-from replay.inference.model.model import Model, Switching
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.parameters import build
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.models.landmarks import ROBOT
+from fuselog.replay.estimators.models.vehicle_kalman import VEHICLE
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import bind_model, combined
+from fuselog.replay.inference.model.model import Model, Switching
 from tests.bench.loops import Call, calls_of
 from tests.bench.reference.landmarks import fill_motion_jacobians, fill_sensor_jacobian
 from tests.bench.timing import cpu_seconds

@@ -7,10 +7,10 @@ with `make bench`, or `python -m tests.bench navigation`.
 
 import numpy as np
 
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.bench.reference import navigation
 from tests.bench.timing import cpu_seconds
 

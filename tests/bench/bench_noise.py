@@ -20,7 +20,7 @@ CPU_S, PEAK_GB = 60.0, 2.0
 WHITE, WALK = {"specific_force_mps2": 1e-2, "turn_rate_radps": 1e-3}, 0.01  # of the white noise
 # the kernel counts the parent's memory as the child's, but for what /proc says of itself
 CODE = """import sys
-from pipeline.command_line import main
+from fuselog.pipeline.command_line import main
 code = main(sys.argv[1:])
 peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM"))
 open("peak", "w").write(peak)

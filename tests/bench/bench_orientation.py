@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.inertial import product
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.orientation.complementary import HALF
-from replay.estimators.orientation.triad import triad
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.models.inertial import product
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.orientation.complementary import HALF
+from fuselog.replay.estimators.orientation.triad import triad
 from tests.bench.timing import median_seconds, seconds
 
 COUNT, STEP_NS, THEIRS = 100_000, 10_000_000, 500

@@ -19,11 +19,11 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
-from pipeline.runs.recorded import record_ensemble
-from recorders.models.vehicles import noise_moments, turn
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.models.vehicles import noise_moments, turn
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource
 from tests.bench.timing import cpu_seconds
 
 Floats = NDArray[np.float64]

@@ -13,19 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from pipeline.runs.recorded import replay_in_memory
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.engine.streams.blocks import gather
-from replay.estimators.tracking.gaussian_mixture_phd import (
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
     no_components,
     scans_of,
     settings_of,
 )
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.distances import gospa
-from replay.judging.sets.errors import CUTOFF_M, set_errors
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.distances import gospa
+from fuselog.replay.judging.sets.errors import CUTOFF_M, set_errors
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS = 6

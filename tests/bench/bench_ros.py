@@ -22,9 +22,9 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from recorders.importers.ros.importer import read
-from recorders.importers.ros.parameters import RosParameters
-from recorders.recording import import_log
+from fuselog.recorders.importers.ros.importer import read
+from fuselog.recorders.importers.ros.parameters import RosParameters
+from fuselog.recorders.recording import import_log
 from tests.bench.timing import cpu_seconds
 
 MESSAGES = 150_000

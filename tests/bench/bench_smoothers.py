@@ -13,11 +13,11 @@ from unittest.mock import patch
 
 import numpy as np
 
-from pipeline.runs.recorded import record_ensemble
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource
-from replay.inference.smoothing import smoothers
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.inference.smoothing import smoothers
 from tests.bench.timing import cpu_seconds
 
 Row = tuple[str, str, str, str]

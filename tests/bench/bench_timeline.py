@@ -8,12 +8,12 @@ import numpy as np
 import rerun as rr
 import rerun.chunk as rc
 
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.judging.judge import Judge
-from replay.timeline.show import show
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.show import show
 
 SCENARIO = {"duration_s": 250.0, "range_bearing": {"rate_hz": 5.0, "outlier_probability": 0.02}}
 

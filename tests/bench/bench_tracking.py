@@ -11,17 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.recorded import replay_in_memory
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.engine.streams.blocks import Block, gather, merge_events
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.tracking.scan_sensors import KINDS
-from replay.estimators.tracking.scans import scans_of
-from replay.estimators.tracking.targets import targets_of
-from replay.estimators.tracking.tracker import TrackerParameters, find_sensors, settings_of, tracker_of
-from replay.inference.association.scans import Scans
-from replay.inference.association.tracking import track_scans
-from replay.inference.association.tracks import Tracks, no_tracks
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.engine.streams.blocks import Block, gather, merge_events
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.tracking.scan_sensors import KINDS
+from fuselog.replay.estimators.tracking.scans import scans_of
+from fuselog.replay.estimators.tracking.targets import targets_of
+from fuselog.replay.estimators.tracking.tracker import (
+    TrackerParameters,
+    find_sensors,
+    settings_of,
+    tracker_of,
+)
+from fuselog.replay.inference.association.scans import Scans
+from fuselog.replay.inference.association.tracking import track_scans
+from fuselog.replay.inference.association.tracks import Tracks, no_tracks
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS, REPEATS = 3, 5

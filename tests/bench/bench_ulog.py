@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from recorders.importers.ulog.file import UlogFile
+from fuselog.recorders.importers.ulog.file import UlogFile
 
 SAMPLE = "./ulog/sample.ulg"
 SIZES = {"ours": 1_000_000_000, "pyulog": 100_000_000}
@@ -23,7 +23,7 @@ READ = {
 CODE = """import sys, time
 from pathlib import Path
 from pyulog import ULog
-from recorders.importers.ulog.file import UlogFile
+from fuselog.recorders.importers.ulog.file import UlogFile
 {read}
 begin = time.process_time()
 {read}

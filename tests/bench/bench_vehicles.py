@@ -18,11 +18,11 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
-from pipeline.runs.recorded import record_ensemble
-from recorders.models.vehicles import noise_moments, turn
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.models.vehicles import noise_moments, turn
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource
 
 RUNS = 200
 REPEATS = 5

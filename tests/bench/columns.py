@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -8,11 +8,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.replaying.estimator import Bound
-from replay.engine.replaying.replaying import replay
-from replay.engine.streams.sources import Source
-from replay.inference.run import filtering
-from replay.inference.run.recursion import Estimates, Innovations, RunResults, filled
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.replaying.replaying import replay
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.inference.run import filtering
+from fuselog.replay.inference.run.recursion import Estimates, Innovations, RunResults, filled
 
 Floats = NDArray[np.float64]
 

@@ -18,15 +18,15 @@ from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING, Any
 
-from recorders import registry
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import bind_model, combined
+from fuselog.recorders import registry
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import bind_model, combined
 from tests.bench import loops
 from tests.bench.loops import Call, calls_of
 
 if TYPE_CHECKING:
-    from replay.engine.replaying.estimator import Bound
-    from replay.engine.streams.sources import MemorySource
+    from fuselog.replay.engine.replaying.estimator import Bound
+    from fuselog.replay.engine.streams.sources import MemorySource
 
 OWN = "a user's own model"
 
@@ -70,7 +70,7 @@ def either(name: str, *modules: str) -> Any:
 def recorded(scenario: str, parameters: Mapping[str, Any], runs: int) -> "list[MemorySource]":
     """Runs of the scenario, or logs for the user's model."""
     if scenario != OWN:
-        places = "pipeline.runs.recorded", "pipeline.runs.ensemble", "pipeline.ensemble"
+        places = "fuselog.pipeline.runs.recorded", "fuselog.pipeline.runs.ensemble", "pipeline.ensemble"
         return either("record_ensemble", *places)(scenario, parameters, 1, runs)
     from tests.replay.inference.vehicle_a import simulate, source
 
@@ -80,7 +80,7 @@ def recorded(scenario: str, parameters: Mapping[str, Any], runs: int) -> "list[M
 def bound(scenario: str, estimator: str, sources: "list[MemorySource]") -> "list[Bound]":
     """The estimator, of whichever registered model the log has, or of the user's."""
     if scenario != OWN:
-        places = "replay.engine.replaying.estimator", "replay.engine.estimator"
+        places = "fuselog.replay.engine.replaying.estimator", "fuselog.replay.engine.estimator"
         return either("bind", *places)(estimator, sources, {})
     from tests.replay.inference.vehicle_a import VEHICLE_A as MODEL
 

@@ -19,12 +19,12 @@ from typing import NamedTuple
 
 import matplotlib as mpl
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, draw, level
-from pipeline.runs.campaigns import Cell, cells_of
-from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.ensemble import RUNS_AT_ONCE
-from pipeline.runs.executors import processes
-from pipeline.runs.experiment import Setting, load_experiment, run_experiment
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, draw, level
+from fuselog.pipeline.runs.campaigns import Cell, cells_of
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE
+from fuselog.pipeline.runs.executors import processes
+from fuselog.pipeline.runs.experiment import Setting, load_experiment, run_experiment
 from tests.bench.timing import seconds
 
 DOCS = Path(__file__).parents[2] / "docs"

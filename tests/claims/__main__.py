@@ -5,10 +5,10 @@ from pathlib import Path
 
 import click
 
-from pipeline.command_line import main as fuselog
-from pipeline.runs.experiment import load_experiment
-from pipeline.runs.inputs import shipped
-from recorders.errors import choices
+from fuselog.pipeline.command_line import main as fuselog
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.errors import choices
 from tests.claims import pages
 from tests.goldens.recipes import DATA, data_option, importer_of, unpack
 

@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.output.claims import Claim, decide
-from pipeline.runs.experiment import Study, load_experiment, numbers_of
-from recorders.parameters import build
-from recorders.registry import load
+from fuselog.pipeline.output.claims import Claim, decide
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
 from tests.claims import pages
 
 OPPOSITE = {"confirmed", "refuted"}

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from pipeline.output.claims import Claim, StatedClaim, _combinations, _decided, _named
-from pipeline.output.expressions import Values
-from pipeline.output.numbers import exactly
-from pipeline.output.results import MetricValue, split_metric
-from pipeline.runs.experiment import Study, load_experiment, numbers_of
-from pipeline.runs.inputs import shipped
-from recorders.parameters import build
-from recorders.registry import load
+from fuselog.pipeline.output.claims import Claim, StatedClaim, _combinations, _decided, _named
+from fuselog.pipeline.output.expressions import Values
+from fuselog.pipeline.output.numbers import exactly
+from fuselog.pipeline.output.results import MetricValue, split_metric
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
 from tests.claims import pages
 
 MOVES = (-3.0, 0.0, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0)

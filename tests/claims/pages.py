@@ -24,13 +24,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from pipeline.api.lists import listed
-from pipeline.output.claims import Verdict
-from pipeline.output.results import MetricValue, Result, read_result
-from pipeline.runs.experiment import load_experiment
-from pipeline.runs.inputs import shipped
-from recorders.importers.tables.mapping import read_mapping
-from recorders.importers.tables.mapping import shipped as shipped_mappings
+from fuselog.pipeline.api.lists import listed
+from fuselog.pipeline.output.claims import Verdict
+from fuselog.pipeline.output.results import MetricValue, Result, read_result
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.importers.tables.mapping import read_mapping
+from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"

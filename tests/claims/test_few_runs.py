@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.runs.experiment import Study, load_experiment, numbers_of, run_experiment
-from recorders.parameters import build
-from recorders.registry import load
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of, run_experiment
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
 from tests.claims.few_runs import opposite
 from tests.claims.pages import stored
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import Claim, decide, known
-from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.experiment import Study, load_experiment, numbers_of
-from pipeline.runs.inputs import shipped
-from recorders.importers.tables.mapping import shipped as shipped_mappings
-from recorders.parameters import build
-from recorders.registry import load
+from fuselog.pipeline.output.claims import Claim, decide, known
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
 from tests.bench import __main__ as bench
 from tests.claims import pages
 from tests.docs.reference import PLACES

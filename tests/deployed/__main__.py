@@ -18,8 +18,8 @@ from typing import Any
 
 import click
 
-from pipeline.deploying.certificate import CERTIFICATE
-from recorders.errors import BadInput
+from fuselog.pipeline.deploying.certificate import CERTIFICATE
+from fuselog.recorders.errors import BadInput
 from tests.claims.pages import DEPLOYED
 from tests.deployed.building import COMPILERS, furthest_of_all, missing_of_target, on_target
 from tests.deployed.hostile import hold_out_by_all

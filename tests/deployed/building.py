@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from pipeline.deploying.c_target import target_lines
+from fuselog.pipeline.deploying.c_target import target_lines
 
 COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
 WARNINGS = (

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import fuselog as fl
-from recorders.registry import available
+from fuselog.recorders.registry import available
 from tests.deployed.own_models import own_models
 from tests.pipeline import estimator_cases as cases
 from tests.replay.estimators.test_attitude import carried

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import fuselog as fl
-from pipeline.api.catalog import Entry
+from fuselog.pipeline.api.catalog import Entry
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEAD = """---

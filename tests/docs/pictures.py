@@ -10,12 +10,12 @@ from pathlib import Path
 import click
 from PIL import Image
 
-from pipeline.api.api import record
-from pipeline.api.replays import replay
-from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.runs.inputs import shipped
-from recorders.errors import choices
-from replay.timeline.viewer import screenshot
+from fuselog.pipeline.api.api import record
+from fuselog.pipeline.api.replays import replay
+from fuselog.pipeline.diagnosing.diagnosis import diagnose
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.errors import choices
+from fuselog.replay.timeline.viewer import screenshot
 from tests.docs.gallery import DOCS
 from tests.goldens.recipes import DATA, RECIPES, data_option, first_log, unpack
 

@@ -8,11 +8,11 @@ from itertools import groupby
 from pathlib import Path
 
 import fuselog as fl
-from pipeline.api.catalog import Entry
-from recorders.log.schemas import SCHEMAS, Field, Schema
-from recorders.parameters import describe, explain
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import registered_models
+from fuselog.pipeline.api.catalog import Entry
+from fuselog.recorders.log.schemas import SCHEMAS, Field, Schema
+from fuselog.recorders.parameters import describe, explain
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import registered_models
 from tests.bench.__main__ import COLUMNS
 from tests.claims.pages import SPEED
 
@@ -20,7 +20,7 @@ STUB = Path(__file__).parents[2] / "fuselog" / "__init__.pyi"
 COMMANDS = """# Commands
 
 ::: mkdocs-click
-    :module: pipeline.command_line
+    :module: fuselog.pipeline.command_line
     :command: fuselog
     :depth: 1
 """

@@ -15,7 +15,7 @@ import click
 from PIL import Image
 
 import fuselog as fl
-from pipeline.command_line import main as fuselog
+from fuselog.pipeline.command_line import main as fuselog
 from tests.docs.gallery import DOCS
 
 SCHEMES = ("light", "dark")

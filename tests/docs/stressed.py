@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from pipeline.runs.experiment import Setting, load_experiment, read_experiment
-from pipeline.runs.inputs import shipped as names_of
-from pipeline.runs.runner import Runner
-from pipeline.stressing.changes import CHANGES, DROPPED, PARAMETERS
-from pipeline.stressing.copies import How
-from pipeline.stressing.stressing import stress_runs
-from pipeline.stressing.sums import verdicts_of
-from recorders.errors import BadInput
+from fuselog.pipeline.runs.experiment import Setting, load_experiment, read_experiment
+from fuselog.pipeline.runs.inputs import shipped as names_of
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.stressing.changes import CHANGES, DROPPED, PARAMETERS
+from fuselog.pipeline.stressing.copies import How
+from fuselog.pipeline.stressing.stressing import stress_runs
+from fuselog.pipeline.stressing.sums import verdicts_of
+from fuselog.recorders.errors import BadInput
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEPT, PAGE = DOCS / "stressed.json", DOCS / "stress.md"

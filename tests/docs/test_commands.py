@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 import pytest
 
-from pipeline.command_line import fuselog
-from pipeline.runs.inputs import shipped
+from fuselog.pipeline.command_line import fuselog
+from fuselog.pipeline.runs.inputs import shipped
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

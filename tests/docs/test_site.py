@@ -11,7 +11,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from pipeline.runs.inputs import shipped
+from fuselog.pipeline.runs.inputs import shipped
 from tests.docs import gallery, hooks, notebooks, reference
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import fuselog as fl
-from replay.judging.metrics.measuring import find_metrics
+from fuselog.replay.judging.metrics.measuring import find_metrics
 from tests.docs.test_worked_pages import WORKED
 
 DOCS = Path(__file__).parents[2] / "docs"

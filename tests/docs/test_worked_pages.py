@@ -24,7 +24,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from replay.timeline import show
+from fuselog.replay.timeline import show
 from tests.pipeline.conftest import run_here
 
 DOCS = Path(__file__).parents[2] / "docs"

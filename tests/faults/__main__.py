@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.output.terminal import print_table, say
+from fuselog.pipeline.output.terminal import print_table, say
 
 PARTS = sorted(
     path.stem for path in Path(__file__).parent.glob("*.py") if "\ndef run(" in path.read_text()

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.command_line import main
-from pipeline.output.results import TIMINGS
-from pipeline.runs.checkpoints import Checkpoints
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.output.results import TIMINGS
+from fuselog.pipeline.runs.checkpoints import Checkpoints
 from tests.faults import Tally
 
 COMMANDS = (

@@ -22,11 +22,11 @@ from mcap.data_stream import RecordBuilder
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from pipeline.command_line import main
-from recorders.log import Stream
-from recorders.log.container.chunks import MAGIC
-from recorders.log.container.sealed import seal
-from recorders.recording import record_run
+from fuselog.pipeline.command_line import main
+from fuselog.recorders.log import Stream
+from fuselog.recorders.log.container.chunks import MAGIC
+from fuselog.recorders.log.container.sealed import seal
+from fuselog.recorders.recording import record_run
 from tests.faults import Tally
 from tests.faults.damaged_logs import tally
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, loops, open_log, read_streams
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, RunMetadata, Stream, loops, open_log, read_streams
 from tests.faults import Tally
 from tests.recorders.log_samples import some_streams
 

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from pipeline.command_line import main
+from fuselog.pipeline.command_line import main
 from tests.faults import Tally
 
 # What one command may take.

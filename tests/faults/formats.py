@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.command_line import main
-from recorders.log.loops import scan
+from fuselog.pipeline.command_line import main
+from fuselog.recorders.log.loops import scan
 from tests.conftest import without_drawing
 from tests.faults import Tally
 from tests.faults.children import how, in_child, in_children

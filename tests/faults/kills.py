@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rerun.chunk import RrdReader
 
-from pipeline.command_line import main
-from pipeline.output.results import TIMINGS
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.output.results import TIMINGS
 from tests.faults import Tally
 
 FUSELOG = str(Path(sys.executable).with_name("fuselog"))

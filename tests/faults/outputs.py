@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.command_line import main
+from fuselog.pipeline.command_line import main
 from tests.faults import Tally
 
 AIS = (

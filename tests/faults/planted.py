@@ -21,11 +21,11 @@ from unittest import mock
 
 import numpy as np
 
-from pipeline.command_line import main
-from recorders.log import RunMetadata, Stream, schemas, write_log
-from recorders.log import writer as log_writer
-from recorders.log.impossible import TIMELESS, YEAR_NS
-from recorders.recording import record_run
+from fuselog.pipeline.command_line import main
+from fuselog.recorders.log import RunMetadata, Stream, schemas, write_log
+from fuselog.recorders.log import writer as log_writer
+from fuselog.recorders.log.impossible import TIMELESS, YEAR_NS
+from fuselog.recorders.recording import record_run
 from tests.faults import Tally
 
 SHORT = {"duration_s": 4.0}

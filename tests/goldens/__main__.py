@@ -5,9 +5,9 @@ from pathlib import Path
 
 import click
 
-from pipeline.checking.discrepancies import discrepancies
-from pipeline.checking.stored import read, write
-from recorders.errors import choices
+from fuselog.pipeline.checking.discrepancies import discrepancies
+from fuselog.pipeline.checking.stored import read, write
+from fuselog.recorders.errors import choices
 from tests.goldens import store
 from tests.goldens.recipes import DATA, RECIPES, data_option, index, unpack
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.output.results import Outcome
-from pipeline.runs.inputs import shipped
-from recorders.parameters import flat
-from recorders.parsing import read_toml
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.parameters import flat
+from fuselog.recorders.parsing import read_toml
 from tests.goldens.numbers import PATHS, SPREAD, Name, Quantities, Statistics, brief, of_outcome
 
 FOLDER = Path(__file__).with_name("numbers")

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.output.charts import Band, Chart, Panel
-from pipeline.output.results import MetricValue, Outcome, split_metric
-from recorders.log import Stream
-from recorders.recording import Recording
+from fuselog.pipeline.output.charts import Band, Chart, Panel
+from fuselog.pipeline.output.results import MetricValue, Outcome, split_metric
+from fuselog.recorders.log import Stream
+from fuselog.recorders.recording import Recording
 
 SPREAD = ("std", "step", "last")
 LEAST = 2e-6  # of an outcome: angles between equal directions, in degrees, have as much rounding

@@ -15,14 +15,14 @@ from typing import Any
 import click
 import numpy as np
 
-from pipeline.runs.experiment import Experiment, load_experiment
-from pipeline.runs.inputs import load_scenario, shipped
-from pipeline.studies.optical.moving import unknowns
-from recorders.log import RunMetadata
-from recorders.parameters import merge
-from recorders.recording import Recording, import_run, record_run
-from recorders.simulators.moving_optical import MovingOpticalParameters
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.runs.experiment import Experiment, load_experiment
+from fuselog.pipeline.runs.inputs import load_scenario, shipped
+from fuselog.pipeline.studies.optical.moving import unknowns
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.parameters import merge
+from fuselog.recorders.recording import Recording, import_run, record_run
+from fuselog.recorders.simulators.moving_optical import MovingOpticalParameters
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 # Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive
 # that this is in.

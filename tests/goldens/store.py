@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.checking.golden import Replayed, Tolerance, Tolerances, golden_of, make
-from pipeline.checking.stored import SUFFIX, Golden
-from pipeline.runs.experiment import run_experiment
+from fuselog.pipeline.checking.golden import Replayed, Tolerance, Tolerances, golden_of, make
+from fuselog.pipeline.checking.stored import SUFFIX, Golden
+from fuselog.pipeline.runs.experiment import run_experiment
 from tests.goldens.recipes import RECIPES, first_log
 
 FOLDER = Path(__file__).parent / "stored"

@@ -25,16 +25,16 @@ def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_what_one_begins_with_has_an_example() -> None:
     for each in (
-        "recorders.log.writer:write_log",
-        "recorders.log.opening:open_log",
-        "recorders.log.reader:read_streams",
-        "recorders.log.streams:Stream",
-        "recorders.log.streams:make_stream",
-        "recorders.recording:record_run",
-        "replay.engine.vectors.covariances:normalized_error_squared",
-        "replay.engine.api.functions:batch",
-        "replay.engine.api.functions:recursive",
-        "replay.inference.model.model:Model",
+        "fuselog.recorders.log.writer:write_log",
+        "fuselog.recorders.log.opening:open_log",
+        "fuselog.recorders.log.reader:read_streams",
+        "fuselog.recorders.log.streams:Stream",
+        "fuselog.recorders.log.streams:make_stream",
+        "fuselog.recorders.recording:record_run",
+        "fuselog.replay.engine.vectors.covariances:normalized_error_squared",
+        "fuselog.replay.engine.api.functions:batch",
+        "fuselog.replay.engine.api.functions:recursive",
+        "fuselog.replay.inference.model.model:Model",
     ):
         module, _, name = each.partition(":")
         assert ">>> " in getattr(import_module(module), name).__doc__, each

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.charts import Chart, Panel, Series
-from pipeline.output.results import Outcome
-from recorders.log import make_stream, schemas
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.pipeline.output.charts import Chart, Panel, Series
+from fuselog.pipeline.output.results import Outcome
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
 from tests.goldens import keeping
 from tests.goldens.keeping import FOLDER, MOST_LINES, TESTS, against, capped, kept_of, read, written
 from tests.goldens.numbers import Quantities, of_outcome, of_recording

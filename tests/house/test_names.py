@@ -140,7 +140,7 @@ def test_every_attribute_that_is_described_is_one() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "see `replay.inference.steps.reading`",
+        "see `fuselog.replay.inference.steps.reading`",
         "see `steps.taking_in`",
         "see `Stream.colums`",
         "see replay/inference/steps.py",

@@ -132,7 +132,7 @@ def test_processes_are_started_in_known_places() -> None:
             alias.asname or alias.name
             for node in nodes_of(path)
             if isinstance(node, ast.ImportFrom) and node.module
-            if node.module.partition(".")[0] in MODULES or node.module == "recorders.processes"
+            if node.module.partition(".")[0] in MODULES or node.module == "fuselog.recorders.processes"
             for alias in node.names
         }
         for node in nodes_of(path):

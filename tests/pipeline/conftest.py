@@ -17,12 +17,21 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from pipeline.command_line import main
-from pipeline.output.report import write_report
-from pipeline.output.report.kinds import run_sentences
-from pipeline.output.results import Outcome, Result, write_outcome
-from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
-from recorders.recording import record_run
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.output.report import write_report
+from fuselog.pipeline.output.report.kinds import run_sentences
+from fuselog.pipeline.output.results import Outcome, Result, write_outcome
+from fuselog.recorders.log import (
+    Field,
+    Schema,
+    Stream,
+    make_stream,
+    open_log,
+    read_streams,
+    schemas,
+    write_log,
+)
+from fuselog.recorders.recording import record_run
 from tests.claims.few_runs import opposite
 from tests.conftest import without_drawing
 from tests.goldens import keeping
@@ -30,15 +39,15 @@ from tests.goldens import keeping
 SHORT = ["--set", "duration_s=2"]
 # the modules whose outcomes become folders
 WRITERS = (
-    "pipeline.api.estimates",
-    "pipeline.api.replays",
-    "pipeline.api.trajectories",
-    "pipeline.calibrating.ellipsoid",
-    "pipeline.comparing.comparing",
-    "pipeline.diagnosing.diagnosis",
-    "pipeline.runs.experiment",
-    "pipeline.sensing.outcome",
-    "pipeline.tuning.outcome",
+    "fuselog.pipeline.api.estimates",
+    "fuselog.pipeline.api.replays",
+    "fuselog.pipeline.api.trajectories",
+    "fuselog.pipeline.calibrating.ellipsoid",
+    "fuselog.pipeline.comparing.comparing",
+    "fuselog.pipeline.diagnosing.diagnosis",
+    "fuselog.pipeline.runs.experiment",
+    "fuselog.pipeline.sensing.outcome",
+    "fuselog.pipeline.tuning.outcome",
 )
 # modules of tests that look at something else than numbers, by commands that others hold
 ABOUT_OTHERS = (

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from recorders.parameters import merge
-from recorders.recording import Simulator
-from recorders.registry import load
+from fuselog.recorders.parameters import merge
+from fuselog.recorders.recording import Simulator
+from fuselog.recorders.registry import load
 from tests.pipeline.moves import switched_on
 
 

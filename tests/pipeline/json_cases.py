@@ -13,10 +13,10 @@ import pytest
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.api.estimates import judge_estimates
-from pipeline.output.alarms import NOT_TESTED
-from pipeline.sensing.foreign_files import explained
-from recorders.log import open_log
+from fuselog.pipeline.api.estimates import judge_estimates
+from fuselog.pipeline.output.alarms import NOT_TESTED
+from fuselog.pipeline.sensing.foreign_files import explained
+from fuselog.recorders.log import open_log
 from tests.pipeline.json_of_files import (
     of_catalog,
     of_cut_log,
@@ -299,41 +299,43 @@ CASES = [
     Case(
         "evaluate way.tum --truth turned.tum --align sim3 --time-offset 0.5 --out way",
         of_trajectories,
-        "pipeline.api.trajectories.evaluate",
+        "fuselog.pipeline.api.trajectories.evaluate",
     ),
     Case(
         "compare run.mcap -e ekf -e ukf --stress --out compared --save both.rrd",
         of_comparison,
-        "pipeline.comparing.command.compare",
+        "fuselog.pipeline.comparing.command.compare",
     ),
     Case(
         "diagnose run.mcap -e ekf --set sigma_range_m=0.03 --out why --save why.rrd",
         of_diagnosis,
-        "pipeline.diagnosing.command.diagnose",
+        "fuselog.pipeline.diagnosing.command.diagnose",
     ),
-    Case("stress run.mcap -e ekf", of_stress, "pipeline.stressing.command.stress"),
+    Case("stress run.mcap -e ekf", of_stress, "fuselog.pipeline.stressing.command.stress"),
     Case("observability run.mcap", of_observability),
     Case(
         "tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad --validate other.mcap "
         "--gap-limit 0.5 --out tuned",
         of_tuning,
-        "pipeline.tuning.command.tune",
+        "fuselog.pipeline.tuning.command.tune",
     ),
     Case(
         "calibrate run.mcap -e ekf --out calibrated",
         of_calibration,
-        "pipeline.calibrating.command.calibrate",
+        "fuselog.pipeline.calibrating.command.calibrate",
     ),
     Case("deploy run.mcap -e ekf -o robot_ekf", of_deployment),
-    Case("noise rest.mcap --out noise", of_noise, "pipeline.sensing.command.noise"),
+    Case("noise rest.mcap --out noise", of_noise, "fuselog.pipeline.sensing.command.noise"),
     Case("noise imu.yaml", of_foreign_noise),
     Case(
         "ellipsoid turned.mcap --field /imu.magnetic_field_ut --out ellipsoid",
         of_ellipsoid,
-        "pipeline.calibrating.command.ellipsoid",
+        "fuselog.pipeline.calibrating.command.ellipsoid",
     ),
-    Case("check run.mcap --against ekf.golden.xz", of_check, "pipeline.checking.command.check"),
-    Case("check run.mcap --against surer.golden.xz", of_check, "pipeline.checking.command.check"),
+    Case("check run.mcap --against ekf.golden.xz", of_check, "fuselog.pipeline.checking.command.check"),
+    Case(
+        "check run.mcap --against surer.golden.xz", of_check, "fuselog.pipeline.checking.command.check"
+    ),
     Case("info grave.mcap", of_log),
     Case("info cut.mcap --recover", of_cut_log),
     Case("info result", lambda: {"path": "result", **of_result("result")}),

@@ -14,8 +14,8 @@ import pandas as pd
 from mcap.reader import make_reader
 
 import fuselog as fl
-from pipeline.runs.inputs import shipped
-from recorders.log import open_log
+from fuselog.pipeline.runs.inputs import shipped
+from fuselog.recorders.log import open_log
 from tests.pipeline.conftest import run_here
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import fuselog as fl
-from recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
 
 SIZES = np.array([0.8, 0.9, 1.0, 1.1, 1.2, 1.0])
 EPOCH_NS, STEP_NS, STEPS = 1_767_225_600_000_000_000, 100_000_000, 21

@@ -4,8 +4,8 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from recorders.errors import BadInput
-from recorders.parameters import Described, Parameters, build, describe, merge, nested
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Described, Parameters, build, describe, merge, nested
 
 # Numbers of what happens so often, by how their names end, and one under which other parameters count.
 OFTEN = {"rate_hz": 2.0, "_per_minute": 20.0, "_per_scan": 2.0, "_probability": 0.5}

@@ -19,10 +19,10 @@ from mcap.writer import Writer
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from pipeline.calibrating.ellipsoid_study import recorded
-from pipeline.command_line.group import fuselog
-from pipeline.command_line.options import Output
-from recorders.log import make_stream, schemas, write_log
+from fuselog.pipeline.calibrating.ellipsoid_study import recorded
+from fuselog.pipeline.command_line.group import fuselog
+from fuselog.pipeline.command_line.options import Output
+from fuselog.recorders.log import make_stream, schemas, write_log
 from tests.pipeline.conftest import MRCLAM, run_here
 
 AIS = (

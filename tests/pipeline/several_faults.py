@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 import fuselog as fl
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.diagnosing.battery.car import (
     NOISE,
     TURN_DENSITY,
     Noise,
@@ -19,7 +19,7 @@ from pipeline.diagnosing.battery.car import (
     recorded,
     stamps_ns,
 )
-from pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 
 GYRO = "/car/turn_rate"
 OPEN = {"kind": "ekf", "gate_probability": 1.0}

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import load_experiment
-from pipeline.studies.acoustic import recordings, sequence
-from pipeline.studies.acoustic.recordings import (
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.studies.acoustic import recordings, sequence
+from fuselog.pipeline.studies.acoustic.recordings import (
     Options,
     Published,
     Simulated,
@@ -20,11 +20,11 @@ from pipeline.studies.acoustic.recordings import (
     differences_of,
     known_place,
 )
-from pipeline.studies.acoustic.sequence import log_ratio, of_runs, positions, shots_of
-from recorders.errors import BadInput
-from recorders.recording import import_run, record_run
-from replay.engine.streams.sources import memory_source
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.studies.acoustic.sequence import log_ratio, of_runs, positions, shots_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import import_run, record_run
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.errors.evaluation import Errors
 from tests.goldens import keeping
 
 

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 import rerun.chunk
 
-from pipeline.output.claims import decide
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.api.api import record
-from pipeline.api.replays import replay
-from recorders.log import Stream, write_log
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.api.api import record
+from fuselog.pipeline.api.replays import replay
+from fuselog.recorders.log import Stream, write_log
+from fuselog.replay.engine.streams.sources import MemorySource
 from tests.pipeline.conftest import Said
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.altering import alterations as put
-from pipeline.altering.changes import bare
-from pipeline.altering.entries import _columns
-from pipeline.altering.sources import alter
-from pipeline.diagnosing.battery.car import car
-from recorders.log.streams import concatenate
-from recorders.models.orientation import heading
-from recorders.parameters import parse_settings
+from fuselog.pipeline.altering import alterations as put
+from fuselog.pipeline.altering.changes import bare
+from fuselog.pipeline.altering.entries import _columns
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.diagnosing.battery.car import car
+from fuselog.recorders.log.streams import concatenate
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.parameters import parse_settings
 from tests.pipeline.test_python import robot
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 

@@ -6,16 +6,16 @@ import pytest
 from pydantic import BaseModel
 
 import fuselog as fl
-from pipeline.command_line.process import main
-from pipeline.logs.constraints import ConstraintParameters
-from pipeline.runs.experiment import Experiment, Study
-from recorders.importers.biometrics import Matchers
-from recorders.importers.ros.mapping import Mapping
-from recorders.importers.tables.mapping import LogMapping
-from recorders.parameters import describe
-from recorders.registry import available, load
-from replay.inference.all_methods import METHODS
-from replay.inference.observability import OBSERVABILITY
+from fuselog.pipeline.command_line.process import main
+from fuselog.pipeline.logs.constraints import ConstraintParameters
+from fuselog.pipeline.runs.experiment import Experiment, Study
+from fuselog.recorders.importers.biometrics import Matchers
+from fuselog.recorders.importers.ros.mapping import Mapping
+from fuselog.recorders.importers.tables.mapping import LogMapping
+from fuselog.recorders.parameters import describe
+from fuselog.recorders.registry import available, load
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.observability import OBSERVABILITY
 
 # Those that are in no list: of the command line, of an experiment's file, of mappings.
 OTHERS = (ConstraintParameters, Experiment, LogMapping, Mapping, Matchers, OBSERVABILITY.parameters)

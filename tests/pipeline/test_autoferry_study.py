@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
-from pipeline.runs.inputs import Recording
-from recorders.errors import BadInput
-from recorders.parameters import build
+from fuselog.pipeline.runs.experiment import Experiment, load_experiment, run_experiment
+from fuselog.pipeline.runs.inputs import Recording
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import build
 from tests.claims.pages import FOLDER
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
-from recorders.log import open_log, read_streams, write_log
-from recorders.recording import record_run
+from fuselog.recorders.log import open_log, read_streams, write_log
+from fuselog.recorders.recording import record_run
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

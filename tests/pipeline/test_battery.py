@@ -12,12 +12,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from pipeline.altering.sources import alter
-from pipeline.diagnosing import portion
-from pipeline.diagnosing.battery import battery, consistent, together
-from pipeline.diagnosing.battery import car as battery_car
-from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.diagnosing import portion
+from fuselog.pipeline.diagnosing.battery import battery, consistent, together
+from fuselog.pipeline.diagnosing.battery import car as battery_car
+from fuselog.pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
+from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
     Car,
     Noise,
@@ -29,18 +29,18 @@ from pipeline.diagnosing.battery.car import (
     recorded,
     stamps_ns,
 )
-from pipeline.diagnosing.causes import find_causes, seek
-from pipeline.diagnosing.consistency import judged_by_itself
-from pipeline.diagnosing.findings import undone_by, without_filter
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.tuning.measured import until_last_measured
-from recorders.log.planes import Origin
-from recorders.models.geodesy import out_of_tangent_plane
-from recorders.models.orientation import heading
-from replay.engine.replaying.estimator import bind
-from replay.judging.consistency.consistency import CONSISTENT
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.pipeline.diagnosing.causes import find_causes, seek
+from fuselog.pipeline.diagnosing.consistency import judged_by_itself
+from fuselog.pipeline.diagnosing.findings import undone_by, without_filter
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.tuning.measured import until_last_measured
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.models.orientation import heading
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.judging.consistency.consistency import CONSISTENT
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from tests.pipeline.several_faults import GYRO, lost_by, several
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
 
 pytestmark = pytest.mark.paper
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.biometrics.sequential import Drawn, Options, wald_tests, watched
-from recorders.errors import BadInput
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.biometrics.sequential import Drawn, Options, wald_tests, watched
+from fuselog.recorders.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 import rerun.chunk as rc
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from replay.judging.consistency.verification import relative_rate_increase
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.replay.judging.consistency.verification import relative_rate_increase
 
 pytestmark = pytest.mark.paper
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 import fuselog as fl
-from pipeline.altering.alterations import delayed
-from pipeline.calibrating import study
-from pipeline.calibrating.car import (
+from fuselog.pipeline.altering.alterations import delayed
+from fuselog.pipeline.calibrating import study
+from fuselog.pipeline.calibrating.car import (
     NAMES,
     OURS,
     TRUTH,
@@ -25,18 +25,18 @@ from pipeline.calibrating.car import (
     slalom,
     straight,
 )
-from pipeline.calibrating.kalibr import FILE, kalibr_yaml
-from pipeline.calibrating.manoeuvres import _simulated, advice, gain
-from pipeline.diagnosing.battery.car import arcs
-from pipeline.tuning.command import progress_of
-from pipeline.tuning.information import information
-from pipeline.tuning.objective import Best, Objective, in_memory
-from recorders.common_streams import fix_stream, prior_stream
-from recorders.log import RunMetadata
-from recorders.models.inertial import from_mounting
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.sources import memory_source
+from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
+from fuselog.pipeline.calibrating.manoeuvres import _simulated, advice, gain
+from fuselog.pipeline.diagnosing.battery.car import arcs
+from fuselog.pipeline.tuning.command import progress_of
+from fuselog.pipeline.tuning.information import information
+from fuselog.pipeline.tuning.objective import Best, Objective, in_memory
+from fuselog.recorders.common_streams import fix_stream, prior_stream
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.models.inertial import from_mounting
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.sources import memory_source
 from tests.goldens import keeping
 
 A_V, A_W, B_W = TRUTH[:3]

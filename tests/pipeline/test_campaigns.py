@@ -17,18 +17,29 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.command_line import main
-from pipeline.output.results import TIMINGS
-from pipeline.runs import campaigns, executors
-from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, processes, version_of_code
-from pipeline.runs.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
-from pipeline.runs.inputs import Record
-from recorders.errors import BadInput
-from recorders.log import write_log
-from recorders.recording import record_run
-from replay.foreign.naming import Allowed
-from replay.judging.metrics.sums import BinnedSums
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.output.results import TIMINGS
+from fuselog.pipeline.runs import campaigns, executors
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.executors import (
+    InlineExecutor,
+    WorkerPool,
+    pool_for,
+    processes,
+    version_of_code,
+)
+from fuselog.pipeline.runs.experiment import (
+    Experiment,
+    experiment_of_logs,
+    load_experiment,
+    run_experiment,
+)
+from fuselog.pipeline.runs.inputs import Record
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import write_log
+from fuselog.recorders.recording import record_run
+from fuselog.replay.foreign.naming import Allowed
+from fuselog.replay.judging.metrics.sums import BinnedSums
 from tests.bench import scaling
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -56,7 +67,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module", autouse=True)
 def _small_cells() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
+        patch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
         yield
 
 
@@ -109,7 +120,7 @@ def worked_off(monkeypatch) -> list[int]:
 @pytest.mark.paper
 def test_cells_are_merged_into_what_one_pass_gives(whole, tmp_path, monkeypatch):
     folder, files = whole
-    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", RUNS)
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", RUNS)
     one_pass = json.loads(run(tmp_path / "one")["result.json"])["metrics"]
     assert json.loads(files["result.json"])["metrics"] == pytest.approx(one_pass, rel=1e-12)
     errors = pytest.importorskip("pandas").read_parquet(folder / "tables/errors/ekf-robot1.parquet")
@@ -256,7 +267,7 @@ def test_a_worker_has_one_thread_for_linear_algebra() -> None:
 @pytest.mark.paper
 def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
     """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
-    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     drives, place = tmp_path / "drives", tmp_path / "result"
     drives.mkdir()
     logs = [drives / f"{seed}.mcap" for seed in (1, 2)]
@@ -425,7 +436,7 @@ def test_the_simulated_driver_is_the_limit_where_it_is_busy():
 
 @pytest.mark.paper
 def test_processes_give_the_same_bytes_also_after_a_kill(place, monkeypatch):
-    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 128)
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 128)
     runs = 260
     files = run(place, runs=runs)
     shutil.rmtree(place)

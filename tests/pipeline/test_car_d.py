@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.diagnosing.battery.car import drive
+from fuselog.pipeline.diagnosing.battery.car import drive
 
 
 def test_the_car_is_that_of_the_sheet() -> None:

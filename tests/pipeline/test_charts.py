@@ -11,15 +11,21 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from pipeline.comparing.comparing import _chart as difference_chart
-from pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, draw
-from pipeline.output.report.first_run import first_run
-from pipeline.output.report.scene import nis_chart, plan, tracked
-from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
-from pipeline.runs.sweeps import Over, figures_of
-from pipeline.tuning.outcome import Tuning
-from recorders.log import RunMetadata, make_stream, schemas, write_log
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.comparing.comparing import _chart as difference_chart
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, draw
+from fuselog.pipeline.output.report.first_run import first_run
+from fuselog.pipeline.output.report.scene import nis_chart, plan, tracked
+from fuselog.pipeline.output.summary import (
+    effective_chart,
+    error_chart,
+    late_chart,
+    late_counts,
+    mode_chart,
+)
+from fuselog.pipeline.runs.sweeps import Over, figures_of
+from fuselog.pipeline.tuning.outcome import Tuning
+from fuselog.recorders.log import RunMetadata, make_stream, schemas, write_log
+from fuselog.replay.judging.errors.evaluation import Errors
 
 TIMES = np.array([0.0, 1.0, 2.0])
 
@@ -332,7 +338,7 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
         if is_out.any():
             own["outside"] = [middle[is_out], np.zeros(45)]
     found["other", "b"] = found["calm", "a"]
-    monkeypatch.setattr("pipeline.output.report.scene.innovations_of_runs", lambda _: found)
+    monkeypatch.setattr("fuselog.pipeline.output.report.scene.innovations_of_runs", lambda _: found)
     (tmp_path / "estimates").mkdir()
     for run in range(2):
         (tmp_path / f"estimates/run-000{run}.mcap").touch()

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from fuselog.pipeline.checking.checking import Checked
+from fuselog.pipeline.checking.discrepancies import Discrepancy, discrepancies
+from fuselog.pipeline.checking.golden import Replayed, checksums
+from fuselog.pipeline.checking.junit import write_junit
+from fuselog.pipeline.checking.stored import read, write
+from fuselog.recorders.log import LogWriter
 from fuselog.testing import _require, assert_golden
-from pipeline.checking.checking import Checked
-from pipeline.checking.discrepancies import Discrepancy, discrepancies
-from pipeline.checking.golden import Replayed, checksums
-from pipeline.checking.junit import write_junit
-from pipeline.checking.stored import read, write
-from recorders.log import LogWriter
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.output.results import TIMINGS
-from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
-from pipeline.runs.executors import InlineExecutor, WorkerPool
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
+from fuselog.pipeline.output.results import TIMINGS
+from fuselog.pipeline.runs.checkpoints import Checkpoints, checkpoints_of
+from fuselog.pipeline.runs.executors import InlineExecutor, WorkerPool
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -27,7 +27,7 @@ SETTINGS = {"duration_s": 1.0, "estimators": {"dead-reckoning": {}}}
 @pytest.fixture(scope="module", autouse=True)
 def _small_cells() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
+        patch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", CELL)
         yield
 
 

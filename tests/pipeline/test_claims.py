@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import (
+from fuselog.pipeline.output.claims import (
     Claim,
     StatedClaim,
     decide,
@@ -15,12 +15,12 @@ from pipeline.output.claims import (
     require_names,
     require_recordings,
 )
-from pipeline.output.expressions import Values, evaluate, formatted, truth
-from pipeline.output.numbers import Number, exactly
-from pipeline.runs.experiment import Experiment, Stated, load_experiment
-from pipeline.runs.inputs import Recording, holding, shipped
-from recorders.errors import BadInput
-from recorders.parameters import build
+from fuselog.pipeline.output.expressions import Values, evaluate, formatted, truth
+from fuselog.pipeline.output.numbers import Number, exactly
+from fuselog.pipeline.runs.experiment import Experiment, Stated, load_experiment
+from fuselog.pipeline.runs.inputs import Recording, holding, shipped
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import build
 from tests.goldens.recipes import DATA, importer_of, unpack
 
 METRICS = {

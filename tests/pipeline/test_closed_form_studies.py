@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm, t
 
-from pipeline.output.expressions import Values, evaluate, formatted
-from pipeline.output.numbers import exactly
-from pipeline.output.results import Outcome
-from pipeline.studies.biometrics.sequential import Drawn, Options, probes_of
-from pipeline.studies.navigation import imu_grades
-from pipeline.studies.networks.networks import network_table, traces_of_equation_17
-from pipeline.studies.optical.moving import _measure
-from pipeline.studies.toolkit.repetitions import (
+from fuselog.pipeline.output.expressions import Values, evaluate, formatted
+from fuselog.pipeline.output.numbers import exactly
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.studies.biometrics.sequential import Drawn, Options, probes_of
+from fuselog.pipeline.studies.navigation import imu_grades
+from fuselog.pipeline.studies.networks.networks import network_table, traces_of_equation_17
+from fuselog.pipeline.studies.optical.moving import _measure
+from fuselog.pipeline.studies.toolkit.repetitions import (
     by_repetition,
     mean_interval,
     rms_length,
@@ -24,11 +24,11 @@ from pipeline.studies.toolkit.repetitions import (
     root_mean_square,
     worst_deviation,
 )
-from pipeline.studies.vehicles import scaling
-from pipeline.studies.vehicles.cases import score_set
-from pipeline.studies.vehicles.scaling import growth_of
-from recorders.log import RunMetadata
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.studies.vehicles import scaling
+from fuselog.pipeline.studies.vehicles.cases import score_set
+from fuselog.pipeline.studies.vehicles.scaling import growth_of
+from fuselog.recorders.log import RunMetadata
+from fuselog.replay.engine.streams.sources import MemorySource
 from tests.goldens import keeping
 
 # Two runs of two steps, one of which failed; errors of 5, 13 and 17 m.

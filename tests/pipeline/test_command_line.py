@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.api.lists import KEPT
-from pipeline.output.results import result_folder
-from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.pipeline.api.lists import KEPT
+from fuselog.pipeline.output.results import result_folder
+from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 from tests.lists import lists
 from tests.pipeline.conftest import heeding_interrupts
 from tests.replay.foreign.test_isolation import SANE, run_with
@@ -115,7 +115,7 @@ def test_more_runs_than_are_replayed_at_once(
     here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thousand logs must not need a thousand open files: they are replayed in parts."""
-    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     logs = [str(world / "log.mcap"), str(world / "other.mcap")]
     in_parts = fuselog("replay", *logs, "-e", "ekf", "--out", "a", "--json").json["metrics"]
     monkeypatch.undo()
@@ -128,7 +128,7 @@ def test_a_part_of_the_runs_that_cannot_start_fails_alone(
     world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one run of an ensemble does; where no run of any part can start, that is bad input."""
-    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     good, bad = str(world / "log.mcap"), str(world / "bad-prior.mcap")
     said = fuselog("replay", good, bad, "-e", "ekf", "--out", "both", "--json")
     assert said.code == 0, said.err
@@ -375,7 +375,7 @@ def test_the_model_and_the_interval_of_estimates_are_options(world: Path, fuselo
 def test_help_imports_nothing_heavy() -> None:
     """--help answers at once: what takes long to import waits for a command that needs it."""
     code = (
-        "import sys; from pipeline.command_line import main; code = main(['--help']); "
+        "import sys; from fuselog.pipeline.command_line import main; code = main(['--help']); "
         "print(code, *{'numpy', 'numba', 'rerun', 'pandas', 'pydantic', 'rich'} & set(sys.modules))"
     )
     said = subprocess.run(
@@ -412,7 +412,7 @@ sys.stderr = io.TextIOWrapper(io.BufferedWriter(Slow()))
 atexit.register(clear)  # before logging's own, so that it is called after that
 threading.Thread(target=work, daemon=DAEMON).start()
 
-from pipeline.command_line import main
+from fuselog.pipeline.command_line import main
 sys.exit(main())
 """
 
@@ -429,7 +429,7 @@ def test_a_thread_at_work_does_not_spoil_the_end(is_daemon: bool) -> None:
 
 FAILS = """
 import sys, threading, time
-from pipeline.command_line import main, process
+from fuselog.pipeline.command_line import main, process
 
 process.fuselog = lambda *_, **__: 1 / 0
 threading.Thread(target=time.sleep, args=[60.0]).start()
@@ -451,10 +451,16 @@ HEAVY = (
     "scipy",
 )
 # What compiles and loads kernels.
-KERNELS = ("replay.engine.compiling.kernel_cache", "replay.engine.compiling.inlining")
+KERNELS = ("fuselog.replay.engine.compiling.kernel_cache", "fuselog.replay.engine.compiling.inlining")
 
 # What a list needs nothing of: what it lists.
-LISTED = (*HEAVY, *KERNELS, "recorders.simulators.landmarks", "replay.inference", "pipeline.studies")
+LISTED = (
+    *HEAVY,
+    *KERNELS,
+    "fuselog.recorders.simulators.landmarks",
+    "fuselog.replay.inference",
+    "fuselog.pipeline.studies",
+)
 
 
 @pytest.mark.paper
@@ -469,7 +475,7 @@ LISTED = (*HEAVY, *KERNELS, "recorders.simulators.landmarks", "replay.inference"
             "estimators ekf": (),
         },
         {
-            "replay log.mcap -e ekf -e ukf": (*HEAVY, "pipeline.runs.experiment"),
+            "replay log.mcap -e ekf -e ukf": (*HEAVY, "fuselog.pipeline.runs.experiment"),
             "replay log.mcap -e ekf --save drawn.rrd": ("matplotlib", "scipy"),
         },
     ],
@@ -481,7 +487,7 @@ def test_a_command_imports_nothing_heavy_that_it_does_not_need(
 ) -> None:
     shutil.copy(world / "log.mcap", "log.mcap")
     code = (
-        "import sys; from pipeline.command_line import main; imported = []\n"
+        "import sys; from fuselog.pipeline.command_line import main; imported = []\n"
         f"for command, needless in {commands}.items():\n"
         "    imported += [main(command.split()), {*needless} & sys.modules.keys()]\n"
         "print(imported)"
@@ -564,7 +570,7 @@ def test_a_stopped_recording_or_replay_leaves_nothing(
         assert list(here.glob(".new.mcap.*.part/new.mcap"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("recorders.log.LogWriter.write", stop)
+    monkeypatch.setattr("fuselog.recorders.log.LogWriter.write", stop)
     said = fuselog(*command.format(log=world / "log.mcap").split(), "--out", "new.mcap")
     assert said.code == 130
     assert said.err.strip() == "fuselog: stopped"
@@ -601,7 +607,7 @@ def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
 
     sent = list[int]()
     monkeypatch.setattr("threading.Timer", Timer)
-    monkeypatch.setattr("recorders.log.LogWriter.write", finalize)
+    monkeypatch.setattr("fuselog.recorders.log.LogWriter.write", finalize)
     with heeding_interrupts():
         said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
     assert (said.code, said.err.strip()) == (128 + number, "fuselog: stopped")
@@ -657,7 +663,7 @@ def test_names_beyond_the_locale(world: Path) -> None:
     """In the C locale, a name that is not ASCII reaches Python, Rerun and Arrow in three ways."""
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = (
-        "import sys; from pipeline.command_line import main; log, folder, timeline = sys.argv[1:]\n"
+        "import sys; from fuselog.pipeline.command_line import main; log, folder, timeline = sys.argv[1:]\n"
         "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "run = main(['run', 'landmarks', '--runs', '1', '--set', 'duration_s=1', '--out', folder])\n"
         "print(run, *[main(['view', log, '--save', timeline]) for _ in range(2)])"

@@ -12,7 +12,7 @@ import click
 import pytest
 
 import fuselog as fl
-from pipeline.command_line import fuselog
+from fuselog.pipeline.command_line import fuselog
 from tests.pipeline.conftest import run_here
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

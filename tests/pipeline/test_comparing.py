@@ -16,14 +16,14 @@ import rerun.blueprint as rrb
 import tomli_w
 
 import fuselog as fl
-from pipeline.comparing.candidates import _stored
-from pipeline.comparing.comparing import Differences
-from pipeline.comparing.groups import unlike_runs
-from pipeline.comparing.paired import ALL, Paired, under_stress
-from pipeline.comparing.renamed import Renamed
-from pipeline.output.alarms import Stressing
-from replay.judging.errors.differences import Difference
-from replay.timeline.side_by_side import _alone
+from fuselog.pipeline.comparing.candidates import _stored
+from fuselog.pipeline.comparing.comparing import Differences
+from fuselog.pipeline.comparing.groups import unlike_runs
+from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
+from fuselog.pipeline.comparing.renamed import Renamed
+from fuselog.pipeline.output.alarms import Stressing
+from fuselog.replay.judging.errors.differences import Difference
+from fuselog.replay.timeline.side_by_side import _alone
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -140,7 +140,7 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one from before a change of the code: its own rows count, not those of today."""
-    import pipeline.comparing.candidates as candidates
+    import fuselog.pipeline.comparing.candidates as candidates
 
     def changed(*logs: Any, **options: Any) -> Any:
         wrong = [{label: {"sigma_range_m": 0.2} if label == "ekf" else {}} for label in logs[1][0]]

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import load_experiment
-from pipeline.studies.toolkit import localization
-from pipeline.studies.toolkit.consistency import ConsistencyOptions, study
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.studies.toolkit import localization
+from fuselog.pipeline.studies.toolkit.consistency import ConsistencyOptions, study
 
 
 def steps(estimator: str, nees: Any) -> pd.DataFrame:

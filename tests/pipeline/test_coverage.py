@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.api.replays import replay
-from pipeline.output.coverage import sentences
-from recorders.log import Stream, make_stream, open_log, read_streams, schemas, write_log
-from recorders.recording import record_run
-from replay.engine.replaying.usage import UNTAKEN, Row, Usage
-from replay.engine.streams.blocks import gather
+from fuselog.pipeline.api.replays import replay
+from fuselog.pipeline.output.coverage import sentences
+from fuselog.recorders.log import Stream, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.usage import UNTAKEN, Row, Usage
+from fuselog.replay.engine.streams.blocks import gather
 from tests.pipeline.conftest import Said
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.deploying.certificate import deepest_stack
-from recorders.errors import BadInput
-from replay.estimators.models.reactor import REACTOR
+from fuselog.pipeline.deploying.certificate import deepest_stack
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.models.reactor import REACTOR
 from tests.claims.pages import DEPLOYED
 from tests.deployed.building import (
     COMPILERS,

@@ -13,18 +13,18 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from pipeline.altering import alterations as alter
-from pipeline.altering import sources as altering
-from pipeline.diagnosing import diagnosis, study
-from pipeline.diagnosing.causes import Sought, find_causes, least_gain
-from pipeline.diagnosing.consistency import of_each_component
-from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
-from recorders.linting.lint import lint
-from replay.engine.replaying.estimator import bind
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering import sources as altering
+from fuselog.pipeline.diagnosing import diagnosis, study
+from fuselog.pipeline.diagnosing.causes import Sought, find_causes, least_gain
+from fuselog.pipeline.diagnosing.consistency import of_each_component
+from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
+from fuselog.recorders.linting.lint import lint
+from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 

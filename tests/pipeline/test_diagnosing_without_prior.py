@@ -11,16 +11,23 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.diagnosing import causes as seeking
-from pipeline.diagnosing.advice import Trying
-from pipeline.diagnosing.battery.car import car
-from pipeline.diagnosing.causes import Cause, find_causes
-from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.joint import Supposed, fit
-from pipeline.diagnosing.likelihood import EVER_NS, Likelihood, Trial, _broad, _span, first_of_each
-from pipeline.diagnosing.search import DROP_95
-from replay.engine.replaying.estimator import bind
+from fuselog.pipeline.diagnosing import causes as seeking
+from fuselog.pipeline.diagnosing.advice import Trying
+from fuselog.pipeline.diagnosing.battery.car import car
+from fuselog.pipeline.diagnosing.causes import Cause, find_causes
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.joint import Supposed, fit
+from fuselog.pipeline.diagnosing.likelihood import (
+    EVER_NS,
+    Likelihood,
+    Trial,
+    _broad,
+    _span,
+    first_of_each,
+)
+from fuselog.pipeline.diagnosing.search import DROP_95
+from fuselog.replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}

@@ -11,8 +11,8 @@ from mcap.writer import Writer
 from numpy.testing import assert_array_equal
 
 import fuselog as fl
-from pipeline.logs import rewriting
-from recorders.log import LogWriter, read_span
+from fuselog.pipeline.logs import rewriting
+from fuselog.recorders.log import LogWriter, read_span
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

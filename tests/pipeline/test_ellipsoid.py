@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.altering.sources import alter
-from pipeline.calibrating import ellipsoid_study as study
-from pipeline.calibrating.ellipsoid_fit import NAMES
-from pipeline.tuning.confidence import QUANTILE
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.calibrating import ellipsoid_study as study
+from fuselog.pipeline.calibrating.ellipsoid_fit import NAMES
+from fuselog.pipeline.tuning.confidence import QUANTILE
 from tests.goldens import keeping
 from tests.pipeline.conftest import Said
 

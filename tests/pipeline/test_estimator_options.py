@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import replay_in_memory
-from recorders.errors import BadInput
-from recorders.parameters import Described, Parameters, merge, nested
-from recorders.recording import record_run
-from recorders.registry import available
-from replay.engine.replaying.estimator import configure, find_estimator
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import registered_models
-from replay.inference.kalman.methods import MethodParameters
-from replay.inference.model.parameters import ModelParameters
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Described, Parameters, merge, nested
+from fuselog.recorders.recording import record_run
+from fuselog.recorders.registry import available
+from fuselog.replay.engine.replaying.estimator import configure, find_estimator
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.kalman.methods import MethodParameters
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.pipeline import estimator_cases as cases
 from tests.pipeline.estimator_cases import Case, Situation
 from tests.pipeline.moves import moved, settable

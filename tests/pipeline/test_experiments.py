@@ -15,13 +15,13 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.output.charts import Chart
-from pipeline.output.claims import Claim
-from pipeline.output.results import TIMINGS, Outcome, result_folder, write_outcome
-from pipeline.output.summary import summarise
-from pipeline.output.words import Scale, alike
-from pipeline.runs.estimates import hash_files, hash_streams
-from pipeline.runs.experiment import (
+from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.output.claims import Claim
+from fuselog.pipeline.output.results import TIMINGS, Outcome, result_folder, write_outcome
+from fuselog.pipeline.output.summary import summarise
+from fuselog.pipeline.output.words import Scale, alike
+from fuselog.pipeline.runs.estimates import hash_files, hash_streams
+from fuselog.pipeline.runs.experiment import (
     Experiment,
     Setting,
     Study,
@@ -29,14 +29,14 @@ from pipeline.runs.experiment import (
     load_experiment,
     run_experiment,
 )
-from pipeline.runs.recorded import record_ensemble
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, open_log, schemas
-from recorders.parameters import build
-from recorders.recording import Recording
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import memory_source
-from replay.judging.judge import Judge
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, open_log, schemas
+from fuselog.recorders.parameters import build
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.judge import Judge
 from tests.conftest import without_drawing
 
 pytestmark = pytest.mark.paper
@@ -395,7 +395,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
         (setting.folder / "half").write_text("written")
         raise ZeroDivisionError("no runs")
 
-    monkeypatch.setattr("pipeline.runs.experiment.load", lambda *_: Study("fails", divide))
+    monkeypatch.setattr("fuselog.pipeline.runs.experiment.load", lambda *_: Study("fails", divide))
     with pytest.raises(BadInput, match="study mine raised ZeroDivisionError: no runs"):
         run_experiment("x", Experiment(title="x", study="mine"), tmp_path / "out")
     assert not list(tmp_path.iterdir())
@@ -407,7 +407,7 @@ def test_nothing_is_refuted_by_estimates_that_are_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
-    monkeypatch.setattr("recorders.log.impossible.limit_of", lambda _: 1e300)
+    monkeypatch.setattr("fuselog.recorders.log.impossible.limit_of", lambda _: 1e300)
     label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})
     result = run_experiment(label, experiment, tmp_path / "out", logs=1)
     assert {claim.verdict for claim in result.claims} == {"not reproducible"}

@@ -21,14 +21,14 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, typical_time_s
-from pipeline.exploring.curves import Path as Track
-from pipeline.exploring.newest import NewestFirst
-from pipeline.exploring.session import Session, open_session
-from pipeline.exploring.sliders import SMALLER, in_words
-from pipeline.exploring.verdict import numbers_of
-from recorders.errors import BadInput
-from replay.estimators.models.landmarks import ROBOT
+from fuselog.pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, typical_time_s
+from fuselog.pipeline.exploring.curves import Path as Track
+from fuselog.pipeline.exploring.newest import NewestFirst
+from fuselog.pipeline.exploring.session import Session, open_session
+from fuselog.pipeline.exploring.sliders import SMALLER, in_words
+from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.models.landmarks import ROBOT
 
 SURE = {"sigma_range_m": 0.03}  # of .1
 
@@ -129,8 +129,8 @@ def test_likelihood_is_greatest_where_tuning_ends(session: Session) -> None:
 def test_a_parameter_is_taken_into_the_state(session: Session) -> None:
     """Its estimate is drawn and said; NEES is still of what the truth has."""
     document_of = pytest.importorskip("bokeh.document").Document
-    from pipeline.exploring.page import Page
-    from pipeline.exploring.widgets import time_range
+    from fuselog.pipeline.exploring.page import Page
+    from fuselog.pipeline.exploring.widgets import time_range
 
     page = Page(session.with_estimated(["bias_range_m"]), document_of())
     page.end()
@@ -180,7 +180,7 @@ def test_nothing_drawn_is_lost(session: Session) -> None:
 
 def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
     pytest.importorskip("bokeh")
-    from pipeline.exploring.plots import blank, show_lens
+    from fuselog.pipeline.exploring.plots import blank, show_lens
 
     plot, scene = blank("lens", ""), blank("scene", "")
     shown = plot.source(0, "truth", "x", "y")
@@ -196,7 +196,7 @@ def test_the_page_draws_and_says_what_was_replayed(
 ) -> None:
     """All plots are read back, of a filter that is too sure, above the one that was pinned."""
     document_of = pytest.importorskip("bokeh.document").Document
-    from pipeline.exploring.page import Page
+    from fuselog.pipeline.exploring.page import Page
 
     document, acts = document_of(), Queue()
     document.add_next_tick_callback = acts.put
@@ -266,7 +266,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     assert "Too sure of itself." in page._head.text
     assert "pinned" in page._head.text
     for slow_s, is_said in ((1e9, False), (0.0, True)):
-        monkeypatch.setattr("pipeline.exploring.markup.SLOW_S", slow_s)
+        monkeypatch.setattr("fuselog.pipeline.exploring.markup.SLOW_S", slow_s)
         page._show_head()
         assert ("One replay takes" in page._head.text) == is_said
     page._command()
@@ -401,7 +401,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         viewed.append((rrd.read_bytes()[:4], f"Lens at {at_s:.1f} s (m)"))
         is_viewed.set()
 
-    monkeypatch.setattr("replay.timeline.viewer.view", view)  # there is no screen
+    monkeypatch.setattr("fuselog.replay.timeline.viewer.view", view)  # there is no screen
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900})

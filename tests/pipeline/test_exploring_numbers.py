@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
-from pipeline.exploring.session import open_session
-from pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
-from pipeline.exploring.verdict import mean_nis, verdict_of
-from pipeline.output.alarms import Alarm
+from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
+from fuselog.pipeline.exploring.session import open_session
+from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
+from fuselog.pipeline.exploring.verdict import mean_nis, verdict_of
+from fuselog.pipeline.output.alarms import Alarm
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +87,8 @@ def test_ends_of_a_slider_follow_from_bounds_and_value(
     ends: tuple[float, float],
     is_logarithmic: bool,
 ) -> None:
-    monkeypatch.setattr("pipeline.exploring.sliders.bounds_of", lambda *_: bounds)
-    monkeypatch.setattr("pipeline.exploring.sliders.value_at_start", lambda *_: (own, False))
+    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.bounds_of", lambda *_: bounds)
+    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.value_at_start", lambda *_: (own, False))
     made: Any = _slider(name, "group", "what it is", unit, None, SimpleNamespace(parameters=None))  # type: ignore[arg-type]
     assert made == Slider(name, "group", "what it is", unit, own, *ends, is_logarithmic)
 

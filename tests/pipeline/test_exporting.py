@@ -90,7 +90,7 @@ def test_tables(to: Any, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = fl.open(world / "log.mcap")
     nothing = replace(whole["/landmarks"].take(slice(0, 0)), topic="/nothing/at all")
     fl.write("log.mcap", [*(whole[topic] for topic in whole), nothing])
-    import pipeline.logs.exporting as exporting
+    import fuselog.pipeline.logs.exporting as exporting
 
     read = exporting.read_blocks
     monkeypatch.setattr(exporting, "read_blocks", lambda *given: read(*given, block_messages=20))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.sensing.foreign_files import explained
+from fuselog.pipeline.sensing.foreign_files import explained
 
 DEVIATION_RADPS = 1e-4  # at 1 s
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recorders.log import Stream, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.recorders.log import Stream, make_stream, open_log, read_streams, schemas, write_log
 
 Fuselog = Callable[..., Any]
 RECORD = ("record", "landmarks", "--seed", "3", "--set", "duration_s=3")

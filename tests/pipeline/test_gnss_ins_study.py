@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.output.results import Result
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.navigation.gnss_ins import GnssInsOptions, ignoring_delay
-from pipeline.studies.navigation.outages import (
+from fuselog.pipeline.output.results import Result
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.navigation.gnss_ins import GnssInsOptions, ignoring_delay
+from fuselog.pipeline.studies.navigation.outages import (
     Rows,
     coasted,
     error_table,
@@ -22,10 +22,10 @@ from pipeline.studies.navigation.outages import (
     window_table,
     windows_of,
 )
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from replay.engine.streams.sources import MemorySource
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.replay.engine.streams.sources import MemorySource
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -16,10 +16,10 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.output.report import empty_cells, write_report
-from pipeline.output.results import Outcome, write_outcome
-from pipeline.output.terminal import format_value
-from recorders.log import write_log
+from fuselog.pipeline.output.report import empty_cells, write_report
+from fuselog.pipeline.output.results import Outcome, write_outcome
+from fuselog.pipeline.output.terminal import format_value
+from fuselog.recorders.log import write_log
 from tests.faults.planted import NOT_A_NUMBER, QUICK, Planted, complaints, in_order, recorded
 from tests.pipeline.conftest import Said
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.runs.experiment import load_experiment
-from pipeline.studies.navigation.imu_grades import Span, horizontal, outage_of
-from recorders.errors import BadInput
-from recorders.log import RunMetadata
-from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.studies.navigation.imu_grades import Span, horizontal, outage_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.errors.evaluation import Errors
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

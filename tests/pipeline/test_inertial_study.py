@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import Part, replay_parts
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.streams.sources import memory_source
+from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.streams.sources import memory_source
 
 pytestmark = pytest.mark.paper
 

@@ -17,12 +17,12 @@ import pytest
 import rerun as rr
 
 import fuselog as fl
-from pipeline.calibrating.ellipsoid_study import recorded
-from pipeline.checking.stored import read
-from pipeline.checking.stored import write as store
-from pipeline.command_line.group import fuselog
-from pipeline.output.terminal import format_value
-from recorders.log import schemas
+from fuselog.pipeline.calibrating.ellipsoid_study import recorded
+from fuselog.pipeline.checking.stored import read
+from fuselog.pipeline.checking.stored import write as store
+from fuselog.pipeline.command_line.group import fuselog
+from fuselog.pipeline.output.terminal import format_value
+from fuselog.recorders.log import schemas
 from tests.pipeline.conftest import run_here
 from tests.pipeline.json_cases import CASES, POSITIVE, QUARTER, Case
 from tests.pipeline.json_of_files import leaves

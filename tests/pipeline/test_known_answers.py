@@ -18,13 +18,13 @@ import pytest
 from scipy.stats import chi2, norm, t
 
 import fuselog as fl
-from pipeline.diagnosing.consistency import nis_charts
-from pipeline.exploring.curves import BIN_S, cases_of, ellipse
-from pipeline.exploring.verdict import numbers_of
-from pipeline.output.terminal import print_metrics, print_pose_errors
-from recorders.log import RunMetadata
-from replay.engine.streams.blocks import gather
-from replay.judging.judge import Judge
+from fuselog.pipeline.diagnosing.consistency import nis_charts
+from fuselog.pipeline.exploring.curves import BIN_S, cases_of, ellipse
+from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.pipeline.output.terminal import print_metrics, print_pose_errors
+from fuselog.recorders.log import RunMetadata
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.judging.judge import Judge
 from tests.pipeline import known
 from tests.pipeline.conftest import run_here
 from tests.pipeline.known import COVARIANCES, ERRORS, ROWS, SIZES, STEP_NS, STEPS
@@ -346,7 +346,7 @@ def _panels(page: str) -> list[dict[str, Any]]:
 
 def test_a_timeline_of_the_run_has_its_errors_and_bands(place: Path) -> None:
     """Signs are estimate less truth; a band is two of the estimator's own standard deviations."""
-    from replay.timeline.drawing.canvas import PALETTE, TRUTH
+    from fuselog.replay.timeline.drawing.canvas import PALETTE, TRUTH
     from tests.replay.timeline.test_timeline import read
 
     said = run_here("view", "estimates0.mcap", "--save", "run.rrd")

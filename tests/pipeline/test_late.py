@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.output.results import read_result
-from recorders.log import Stream, open_log, read_streams
-from replay.engine.streams.failures import sentences_of
+from fuselog.pipeline.output.results import read_result
+from fuselog.recorders.log import Stream, open_log, read_streams
+from fuselog.replay.engine.streams.failures import sentences_of
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

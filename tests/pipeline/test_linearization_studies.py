@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.output.results import Result
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
+from fuselog.pipeline.output.results import Result
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 

@@ -4,12 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import load_experiment
-from pipeline.studies.optical.moving import _measure, prior_sigmas, seconds_of, unknowns, weakest
-from recorders.simulators.moving_optical import MovingOpticalParameters
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.studies.optical.moving import _measure, prior_sigmas, seconds_of, unknowns, weakest
+from fuselog.recorders.simulators.moving_optical import MovingOpticalParameters
+from fuselog.replay.judging.errors.evaluation import Errors
 
 COMPONENTS = (
     "target_1_x_m",

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.claims import decide
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
-from pipeline.studies.sampling.lrkf_dimension import (
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, load_experiment, run_experiment
+from fuselog.pipeline.studies.sampling.lrkf_dimension import (
     Options,
     Waves,
     exact,
@@ -16,8 +16,8 @@ from pipeline.studies.sampling.lrkf_dimension import (
     sampled,
     samplings_of,
 )
-from recorders.errors import BadInput
-from replay.sampling import Samples
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling import Samples
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -8,17 +8,17 @@ import pandas as pd
 import pytest
 from scipy.stats import norm
 
-from pipeline.output.results import Outcome
-from pipeline.studies.biometrics import biometrics
-from pipeline.studies.navigation import orientation, outages
-from pipeline.studies.networks import cooperative_stress, stress
-from pipeline.studies.ranging.ranging import Reference, mean_nis
-from pipeline.studies.sampling import bingham, extended_target, reactor, torus, torus_real
-from pipeline.studies.sampling.linearization import REFERENCE
-from pipeline.studies.sampling.lrkf_dimension import RATED, _measure_moments
-from recorders.log import RunMetadata, make_stream, schemas
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.studies.biometrics import biometrics
+from fuselog.pipeline.studies.navigation import orientation, outages
+from fuselog.pipeline.studies.networks import cooperative_stress, stress
+from fuselog.pipeline.studies.ranging.ranging import Reference, mean_nis
+from fuselog.pipeline.studies.sampling import bingham, extended_target, reactor, torus, torus_real
+from fuselog.pipeline.studies.sampling.linearization import REFERENCE
+from fuselog.pipeline.studies.sampling.lrkf_dimension import RATED, _measure_moments
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
 from tests.goldens import keeping
 from tests.pipeline.test_made_studies import S, names
 

@@ -8,18 +8,18 @@ import pandas as pd
 import pytest
 from scipy.stats import skew
 
-from pipeline.output.results import Outcome
-from pipeline.studies.acoustic import acoustic
-from pipeline.studies.acoustic.cases import Mode
-from pipeline.studies.optical import los, printed
-from pipeline.studies.optical.cases import ALONE, BLIND, JOINT
-from pipeline.studies.sets import error_bounds, set_filter, set_membership
-from pipeline.studies.tracking import ais, autoferry, crossing
-from pipeline.studies.tracking.tracking import means_of, nis_metrics
-from pipeline.studies.vehicles import scaling, vehicles
-from pipeline.studies.vehicles.cases import Scores
-from recorders.log import make_stream, schemas
-from replay.judging.sets.evaluation import JudgedSets
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.studies.acoustic import acoustic
+from fuselog.pipeline.studies.acoustic.cases import Mode
+from fuselog.pipeline.studies.optical import los, printed
+from fuselog.pipeline.studies.optical.cases import ALONE, BLIND, JOINT
+from fuselog.pipeline.studies.sets import error_bounds, set_filter, set_membership
+from fuselog.pipeline.studies.tracking import ais, autoferry, crossing
+from fuselog.pipeline.studies.tracking.tracking import means_of, nis_metrics
+from fuselog.pipeline.studies.vehicles import scaling, vehicles
+from fuselog.pipeline.studies.vehicles.cases import Scores
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.judging.sets.evaluation import JudgedSets
 
 S = 10**9
 

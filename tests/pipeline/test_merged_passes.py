@@ -8,16 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.outputs import check_outputs
-from pipeline.output.report.kinds import _forest
-from pipeline.runs.ensemble import RUNS_AT_ONCE, Pass, cut_in_parts
-from recorders.errors import BadInput
-from recorders.simulators import landmarks
-from recorders.simulators.landmarks_parameters import LandmarksParameters
-from replay.engine.replaying.late import Late, parse_late
-from replay.engine.replaying.usage import Usage
-from replay.engine.streams.failures import Failure
-from replay.engine.streams.results import failures_by_run
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.report.kinds import _forest
+from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Pass, cut_in_parts
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.simulators import landmarks
+from fuselog.recorders.simulators.landmarks_parameters import LandmarksParameters
+from fuselog.replay.engine.replaying.late import Late, parse_late
+from fuselog.replay.engine.replaying.usage import Usage
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.engine.streams.results import failures_by_run
 
 
 def _pass(**used: int) -> Pass:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from recorders.log import make_stream, schemas
-from recorders.models.states import state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.judging.tracks.distances import hota
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.states import state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.judging.tracks.distances import hota
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, passing, sensor
 
 Fuselog = Callable[..., Any]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from tests.pipeline.test_planes import HERE, POSE, SIGMA_M, STAMPS_NS, car, driven
 from tests.recorders.test_ros import Maker, Sent, write_bag
 

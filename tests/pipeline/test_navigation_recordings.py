@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.altering.sources import alter
-from pipeline.diagnosing import diagnosis
-from pipeline.diagnosing.causes import Sought
-from recorders.plausibility.checks import BLOCK, findings_in
+from fuselog.pipeline.altering.sources import alter
+from fuselog.pipeline.diagnosing import diagnosis
+from fuselog.pipeline.diagnosing.causes import Sought
+from fuselog.recorders.plausibility.checks import BLOCK, findings_in
 
 CORRECTIONS = 2
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from recorders.errors import BadInput
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.recorders.errors import BadInput
 from tests.claims.few_runs import as_of_all
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.sensing import exports, study
-from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
-from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
-from pipeline.sensing.likelihood import Samples, likelihood
-from pipeline.sensing.noise import _drifts
-from pipeline.sensing.preparing import (
+from fuselog.pipeline.sensing import exports, study
+from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom
+from fuselog.pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
+from fuselog.pipeline.sensing.likelihood import Samples, likelihood
+from fuselog.pipeline.sensing.noise import _drifts
+from fuselog.pipeline.sensing.preparing import (
     Drift,
     check_at_rest,
     find_drift,
@@ -27,8 +27,8 @@ from pipeline.sensing.preparing import (
     samples_of,
     white_block,
 )
-from pipeline.sensing.terms import Terms
-from pipeline.sensing.units import UNITS, parse_sheet
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
 from tests.goldens import keeping
 from tests.pipeline.conftest import Said

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.output.claims import decide
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.navigation.orientation import error_angles
-from recorders.errors import BadInput
+from fuselog.pipeline.output.claims import decide
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.navigation.orientation import error_angles
+from fuselog.recorders.errors import BadInput
 from tests.replay.timeline.test_timeline import read
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -17,9 +17,9 @@ from types import SimpleNamespace
 import pytest
 from PIL import Image
 
-from pipeline.command_line.group import fuselog
-from pipeline.command_line.options import Output
-from replay.timeline import viewer
+from fuselog.pipeline.command_line.group import fuselog
+from fuselog.pipeline.command_line.options import Output
+from fuselog.replay.timeline import viewer
 from tests.pipeline.conftest import Said, run_here
 from tests.pipeline.outputs_audit import (
     COMMANDS,
@@ -385,8 +385,8 @@ with open(os.environ["SHADOWED"], "a") as told:
 DRIVER = """
 import json, sys
 from matplotlib.figure import Figure
-from pipeline.command_line import main
-from pipeline.runs.executors import dask, processes
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.runs.executors import dask, processes
 if __name__ == "__main__":
     Figure.draw = lambda *_: None
     for workers in (processes(2), dask("local:1")):
@@ -453,8 +453,8 @@ def test_settings_of_numba_in_the_current_folder_are_refused(here: Path) -> None
 
 MATPLOTLIB_SETTINGS = """
 import sys
-from pipeline.command_line import main
-from pipeline.runs.executors import processes
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.runs.executors import processes
 
 if __name__ == "__main__":
     assert main(["--version"]) == 0

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.command_line import main
-from recorders.log import Clock, open_log, read_streams
-from recorders.registry import available, load
-from replay.engine.replaying.late import parse_late
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.command_line import main
+from fuselog.recorders.log import Clock, open_log, read_streams
+from fuselog.recorders.registry import available, load
+from fuselog.replay.engine.replaying.late import parse_late
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 PAGE = (Path(__file__).parents[2] / "docs" / "your-estimator.md").read_text()
 
@@ -139,8 +139,12 @@ def test_ours_are_made_as_those_of_others() -> None:
     for name in set(available("estimators")) - {"exec", "lib"}:
         bind = load("estimators", name, fl.Estimator).bind
         makers.add(getattr(bind, "func", bind).__module__)
-    nine_axes = "replay.estimators.orientation.magnetometers"
-    assert makers == {"replay.engine.api.binding", "replay.inference.estimators", nine_axes}
+    nine_axes = "fuselog.replay.estimators.orientation.magnetometers"
+    assert makers == {
+        "fuselog.replay.engine.api.binding",
+        "fuselog.replay.inference.estimators",
+        nine_axes,
+    }
 
 
 def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:
@@ -149,7 +153,7 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:
     Figures are written without being drawn, as by `blank_figures`.
     """
     code = (
-        "import sys, json, io, shlex; from contextlib import *; from pipeline.command_line import main\n"
+        "import sys, json, io, shlex; from contextlib import *; from fuselog.pipeline.command_line import main\n"
         "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "for line in json.load(sys.stdin):\n"
         "    out, err = io.StringIO(), io.StringIO()\n"

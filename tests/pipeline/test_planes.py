@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 import fuselog as fl
-from recorders.log.planes import Origin
-from recorders.models.geodesy import out_of_tangent_plane
-from replay.engine.streams.planes import into_plane_of
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.replay.engine.streams.planes import into_plane_of
 
 Floats = NDArray[np.float64]
 # The truth's plane, and one 20 km away whose axes are turned by a quarter of a degree.

@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.navigation.quad_inertial import (
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.navigation.quad_inertial import (
     Flight,
     _highest,
     flight_of,
@@ -19,12 +19,12 @@ from pipeline.studies.navigation.quad_inertial import (
     mean_of,
     pose_errors,
 )
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.states import NAVIGATION, state_metadata
-from recorders.recording import import_run
-from replay.engine.streams.sources import memory_source
-from replay.estimators.navigation.navigation import INERTIAL
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.states import NAVIGATION, state_metadata
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.estimators.navigation.navigation import INERTIAL
 from tests.replay.inference.replays import outputs
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.runs.runner import Runner
-from pipeline.studies.ranging import uwb_outdoor, uwb_pose
-from pipeline.studies.ranging.ranging import Recording, Replayed, mean_nis
-from pipeline.studies.ranging.uwb_outdoor import Window, printed, published_rmse, scored_truth
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream
-from recorders.recording import import_run
-from replay.engine.streams.sources import memory_source
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.ranging import uwb_outdoor, uwb_pose
+from fuselog.pipeline.studies.ranging.ranging import Recording, Replayed, mean_nis
+from fuselog.pipeline.studies.ranging.uwb_outdoor import Window, printed, published_rmse, scored_truth
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.sources import memory_source
 
 pytestmark = pytest.mark.usefixtures("blank_figures", "no_timelines")
 

@@ -8,7 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import run_here
 
 

@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output import RESULT_FILE
-from pipeline.output.charts import (
+from fuselog.pipeline.output import RESULT_FILE
+from fuselog.pipeline.output.charts import (
     COLOURS,
     OUTSIDE_COLOUR,
     REFERENCE_COLOUR,
@@ -32,17 +32,17 @@ from pipeline.output.charts import (
     interval,
     level,
 )
-from pipeline.output.claims import Claim
-from pipeline.output.report import _figure, _legend, write_report
-from pipeline.output.report.first_run import Followed
-from pipeline.output.report.kinds import opening, run_sentences
-from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
-from pipeline.output.report.scene import typical_second
-from pipeline.output.results import Outcome, Result, read_result, result_folder, write_outcome
-from recorders.errors import BadInput
-from recorders.log import open_log, read_streams
-from recorders.parameters import build
-from recorders.parsing import parse_json
+from fuselog.pipeline.output.claims import Claim
+from fuselog.pipeline.output.report import _figure, _legend, write_report
+from fuselog.pipeline.output.report.first_run import Followed
+from fuselog.pipeline.output.report.kinds import opening, run_sentences
+from fuselog.pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
+from fuselog.pipeline.output.report.scene import typical_second
+from fuselog.pipeline.output.results import Outcome, Result, read_result, result_folder, write_outcome
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log, read_streams
+from fuselog.recorders.parameters import build
+from fuselog.recorders.parsing import parse_json
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
@@ -124,7 +124,7 @@ def test_the_page_is_whole_offline_and_small(result: Path, page_file: Path) -> N
     links = [each["href"] or "" for tag, each in page.elements if "href" in each and tag == "a"]
     assert all(link.startswith(("#", "https://")) for link in links)  # followed by a click alone
     assert not any("href" in each for tag, each in page.elements if tag != "a")
-    assets = resources.files("pipeline.output.report")
+    assets = resources.files("fuselog.pipeline.output.report")
     scripts = [(assets / name).read_text() for name in ("plotly-basic.min.js", "page.js")]
     kinds = [each.get("type") for each in page.all("script")]
     run = [text for text, kind in zip(page.texts["script"], kinds, strict=True) if kind is None]

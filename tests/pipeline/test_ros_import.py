@@ -12,9 +12,9 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
-from pipeline.api.estimates import judge_estimates
-from recorders.recording import import_log
-from replay.distributions import chi2
+from fuselog.pipeline.api.estimates import judge_estimates
+from fuselog.recorders.recording import import_log
+from fuselog.replay.distributions import chi2
 from tests.recorders.test_ros import START_NS, STEP_NS, Maker, Sent, imported, refusal, write_bag
 from tests.replay.timeline.test_timeline import read
 

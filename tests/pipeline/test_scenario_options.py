@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.parameters import build, merge, nested
-from recorders.recording import Recorder, Recording, Simulator, record_run
-from recorders.registry import available, load
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import build, merge, nested
+from fuselog.recorders.recording import Recorder, Recording, Simulator, record_run
+from fuselog.recorders.registry import available, load
 from tests.goldens import keeping, numbers
 from tests.pipeline.moves import bounds_of, moved, settable, switched_on, value_of
 

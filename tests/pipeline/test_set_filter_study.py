@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.runs.recorded import record_ensemble
-from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
-from recorders.errors import BadInput
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
+from fuselog.recorders.errors import BadInput
 from tests.claims.few_runs import as_of_all
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.altering.changes import changes_of, is_parameter
-from pipeline.deploying.deploying import deploy
-from pipeline.exploring.session import Session
-from recorders.errors import BadInput
-from recorders.log.streams import empty_stream
-from recorders.parameters import parse_settings
-from replay.distributions import chi2
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.ensembles import Ensemble
-from replay.inference.estimators import registered_models
-from replay.inference.model.own_parameters import read_by
-from replay.inference.run import events
-from replay.tracing import functions
+from fuselog.pipeline.altering.changes import changes_of, is_parameter
+from fuselog.pipeline.deploying.deploying import deploy
+from fuselog.pipeline.exploring.session import Session
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.streams import empty_stream
+from fuselog.recorders.parameters import parse_settings
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.model.own_parameters import read_by
+from fuselog.replay.inference.run import events
+from fuselog.replay.tracing import functions
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

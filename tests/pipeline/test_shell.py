@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.output import terminal
+from fuselog.pipeline.output import terminal
 from tests.pipeline.conftest import Said
 
 ROOT = Path(__file__).parents[2]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.ensemble import Part, replay_parts
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, open_log, read_streams, write_log
-from recorders.recording import SIMULATION_EPOCH_NS, record_run
-from replay.engine.streams.sources import LogSource
+from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, open_log, read_streams, write_log
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, record_run
+from fuselog.replay.engine.streams.sources import LogSource
 from tests.replay.timeline.test_timeline import read
 
 Fuselog = Callable[..., Any]

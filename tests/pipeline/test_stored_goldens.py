@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.checking.stored import read, write
-from recorders.errors import BadInput
+from fuselog.pipeline.checking.stored import read, write
+from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
 
 COLUMN = {"kept": [[1.0, 2.0]], "missing": [0, 0], "sum": [1.0, 2.0], "sum_of_squares": [1.0, 4.0]}

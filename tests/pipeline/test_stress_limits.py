@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.stressing.partings import partings
-from pipeline.stressing.sums import StressSums
-from pipeline.stressing.verdicts import Tried
-from recorders.errors import BadInput
+from fuselog.pipeline.stressing.partings import partings
+from fuselog.pipeline.stressing.sums import StressSums
+from fuselog.pipeline.stressing.verdicts import Tried
+from fuselog.recorders.errors import BadInput
 from tests.pipeline.test_stressing import EPOCH_NS, LINE, VECTOR, line
 
 

@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.runs.recorded import record_ensemble
-from pipeline.studies.networks.cooperative_stress import (
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.pipeline.studies.networks.cooperative_stress import (
     CooperativeStressOptions,
     _edited,
     _lying,
@@ -15,7 +15,7 @@ from pipeline.studies.networks.cooperative_stress import (
     _robots,
     _while_there,
 )
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -10,17 +10,17 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.output.alarms import NOT_TESTED, Stressing
-from pipeline.output.report.kinds import opening
-from pipeline.output.results import RUNS, Result, read_result, read_table
-from pipeline.stressing import copies, stressing
-from pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
-from pipeline.stressing.experiments import stress_result
-from pipeline.stressing.partings import Parting, partings, undetermined
-from pipeline.stressing.verdicts import ORDER
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream
-from replay.engine.streams.sources import memory_source
+from fuselog.pipeline.output.alarms import NOT_TESTED, Stressing
+from fuselog.pipeline.output.report.kinds import opening
+from fuselog.pipeline.output.results import RUNS, Result, read_result, read_table
+from fuselog.pipeline.stressing import copies, stressing
+from fuselog.pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
+from fuselog.pipeline.stressing.experiments import stress_result
+from fuselog.pipeline.stressing.partings import Parting, partings, undetermined
+from fuselog.pipeline.stressing.verdicts import ORDER
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream
+from fuselog.replay.engine.streams.sources import memory_source
 from tests.replay.timeline.reading import picture_of
 
 VECTOR = fl.schemas.VECTOR_MEASUREMENT
@@ -447,7 +447,7 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
     assert "over 5 runs: " in kept.stress[0].words[0]
     found = opening(kept, {"runs": read_table(out / RUNS)})
     assert found.story.cards[0].stress in kept.stress
-    monkeypatch.setattr("pipeline.stressing.experiments.TOGETHER", 2)
+    monkeypatch.setattr("fuselog.pipeline.stressing.experiments.TOGETHER", 2)
     with pytest.raises(BadInput, match="a scheduler has its own workers"):
         stress_result(kept, workers=2, scheduler="local:2")
     parts = stress_result(kept)

@@ -10,23 +10,23 @@ import pandas as pd
 import pytest
 from scipy.stats import t
 
-from pipeline.output.charts import Chart
-from pipeline.studies.acoustic import recordings, sequence
-from pipeline.studies.biometrics import sequential
-from pipeline.studies.navigation import (
+from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.studies.acoustic import recordings, sequence
+from fuselog.pipeline.studies.biometrics import sequential
+from fuselog.pipeline.studies.navigation import (
     gnss_ins,
     imu_grades,
     orientation,
     outages,
     quad_inertial,
 )
-from pipeline.studies.networks import cooperative, cooperative_stress, networks, stress
-from pipeline.studies.optical import moving
-from pipeline.studies.ranging import ranging
-from pipeline.studies.sampling import extended_target, lrkf_dimension, reactor, torus, torus_real
-from pipeline.studies.sets import set_filter, set_membership
-from pipeline.studies.tracking import autoferry, crossing
-from pipeline.studies.vehicles import scaling, vehicles
+from fuselog.pipeline.studies.networks import cooperative, cooperative_stress, networks, stress
+from fuselog.pipeline.studies.optical import moving
+from fuselog.pipeline.studies.ranging import ranging
+from fuselog.pipeline.studies.sampling import extended_target, lrkf_dimension, reactor, torus, torus_real
+from fuselog.pipeline.studies.sets import set_filter, set_membership
+from fuselog.pipeline.studies.tracking import autoferry, crossing
+from fuselog.pipeline.studies.vehicles import scaling, vehicles
 from tests.pipeline.test_charts import held, same
 
 Wanted = dict[str, dict[str, Any]]

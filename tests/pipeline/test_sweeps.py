@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.command_line import main
-from pipeline.runs import experiment
-from pipeline.runs.sweeps import (
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.runs import experiment
+from fuselog.pipeline.runs.sweeps import (
     curves,
     errors_of_runs,
     heat_maps,
@@ -21,7 +21,7 @@ from pipeline.runs.sweeps import (
     point_table,
     points_of,
 )
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from recorders.importers.tables.guessing import guess
+from fuselog.recorders.importers.tables.guessing import guess
 
 COUNT = 50
 

@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import fuselog as fl
-from pipeline.logs.exporting import export
-from recorders.importers.tables.guessing import guess
-from recorders.log import Stream, write_log
-from recorders.recording import Simulator, record_run
+from fuselog.pipeline.logs.exporting import export
+from fuselog.recorders.importers.tables.guessing import guess
+from fuselog.recorders.log import Stream, write_log
+from fuselog.recorders.recording import Simulator, record_run
 
 # What makes the runs short that are long.
 SHORT: dict[str, dict[str, Any]] = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.studies.sampling.torus_real import FILTERS, interval, persistence, predict
+from fuselog.pipeline.studies.sampling.torus_real import FILTERS, interval, persistence, predict
 
 
 def test_no_prediction_knows_what_comes():

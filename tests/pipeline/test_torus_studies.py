@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.report.kinds import run_sentences
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.sampling.torus import PropagationOptions, propagation_errors
-from recorders.errors import BadInput
+from fuselog.pipeline.output.report.kinds import run_sentences
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.sampling.torus import PropagationOptions, propagation_errors
+from fuselog.recorders.errors import BadInput
 from tests.claims.few_runs import as_of_all
 
 pytestmark = pytest.mark.paper

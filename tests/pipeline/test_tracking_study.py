@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.toolkit.repetitions import mean_interval
-from pipeline.studies.tracking.tracking import figures_of, measure_changes
-from replay.judging.tracks.errors import UNREFERENCED_M, TracksAt
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.pipeline.studies.tracking.tracking import figures_of, measure_changes
+from fuselog.replay.judging.tracks.errors import UNREFERENCED_M, TracksAt
 
 
 def test_figures_of_whole_tracks():

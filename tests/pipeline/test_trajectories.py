@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
-from recorders.log import open_log, read_streams, write_log
-from recorders.recording import record_run
-from recorders.trajectories import Trajectory, tum_lines
+from fuselog.recorders.log import open_log, read_streams, write_log
+from fuselog.recorders.recording import record_run
+from fuselog.recorders.trajectories import Trajectory, tum_lines
 
 Fuselog = Callable[..., Any]
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")

@@ -11,11 +11,11 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput, make_stream, schemas
-from recorders.importers.tables.guessing import guess
-from recorders.log import RunMetadata
-from recorders.recording import Recording
-from recorders.registry import load
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.importers.tables.guessing import guess
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.recorders.registry import load
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.pipeline.test_planes import POSE, STAMPS_NS, car, driven
 from tests.recorders.test_ros import Maker, write_bag
 from tests.replay.foreign.conftest import compile_filter

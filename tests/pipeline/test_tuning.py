@@ -17,16 +17,16 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.output.results import read_result
-from pipeline.runs.executors import InlineExecutor
-from pipeline.tuning.confidence import SearchOutcome, confidence
-from pipeline.tuning.objective import Best, Objective
-from pipeline.tuning.search import Coordinates, Cost, Free, curvature, least, scanned
-from pipeline.tuning.tuning import ENOUGH, _confirmed
-from recorders.log import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.sources import memory_source
-from replay.judging.consistency.whiteness import whitened
+from fuselog.pipeline.output.results import read_result
+from fuselog.pipeline.runs.executors import InlineExecutor
+from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence
+from fuselog.pipeline.tuning.objective import Best, Objective
+from fuselog.pipeline.tuning.search import Coordinates, Cost, Free, curvature, least, scanned
+from fuselog.pipeline.tuning.tuning import ENOUGH, _confirmed
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.consistency.whiteness import whitened
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
@@ -282,7 +282,7 @@ def test_at_an_edge_there_is_no_interval(
 
         return curvature(edged, *where)
 
-    monkeypatch.setattr("pipeline.tuning.tuning.curvature", beside_an_edge)
+    monkeypatch.setattr("fuselog.pipeline.tuning.tuning.curvature", beside_an_edge)
     given = of_sigmas(0.1, 0.05, 0.2, 0.03)
     found = fl.tune(short, "ekf", ["sigma_range_m", "sigma_bearing_rad"], set=given)
     assert found.parameters[["low", "high"]].isna().to_numpy().tolist() == [[True] * 2, [False] * 2]

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
+from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
 from tests.claims.few_runs import as_of_all
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders import recording
-from recorders.log import RunMetadata
-from recorders.parameters import Parameters
-from recorders.recording import Blocks, Recording
+from fuselog.recorders import recording
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Blocks, Recording
 from tests.goldens import keeping, numbers
 
 STEP = 1e-30

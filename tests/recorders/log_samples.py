@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.recorders.log import Schema, Stream, make_stream, schemas
 
 # From 16 doubles on the length before a vector takes two bytes.
 WIDTHS = [0, 1, 2, 3, 9, 15, 16, 17, 40]

@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.tables.guessing import assumptions, guess
-from recorders.importers.tables.importer import TableParameters, read
-from recorders.log import Stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.guessing import assumptions, guess
+from fuselog.recorders.importers.tables.importer import TableParameters, read
+from fuselog.recorders.log import Stream
 
 Verdict = Literal["right", "refused", "assumed", "wrong"]
 METRES = 111_194.93  # of a degree

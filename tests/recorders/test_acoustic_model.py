@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorders.models import acoustic
-from recorders.models.acoustic import Medium, Noise
-from recorders.models.planar import wrap_angle
+from fuselog.recorders.models import acoustic
+from fuselog.recorders.models.acoustic import Medium, Noise
+from fuselog.recorders.models.planar import wrap_angle
 
 MEDIUM = Medium()
 NOISE = Noise(0.07, 0.05, 1e-3, 2.0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Stream, open_log, read_streams, write_log
-from recorders.models.geodesy import into_tangent_plane, out_of_tangent_plane
-from recorders.recording import Recording, import_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, open_log, read_streams, write_log
+from fuselog.recorders.models.geodesy import into_tangent_plane, out_of_tangent_plane
+from fuselog.recorders.recording import Recording, import_run
 
 HEADER = "Time,MMSI,Latitude_degrees,Longitude_degrees,COG_degrees,SOG_knots"
 SMALL = [

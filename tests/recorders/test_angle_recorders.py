@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.optical import line_of_sight
-from recorders.recording import Recording, record_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.optical import line_of_sight
+from fuselog.recorders.recording import Recording, record_run
 
 
 def record(scenario: str, seed: int = 1, **parameters: object) -> Recording:

@@ -5,7 +5,7 @@ import pytest
 from scipy import fft
 from scipy.stats import chi2
 
-from recorders.models.arrivals import Arrivals, arrivals, delay_between
+from fuselog.recorders.models.arrivals import Arrivals, arrivals, delay_between
 
 RATE_HZ, BAND_HZ = 8000.0, (500.0, 3000.0)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from recorders import atomic
-from recorders.atomic import scratch_folder, whole_file, whole_folder
-from recorders.errors import BadInput
+from fuselog.recorders import atomic
+from fuselog.recorders.atomic import scratch_folder, whole_file, whole_folder
+from fuselog.recorders.errors import BadInput
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -104,8 +104,8 @@ def test_a_folder_that_must_stay_stays_whenever_that_is_found(tmp_path):
 KILLED = """
     import os, signal, sys
     from pathlib import Path
-    from recorders import atomic
-    from recorders.atomic import whole_file, whole_folder
+    from fuselog.recorders import atomic
+    from fuselog.recorders.atomic import whole_file, whole_folder
     place, moment = Path(sys.argv[1]), int(sys.argv[2])
     def trace(frame, event, argument):
         global moment
@@ -216,7 +216,7 @@ def test_a_scratch_folder_of_a_killed_process_is_cleared(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
     program = (
         "import os, sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
-        "from recorders.atomic import scratch_folder\n"
+        "from fuselog.recorders.atomic import scratch_folder\n"
         "with scratch_folder('work') as folder:\n"
         "    (folder / 'half').touch()\n"
         "    os.kill(os.getpid(), 9)"

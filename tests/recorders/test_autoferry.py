@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.recording import import_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import import_run
 
 START_S = 1_620_000_000.25
 

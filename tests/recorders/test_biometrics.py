@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.importers.biometrics import Matchers, ScoreMatricesParameters, read
-from recorders.models.scores import comparisons_of
-from recorders.parameters import build
-from recorders.recording import record_run
-from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
-from replay.judging.consistency.verification import identified
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.biometrics import Matchers, ScoreMatricesParameters, read
+from fuselog.recorders.models.scores import comparisons_of
+from fuselog.recorders.parameters import build
+from fuselog.recorders.recording import record_run
+from fuselog.recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
+from fuselog.replay.judging.consistency.verification import identified
 
 pytestmark = pytest.mark.paper
 

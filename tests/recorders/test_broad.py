@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.importers.broad import BROAD, BroadParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.broad import BROAD, BroadParameters
 
 ROWS = 400
 SENSORS = {

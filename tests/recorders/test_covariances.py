@@ -13,10 +13,10 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from recorders.importers.ulog.importer import ULOG, UlogParameters
-from recorders.log import Stream
-from recorders.models.orientation import rotate
-from recorders.recording import import_run
+from fuselog.recorders.importers.ulog.importer import ULOG, UlogParameters
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.orientation import rotate
+from fuselog.recorders.recording import import_run
 from tests.recorders.test_ros import START_NS, Maker, Sent, imported, write_bag
 from tests.recorders.test_ulog import by_hand, message
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from recorders.log import Stream
-from recorders.recording import record_run
-from replay.engine.streams.sources import memory_source
+from fuselog.recorders.log import Stream
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import memory_source
 
 
 def recorded(seed: int, **parameters: float) -> Mapping[str, Stream]:

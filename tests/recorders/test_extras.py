@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.importers.broad import _datasets
-from recorders.importers.tables.plane import _onto_map
-from replay.distributions.torus_mixtures import fit_wrapped_mixture
-from replay.regions.moving_sets import from_rings
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.broad import _datasets
+from fuselog.recorders.importers.tables.plane import _onto_map
+from fuselog.replay.distributions.torus_mixtures import fit_wrapped_mixture
+from fuselog.replay.regions.moving_sets import from_rings
 
 
 @pytest.mark.parametrize(

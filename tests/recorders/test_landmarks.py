@@ -6,13 +6,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy.stats import chi2, expon, kstest, norm, poisson, uniform
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.models.geodesy import into_tangent_plane
-from recorders.models.planar import drive, range_bearing, wrap_angle
-from recorders.recording import SIMULATION_EPOCH_NS, named_generator, record_run
-from recorders.simulators import landmarks
-from recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.geodesy import into_tangent_plane
+from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, named_generator, record_run
+from fuselog.recorders.simulators import landmarks
+from fuselog.recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
 Floats = NDArray[np.float64]
 SURE = 1e-4  # how rarely an honest simulator fails one of these tests; the seeds are fixed

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorders.importers.ros.files.bags import _members
-from recorders.log import LogWriter, make_stream, open_log, read_blocks, read_streams, schemas
-from recorders.recording import import_run, record_run
-from recorders.simulators.landmarks import _dead
-from recorders.simulators.landmarks_parameters import Sensor
+from fuselog.recorders.importers.ros.files.bags import _members
+from fuselog.recorders.log import LogWriter, make_stream, open_log, read_blocks, read_streams, schemas
+from fuselog.recorders.recording import import_run, record_run
+from fuselog.recorders.simulators.landmarks import _dead
+from fuselog.recorders.simulators.landmarks_parameters import Sensor
 from tests.recorders.test_ais import HEADER, table
 
 STAMPS = st.lists(st.integers(0, 6), min_size=1, max_size=25)

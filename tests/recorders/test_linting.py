@@ -16,14 +16,22 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.command_line import main
-from recorders.linting.lint import lint, lint_log
-from recorders.linting.magnetic import FIELD, units
-from recorders.linting.names import frames
-from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas, write_log
-from recorders.log.impossible import YEAR_NS
-from recorders.plausibility.finding import Finding
-from recorders.recording import import_run
+from fuselog.pipeline.command_line import main
+from fuselog.recorders.linting.lint import lint, lint_log
+from fuselog.recorders.linting.magnetic import FIELD, units
+from fuselog.recorders.linting.names import frames
+from fuselog.recorders.log import (
+    LogWriter,
+    RunMetadata,
+    Stream,
+    make_stream,
+    open_log,
+    schemas,
+    write_log,
+)
+from fuselog.recorders.log.impossible import YEAR_NS
+from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.recording import import_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
 BEGIN_NS = 1_700_000_000 * 10**9
@@ -355,9 +363,9 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
         for part in (slice(0, 5000), slice(5000, None)):  # a chunk each
             writer.write([imu.take(part)])
         writer.describe(RunMetadata("test"))
-    for module in ("recorders.linting.lint", "pipeline.api.linting"):
+    for module in ("fuselog.recorders.linting.lint", "fuselog.pipeline.api.linting"):
         monkeypatch.setattr(f"{module}.BLOCK", 1000)
-    monkeypatch.setattr("recorders.linting.lint.MOST", 0)
+    monkeypatch.setattr("fuselog.recorders.linting.lint.MOST", 0)
     for found in (fl.lint(tmp_path / "log.mcap"), lint_log(open_log(tmp_path / "log.mcap"))):
         [words] = [each.words for each in found if "years" in each.words]
         assert words.startswith(

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import (
     LogWriter,
     RunMetadata,
     loops,
@@ -26,11 +26,11 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.container.ahead import ahead
-from recorders.log.container.chunks import Damaged, Span, open_region
-from recorders.log.container.sealed import seal, unseal
-from recorders.log.layout import layout_of
-from recorders.log.loops import agree
+from fuselog.recorders.log.container.ahead import ahead
+from fuselog.recorders.log.container.chunks import Damaged, Span, open_region
+from fuselog.recorders.log.container.sealed import seal, unseal
+from fuselog.recorders.log.layout import layout_of
+from fuselog.recorders.log.loops import agree
 
 # Two blocks of five scans; the second block reaches back, and stamps are equal within and across them.
 NUMBERS = [[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]]
@@ -311,7 +311,7 @@ def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
 @pytest.mark.parametrize("path", [110], indirect=True, ids=["two a chunk"])
 def test_few_bytes_are_read_without_numba(path):
     code = (
-        "import sys; from recorders.log import loops, open_log, read_streams\n"
+        "import sys; from fuselog.recorders.log import loops, open_log, read_streams\n"
         f"log = open_log({str(path)!r})\n"
         "few = read_streams(log, ['/scan'])['/scan'], 'numba' in sys.modules\n"
         "loops._left.clear()\n"

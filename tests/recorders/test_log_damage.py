@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, open_log, read_streams, schemas, write_log
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, RunMetadata, open_log, read_streams, schemas, write_log
 from tests.recorders.log_samples import assert_same, some_streams
 
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
@@ -302,7 +302,7 @@ def test_a_chunk_that_does_not_fit_into_memory_is_told_as_such(tmp_path, monkeyp
     def lack(_):
         raise MemoryError
 
-    monkeypatch.setattr("recorders.log.container.chunks.scan", lack)
+    monkeypatch.setattr("fuselog.recorders.log.container.chunks.scan", lack)
     assert "the chunk at byte 8 does not fit into memory: it states 3 bytes" in refusal(path)
     assert "does not fit into memory" in open_log(path, recover=True).loss_statement
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recorders.log import read_streams
+from fuselog.recorders.log import read_streams
 from tests.faults import crafted, cuts, damaged_logs, flips
 
 

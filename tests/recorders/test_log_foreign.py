@@ -16,10 +16,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
-from recorders.errors import BadInput
-from recorders.log import LogWriter, open_log, read_blocks, read_span, read_streams, schemas
-from recorders.log.schemas import message_class
-from recorders.log.streams import concatenate
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, open_log, read_blocks, read_span, read_streams, schemas
+from fuselog.recorders.log.schemas import message_class
+from fuselog.recorders.log.streams import concatenate
 from tests.recorders.log_samples import assert_same, rows_read, some_streams
 
 FIELD = descriptor_pb2.FieldDescriptorProto

@@ -16,7 +16,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap_protobuf.decoder import DecoderFactory
 
-from recorders.log import LogWriter, RunMetadata, write_log
+from fuselog.recorders.log import LogWriter, RunMetadata, write_log
 from tests.bench.bench_log import read_with_rerun
 from tests.recorders.log_samples import rows_in_file, some_streams
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from recorders.log import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import (
     LogWriter,
     RunMetadata,
     make_stream,
@@ -19,8 +19,8 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.container.ahead import THREADS, ahead
-from recorders.log.schemas import SCHEMAS
+from fuselog.recorders.log.container.ahead import THREADS, ahead
+from fuselog.recorders.log.schemas import SCHEMAS
 from tests.recorders.log_samples import LARGEST_TIME, assert_same, rows_read, some_streams, streams
 
 COMPRESSIONS = ["zstd", "lz4", "none"]

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from recorders.errors import BadInput
-from recorders.log import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import (
     Companion,
     Field,
     LogWriter,
@@ -28,7 +28,7 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.streams import concatenate
+from fuselog.recorders.log.streams import concatenate
 from tests.recorders.log_samples import assert_same, rows_in_file, some_streams
 
 COUNTS = {"scan_id": [1, 2], "detections": [3, 4]}
@@ -123,7 +123,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         import sys, time
         sys.path.insert(0, sys.argv[2])
         from log_samples import some_streams
-        from recorders.log import LogWriter
+        from fuselog.recorders.log import LogWriter
         with LogWriter(sys.argv[1]) as log:
             log.write(some_streams(1, count=20_000))
             log.write(some_streams(2, count=10))

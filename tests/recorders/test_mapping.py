@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from recorders.importers.mapping import Mapped, StreamMapping, mapped
-from recorders.importers.units import NAMED, conversion, unit
+from fuselog.recorders.importers.mapping import Mapped, StreamMapping, mapped
+from fuselog.recorders.importers.units import NAMED, conversion, unit
 
 SOURCES = {
     "a": np.array([1.0, -9.0, 3.0, 999.0]),

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.recording import Recording, import_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.errors.evaluation import errors_of
-from replay.judging.errors.truths import Truths
-from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.recording import Recording, import_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.errors.evaluation import errors_of
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
 
 # A set of one robot: two barcodes known, one not; times out of order; comments as in the real files.
 SMALL = {

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.inertial import strapdown
-from recorders.recording import record_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.inertial import strapdown
+from fuselog.recorders.recording import record_run
 
 NOISELESS = {
     f"{sensor}_{kind}": 0.0 for sensor in ("force", "gyro") for kind in ("noise_density", "bias_density")

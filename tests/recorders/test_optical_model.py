@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorders.models.optical import (
+from fuselog.recorders.models.optical import (
     direction,
     line_of_sight,
     line_of_sight_gradients,

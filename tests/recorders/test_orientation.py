@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.models import orientation
-from recorders.models.directional_noise import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models import orientation
+from fuselog.recorders.models.directional_noise import (
     saddlepoint,
     sample_bingham,
     sample_projected_gaussian,
 )
-from recorders.recording import record_run
+from fuselog.recorders.recording import record_run
 
 
 def units(count: int, d: int, seed: int = 0) -> np.ndarray:

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, PositiveFloat, model_validator
 
-from recorders.errors import BadInput, choices
-from recorders.parameters import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import (
     Parameters,
     build,
     describe,
@@ -19,7 +19,7 @@ from recorders.parameters import (
     merge,
     parse_settings,
 )
-from recorders.parsing import parse_json, read_toml
+from fuselog.recorders.parsing import parse_json, read_toml
 
 
 class Inner(Parameters):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recorders.models.planar import drive, range_bearing, wrap_angle
+from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
 from tests.bench.reference.landmarks import drive_jacobians, range_bearing_jacobian
 
 angles = st.floats(-4, 4)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.diagnosing.battery import battery
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.diagnosing.battery import battery
+from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
     UNIT_FAULTS,
     Unit,
@@ -20,15 +20,15 @@ from pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.orientation import compose
-from recorders.plausibility.body import Series, bodies
-from recorders.plausibility.checks import findings
-from recorders.plausibility.motion import Forces, Lag, Motion
-from recorders.plausibility.speeds import scatter
-from recorders.plausibility.timing import Timing
-from recorders.plausibility.turns import _by_forces
-from recorders.recording import record_run
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.orientation import compose
+from fuselog.recorders.plausibility.body import Series, bodies
+from fuselog.recorders.plausibility.checks import findings
+from fuselog.recorders.plausibility.motion import Forces, Lag, Motion
+from fuselog.recorders.plausibility.speeds import scatter
+from fuselog.recorders.plausibility.timing import Timing
+from fuselog.recorders.plausibility.turns import _by_forces
+from fuselog.recorders.recording import record_run
 from tests.pipeline.test_planes import HERE, car
 
 FOUND = {  # of car D with its compass: cause, topic and setting that are named first

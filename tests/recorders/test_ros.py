@@ -23,17 +23,17 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation, Slerp
 
-from recorders.errors import BadInput
-from recorders.importers.ros import importer
-from recorders.importers.ros.files.bags import open_bag
-from recorders.importers.ros.files.sqlite_file import SqliteFile
-from recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
-from recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
-from recorders.importers.ros.messages import TYPES
-from recorders.importers.ros.parameters import RosParameters
-from recorders.log import Stream, open_log, read_streams
-from recorders.models.inertial import from_mounting
-from recorders.recording import import_log, import_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros import importer
+from fuselog.recorders.importers.ros.files.bags import open_bag
+from fuselog.recorders.importers.ros.files.sqlite_file import SqliteFile
+from fuselog.recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
+from fuselog.recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
+from fuselog.recorders.importers.ros.messages import TYPES
+from fuselog.recorders.importers.ros.parameters import RosParameters
+from fuselog.recorders.log import Stream, open_log, read_streams
+from fuselog.recorders.models.inertial import from_mounting
+from fuselog.recorders.recording import import_log, import_run
 
 pytestmark = pytest.mark.paper
 

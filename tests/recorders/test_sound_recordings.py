@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
-from recorders.errors import BadInput
-from recorders.recording import Recording, import_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import Recording, import_run
 
 RATE_HZ = 8000
 PLACES = {"a.wav": (0, 0), "b.wav": (10, 0), "c.wav": (0, 10), "d.wav": (10, 10)}

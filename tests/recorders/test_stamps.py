@@ -9,9 +9,9 @@ import pyarrow as pa
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, to_ns
-from recorders.importers.tables.cells import read_ns
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import NOT_A_TIME, to_ns
+from fuselog.recorders.importers.tables.cells import read_ns
 
 digits = st.text("0123456789", max_size=40) | st.integers(1, 300).map("7".__mul__)
 signs = st.sampled_from(["", "", "-", "+", "--", "+-"])
@@ -72,7 +72,7 @@ def test_a_product_is_exact_or_refused(
 
 def test_bags_and_ulogs_are_imported_without_arrow() -> None:
     code = (
-        "import recorders.importers.ros.importer, recorders.importers.ulog.importer, sys\n"
+        "import fuselog.recorders.importers.ros.importer, fuselog.recorders.importers.ulog.importer, sys\n"
         "sys.exit('pyarrow' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

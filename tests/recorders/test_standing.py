@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from recorders.models.standing import unrest
+from fuselog.recorders.models.standing import unrest
 
 SECOND = 10**9
 GRAVITY = np.array([0.3, -0.2, 9.8])

@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from recorders.errors import BadInput
-from recorders.importers.tables.guessing import guess
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.guessing import guess
 
 DATE = "time = { column = 't', unit = 'date'"
 VALUES = "[[tables.streams]]\ntopic = '/v'\nbecomes = 'VectorMeasurement'\nfields.value = ['v']\n"

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from recorders.errors import BadInput
-from recorders.importers.tables import blocks, files
-from recorders.importers.tables.guessing import assumptions, guess
-from recorders.importers.tables.importer import TableParameters, read
-from recorders.log import Stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables import blocks, files
+from fuselog.recorders.importers.tables.guessing import assumptions, guess
+from fuselog.recorders.importers.tables.importer import TableParameters, read
+from fuselog.recorders.log import Stream
 
 ROWS = range(40)
 EPOCH = 1_700_000_000

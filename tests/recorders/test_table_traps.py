@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 
-from recorders.errors import BadInput
-from recorders.importers.tables.files import open_table
-from recorders.importers.tables.patterns import fitted, names_in
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.files import open_table
+from fuselog.recorders.importers.tables.patterns import fitted, names_in
 
 
 @pytest.mark.paper
@@ -31,8 +31,8 @@ def test_json_that_is_nested_deeply_is_refused(tmp_path: Path) -> None:
         (tmp_path / f"{name}.jsonl").write_text('{"t": 0}\n' + text)
     program = (
         "import sys; from pathlib import Path\n"
-        "from recorders.errors import BadInput\n"
-        "from recorders.importers.tables.files import open_table\n"
+        "from fuselog.recorders.errors import BadInput\n"
+        "from fuselog.recorders.importers.tables.files import open_table\n"
         "for name in sys.argv[1:]:\n"
         "    try: open_table(Path(f'{name}.jsonl'))\n"
         "    except BadInput as error: print(error)"

@@ -16,12 +16,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.importers.tables import blocks, files
-from recorders.importers.tables.blocks import NO_END
-from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
-from recorders.log import Stream, open_log, read_streams, write_log
-from recorders.recording import import_log, import_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables import blocks, files
+from fuselog.recorders.importers.tables.blocks import NO_END
+from fuselog.recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
+from fuselog.recorders.log import Stream, open_log, read_streams, write_log
+from fuselog.recorders.recording import import_log, import_run
 
 GRAVITY = 9.80665
 INERTIAL = """

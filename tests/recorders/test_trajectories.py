@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.trajectories import Trajectory, kitti_lines, read_trajectory, tum_lines
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.trajectories import Trajectory, kitti_lines, read_trajectory, tum_lines
 
 # A pose at (1, 2, 3), turned a quarter about the vertical, and one more, not turned.
 HALF = 0.7071067811865476

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recorders.importers.ros.transforms import Chain, Pair, Transforms
+from fuselog.recorders.importers.ros.transforms import Chain, Pair, Transforms
 
 MS = 10**6
 MAP, ODOM, MAST = ("map", "odom"), ("odom", "base"), ("map", "mast")

@@ -11,11 +11,11 @@ import pytest
 from pyulog import ULog
 
 import fuselog as fl
-from recorders.errors import BadInput
-from recorders.importers.ulog.file import MAGIC, UlogFile
-from recorders.importers.ulog.importer import ULOG, UlogParameters
-from recorders.importers.ulog.settings import carried, stated_noise
-from recorders.models.orientation import rotate
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ulog.file import MAGIC, UlogFile
+from fuselog.recorders.importers.ulog.importer import ULOG, UlogParameters
+from fuselog.recorders.importers.ulog.settings import carried, stated_noise
+from fuselog.recorders.models.orientation import rotate
 from tests.goldens import keeping, numbers
 
 # Of the sheet, section 6: streams, rows, changed parameters, defaults, texts, dropouts and their ms.

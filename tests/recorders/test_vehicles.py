@@ -5,11 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import kstest, norm
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.geodesy import into_tangent_plane
-from recorders.models.vehicles import into_frame, noise_moments, out_of_frame, turn
-from recorders.recording import record_run
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.geodesy import into_tangent_plane
+from fuselog.recorders.models.vehicles import into_frame, noise_moments, out_of_frame, turn
+from fuselog.recorders.recording import record_run
 
 TURNING = {"turn_rate_radps": [-0.05, 0.05, 0.0, -0.05, 0.05]}
 

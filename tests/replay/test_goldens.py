@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from fuselog.pipeline.checking.discrepancies import discrepancies
+from fuselog.pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, arithmetic
+from fuselog.pipeline.checking.stored import Golden, read
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.registry import available
 from fuselog.testing import assert_same
-from pipeline.checking.discrepancies import discrepancies
-from pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, arithmetic
-from pipeline.checking.stored import Golden, read
-from recorders.errors import BadInput
-from recorders.registry import available
 from tests.goldens import store
 from tests.goldens.recipes import RECIPES, covered, index, unpack
 from tests.goldens.store import ALLOWED
@@ -31,7 +31,7 @@ FRAGILE = ("navigation-unknown-heading", "set-filter")
 ON_IT = """
 import sys
 from fuselog.testing import assert_same
-from pipeline.checking.golden import arithmetic
+from fuselog.pipeline.checking.golden import arithmetic
 from tests.goldens import store
 _, here, *names = sys.argv
 if arithmetic() == here:

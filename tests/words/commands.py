@@ -15,8 +15,8 @@ from importlib.metadata import version
 from pathlib import Path
 from unittest.mock import patch
 
-from pipeline.command_line import main
-from pipeline.output import terminal
+from fuselog.pipeline.command_line import main
+from fuselog.pipeline.output import terminal
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("page.html", "pages.html")

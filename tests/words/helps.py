@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import click
 
-from pipeline.command_line.group import fuselog
+from fuselog.pipeline.command_line.group import fuselog
 
 
 def in_words() -> Iterator[str]:

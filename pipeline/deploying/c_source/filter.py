@@ -2,36 +2,36 @@
 
 import re
 
-from pipeline.deploying.c_source.algebra import CHOLESKY
-from pipeline.deploying.c_source.braces import braced
-from pipeline.deploying.c_source.factors import (
+from fuselog.pipeline.deploying.c_source.algebra import CHOLESKY
+from fuselog.pipeline.deploying.c_source.braces import braced
+from fuselog.pipeline.deploying.c_source.factors import (
     CARRYING,
     FACTORISING,
     RETRIANGULATE,
     SAMPLING,
     START,
 )
-from pipeline.deploying.c_source.names import CFilter, filled, identifier
-from pipeline.deploying.c_source.predictions import predicting_text
-from pipeline.deploying.c_source.products import (
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
+from fuselog.pipeline.deploying.c_source.predictions import predicting_text
+from fuselog.pipeline.deploying.c_source.products import (
     MEASURE,
     PROPAGATE,
     add_through,
     slope_text,
     turn_text,
 )
-from pipeline.deploying.c_source.samples import MOMENTS, samples_text
-from pipeline.deploying.c_source.statements import (
+from fuselog.pipeline.deploying.c_source.samples import MOMENTS, samples_text
+from fuselog.pipeline.deploying.c_source.statements import (
     body,
     count_gains,
     turned_axes,
 )
-from pipeline.deploying.c_source.updates import algebra_text, correcting_text, update_text
-from replay.inference.linear_algebra.factors import NOTHING_LEFT, ROUNDING
-from replay.inference.linear_algebra.manifold import right_jacobian_factors
-from replay.tracing.c_text import Precision, c_lines, helpers_of
-from replay.tracing.functions import trace
-from replay.tracing.graph import Graph, needed
+from fuselog.pipeline.deploying.c_source.updates import algebra_text, correcting_text, update_text
+from fuselog.replay.inference.linear_algebra.factors import NOTHING_LEFT, ROUNDING
+from fuselog.replay.inference.linear_algebra.manifold import right_jacobian_factors
+from fuselog.replay.tracing.c_text import Precision, c_lines, helpers_of
+from fuselog.replay.tracing.functions import trace
+from fuselog.replay.tracing.graph import Graph, needed
 
 IN_SINGLE = 5e-7, 3e-11  # for ROUNDING and NOTHING_LEFT: as many roundings, and their square
 

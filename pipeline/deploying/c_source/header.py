@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 
-from pipeline.deploying.c_source.names import CFilter, filled, identifier
-from recorders.parameters import meanings, unit_of
-from replay.engine.vectors.tangent import tangent_components
-from replay.inference.formulas import reference_names
-from replay.inference.model.model import Sensor
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
+from fuselog.recorders.parameters import meanings, unit_of
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.formulas import reference_names
+from fuselog.replay.inference.model.model import Sensor
 
 _COVARIANCE = """\
 /* The covariance, of the lower factor L that the filter carries: L L'. */

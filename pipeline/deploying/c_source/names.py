@@ -5,15 +5,15 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import NamedTuple
 
-from replay.inference.kalman.update import innovation_components
-from replay.inference.linear_algebra.factors import FACTORS
-from replay.inference.model.model import Sensor
-from replay.inference.model.parameters import number_fields
-from replay.inference.run.filtering import Filter
-from replay.inference.step_graphs import Step
-from replay.inference.whole_steps import WholeSteps
-from replay.tracing.c_text import Precision
-from replay.tracing.graph import INPUT, described, needed
+from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.linear_algebra.factors import FACTORS
+from fuselog.replay.inference.model.model import Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.run.filtering import Filter
+from fuselog.replay.inference.step_graphs import Step
+from fuselog.replay.inference.whole_steps import WholeSteps
+from fuselog.replay.tracing.c_text import Precision
+from fuselog.replay.tracing.graph import INPUT, described, needed
 
 _NAMES_OF_C = """auto break case char const continue default do double else enum extern float for goto if
 inline int long register restrict return short signed sizeof static struct switch typedef union unsigned

@@ -2,10 +2,10 @@
 
 import re
 
-from pipeline.deploying.c_source.header import predict_signature
-from pipeline.deploying.c_source.names import CFilter, filled
-from pipeline.deploying.c_source.samples import sampling_call, weighed
-from pipeline.deploying.c_source.statements import (
+from fuselog.pipeline.deploying.c_source.header import predict_signature
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.pipeline.deploying.c_source.samples import sampling_call, weighed
+from fuselog.pipeline.deploying.c_source.statements import (
     Inputs,
     Loops,
     body,
@@ -13,7 +13,7 @@ from pipeline.deploying.c_source.statements import (
     moved_state,
     noise_loops,
 )
-from replay.tracing.c_text import c_lines
+from fuselog.replay.tracing.c_text import c_lines
 
 _BETWEEN_CONTROLS = """{
     NAME_outcome outcome = checked(filter);

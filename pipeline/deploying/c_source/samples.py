@@ -1,4 +1,4 @@
-"""Writes functions at weighted samples in C, as `replay.inference.kalman.regression` has them.
+"""Writes functions at weighted samples in C, as `fuselog.replay.inference.kalman.regression` has them.
 
 Names as in `algebra`; SAMPLES, DRAWN, VALUES and PLACES are how many samples, numbers of one, tangent
 components and components of a function's values there are at most.
@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.deploying.c_source.names import CFilter, filled
-from pipeline.deploying.c_source.statements import Inputs, body, entries
-from replay.inference.kalman.regression import MEANS
-from replay.inference.kalman.wide_angles import QUARTER_RAD, UNIFORM_RAD, WIDE_RAD
-from replay.inference.linear_algebra.manifold import SETTLED
-from replay.inference.sampled_steps import SETTLING, SampledFunction
-from replay.tracing.c_text import c_lines, truth_text
-from replay.tracing.graph import Node, steady
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.pipeline.deploying.c_source.statements import Inputs, body, entries
+from fuselog.replay.inference.kalman.regression import MEANS
+from fuselog.replay.inference.kalman.wide_angles import QUARTER_RAD, UNIFORM_RAD, WIDE_RAD
+from fuselog.replay.inference.linear_algebra.manifold import SETTLED
+from fuselog.replay.inference.sampled_steps import SETTLING, SampledFunction
+from fuselog.replay.tracing.c_text import c_lines, truth_text
+from fuselog.replay.tracing.graph import Node, steady
 
 SETTLED_IN_SINGLE = 1e-7  # see `manifold.SETTLED`
 

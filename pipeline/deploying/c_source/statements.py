@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from pipeline.deploying.c_source.names import CFilter, identifier
-from pipeline.deploying.c_source.products import (
+from fuselog.pipeline.deploying.c_source.names import CFilter, identifier
+from fuselog.pipeline.deploying.c_source.products import (
     columns_text,
 )
-from replay.inference.linear_algebra.manifold import is_flat, manifold_blocks
-from replay.inference.step_graphs import Step
-from replay.tracing.graph import INPUT, Node, needed
+from fuselog.replay.inference.linear_algebra.manifold import is_flat, manifold_blocks
+from fuselog.replay.inference.step_graphs import Step
+from fuselog.replay.tracing.graph import INPUT, Node, needed
 
 
 class Inputs:

@@ -2,12 +2,12 @@
 
 import re
 
-from pipeline.deploying.c_source import factors
-from pipeline.deploying.c_source.algebra import ALGEBRA, COMMON, ITERATE, UPDATE
-from pipeline.deploying.c_source.header import update_signature
-from pipeline.deploying.c_source.names import CFilter, filled
-from pipeline.deploying.c_source.samples import sampling_call, weighed
-from pipeline.deploying.c_source.statements import (
+from fuselog.pipeline.deploying.c_source import factors
+from fuselog.pipeline.deploying.c_source.algebra import ALGEBRA, COMMON, ITERATE, UPDATE
+from fuselog.pipeline.deploying.c_source.header import update_signature
+from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.pipeline.deploying.c_source.samples import sampling_call, weighed
+from fuselog.pipeline.deploying.c_source.statements import (
     Inputs,
     Loops,
     body,
@@ -18,8 +18,8 @@ from pipeline.deploying.c_source.statements import (
     retriangulates,
     turned_axes,
 )
-from replay.inference.kalman.iterated_update import SETTLED
-from replay.tracing.c_text import c_lines
+from fuselog.replay.inference.kalman.iterated_update import SETTLED
+from fuselog.replay.tracing.c_text import c_lines
 
 
 def correcting_text(made: CFilter) -> list[str]:

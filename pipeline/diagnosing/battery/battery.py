@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
     UNIT_FAULTS,
     faulty,
@@ -18,12 +18,12 @@ from pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
-from pipeline.diagnosing.causes import Cause, seek
-from pipeline.diagnosing.findings import FIRST, without_filter
-from pipeline.diagnosing.hypotheses.hypothesis import Kind
-from pipeline.runs.ensemble import Progress
-from recorders.plausibility.checks import findings
-from recorders.plausibility.finding import Cause as Estimated
+from fuselog.pipeline.diagnosing.causes import Cause, seek
+from fuselog.pipeline.diagnosing.findings import FIRST, without_filter
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.pipeline.runs.ensemble import Progress
+from fuselog.recorders.plausibility.checks import findings
+from fuselog.recorders.plausibility.finding import Cause as Estimated
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"

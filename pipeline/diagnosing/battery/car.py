@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.common_streams import fix_stream, prior_stream
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from replay.engine.streams.sources import MemorySource
+from fuselog.recorders.common_streams import fix_stream, prior_stream
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.floating]
 DURATION_S, REST_S, RAMP_S = 100.0, 10.0, 5.0

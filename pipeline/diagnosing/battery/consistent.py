@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.diagnosing.battery.car import (
     COMPASS_STEP_S,
     FIX_STEP_S,
     FORWARD_DENSITY,
@@ -18,11 +18,11 @@ from pipeline.diagnosing.battery.car import (
     drive,
     recorded,
 )
-from pipeline.diagnosing.causes import seek
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.diagnosing.causes import seek
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.replay.engine.streams.sources import MemorySource
 
 TO_FIX = (0.1, 0.3, 1.0, 3.0, 10.0)
 TO_COMPASS = (None, 0.1, 1.0, 10.0)
@@ -63,7 +63,7 @@ def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
     outcome = Outcome()
     for ratios in all_ratios():

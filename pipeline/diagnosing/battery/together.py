@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
-from pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
-from pipeline.diagnosing.causes import Cause, Estimated, seek
-from pipeline.diagnosing.hypotheses.hypothesis import NOISES
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
+from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
+from fuselog.pipeline.diagnosing.causes import Cause, Estimated, seek
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import NOISES
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 
 TRIPLES = 40
 AXES = "E, N exchanged"
@@ -100,7 +100,7 @@ def _estimate(causes: Sequence[Cause], right: Right) -> Estimated | None:
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
     for faults in (*pairs(), *triples()):
         title = " + ".join(faults)

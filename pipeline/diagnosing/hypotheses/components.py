@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.altering.changes import AXES, bare
-from pipeline.altering.entries import Entry, entries_of
-from pipeline.diagnosing.advice import Advice, number, precise, rounded
-from pipeline.diagnosing.hypotheses.hypothesis import (
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering.changes import AXES, bare
+from fuselog.pipeline.altering.entries import Entry, entries_of
+from fuselog.pipeline.diagnosing.advice import Advice, number, precise, rounded
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     Hypothesis,
     Kind,
     in_sense,
@@ -18,10 +18,10 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     supposed,
     value_of,
 )
-from recorders.importers.units import unit_of
-from recorders.log import Stream
-from recorders.parameters import Parameters
-from replay.engine.replaying.estimator import Reading
+from fuselog.recorders.importers.units import unit_of
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.replaying.estimator import Reading
 
 FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
 ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic, supposed
-from pipeline.diagnosing.likelihood import Trial
-from recorders.log import Stream
-from replay.engine.replaying.estimator import Bound
-from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import split_topic
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.diagnosing.advice import Advice
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic, supposed
+from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 SUSPECT = 2.0  # a mean NIS per component, above which numbers may be exchanged
 SUSPECTS = 12  # of which all pairs are tried

@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice, number
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from recorders.log import Stream
-from recorders.parameters import Parameters, field_of
-from replay.distributions import chi2
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.diagnosing.advice import Advice, number
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameters, field_of
+from fuselog.replay.distributions import chi2
 
 Kind = Literal[
     "measurement noise",
@@ -207,7 +207,7 @@ def noise_gain_over(
 ) -> Callable[[Hypothesis, Number], tuple[float, float]]:
     """Return a function that says what undoing a fault gains by the noise of the controls alone.
 
-    The mean and the standard deviation over logs, see `pipeline.tuning.control_noise`. Of noises and
+    The mean and the standard deviation over logs, see `fuselog.pipeline.tuning.control_noise`. Of noises and
     outliers it is zero: their likelihood is meant to have that noise.
     """
     most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, all of it this noise

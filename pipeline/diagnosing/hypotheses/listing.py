@@ -2,22 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.diagnosing.hypotheses.components import of_components
-from pipeline.diagnosing.hypotheses.exchanges import of_numbers
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from pipeline.diagnosing.hypotheses.origins import of_origin
-from pipeline.diagnosing.hypotheses.parameters import (
+from fuselog.pipeline.diagnosing.hypotheses.components import of_components
+from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from fuselog.pipeline.diagnosing.hypotheses.origins import of_origin
+from fuselog.pipeline.diagnosing.hypotheses.parameters import (
     of_augmentable,
     of_covariances,
     of_declared,
     of_gate,
     of_noises,
 )
-from pipeline.diagnosing.hypotheses.stamps import hold_of, lag_of, of_stamps
-from pipeline.diagnosing.hypotheses.starts import of_start
-from pipeline.diagnosing.likelihood import Trial
-from recorders.log import Stream
-from replay.engine.replaying.estimator import Bound, Reading
+from fuselog.pipeline.diagnosing.hypotheses.stamps import hold_of, lag_of, of_stamps
+from fuselog.pipeline.diagnosing.hypotheses.starts import of_start
+from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.replaying.estimator import Bound, Reading
 
 FEWEST = 20  # messages of which a topic's errors can be told
 

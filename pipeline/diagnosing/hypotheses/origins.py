@@ -4,14 +4,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice, number, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind
-from pipeline.diagnosing.likelihood import Trial
-from recorders.log import Stream
-from recorders.log.planes import Origin, stated_in
-from recorders.models.geodesy import out_of_tangent_plane
-from replay.engine.replaying.estimator import Reading
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.diagnosing.advice import Advice, number, precise
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind
+from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.recorders.log import Stream
+from fuselog.recorders.log.planes import Origin, stated_in
+from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.replay.engine.replaying.estimator import Reading
 
 STEP_M = 1.0
 Metres = tuple[float, float]

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.altering.changes import STATED
-from pipeline.diagnosing.advice import Advice, number, precise, rounded
-from pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_RAD
-from pipeline.diagnosing.hypotheses.hypothesis import (
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering.changes import STATED
+from fuselog.pipeline.diagnosing.advice import Advice, number, precise, rounded
+from fuselog.pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_RAD
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     SCALES,
     Hypothesis,
     Kind,
@@ -21,11 +21,11 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     supposed,
     times,
 )
-from pipeline.diagnosing.likelihood import Trial
-from pipeline.tuning.objective import with_values
-from recorders.importers.units import unit_of
-from recorders.log import Stream
-from recorders.parameters import (
+from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.pipeline.tuning.objective import with_values
+from fuselog.recorders.importers.units import unit_of
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import (
     Described,
     Parameters,
     bounds_of,
@@ -34,10 +34,10 @@ from recorders.parameters import (
     in_few_words,
     roles_of,
 )
-from replay.engine.replaying.estimator import Bound, Reading, Recursive
-from replay.engine.streams.channels import stated
-from replay.engine.streams.sources import MemorySource
-from replay.foreign.programs import ProgramParameters
+from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.foreign.programs import ProgramParameters
 
 GATE = 0.999
 REOPENS_S, NEVER_S = 1.0, 1e9

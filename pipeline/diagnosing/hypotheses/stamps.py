@@ -5,12 +5,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice, number, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic, value_of
-from recorders.log import Stream
-from recorders.parameters import Parameters
-from replay.engine.replaying.estimator import Reading
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.diagnosing.advice import Advice, number, precise
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic, value_of
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.replaying.estimator import Reading
 
 Floats = NDArray[np.float64]
 DELAYS_S = (-0.02, 0.02, -0.1, 0.1, -0.4, 0.4, -2.0, 2.0, -8.0, 8.0)

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.altering import alterations as alter
-from pipeline.altering.changes import bare
-from pipeline.diagnosing.advice import Advice, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
-from recorders.log import Stream
-from replay.engine.vectors.components import components_of, stated_components
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.pipeline.altering.changes import bare
+from fuselog.pipeline.diagnosing.advice import Advice, precise
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.vectors.components import components_of, stated_components
 
 SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # of a prior
 

@@ -25,23 +25,23 @@ from jinja2 import Environment, PackageLoader, Template, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from pipeline.output.alarms import Cause
-from pipeline.output.charts import Chart
-from pipeline.output.report.evidence import Findings, Timings
-from pipeline.output.report.first_run import first_run, picture_of_timeline
-from pipeline.output.report.glossary import Term, glossary
-from pipeline.output.report.kinds import Opening, opening
-from pipeline.output.report.naming import distinct_names, text_colours, title_of
-from pipeline.output.report.scene import lens, nis_chart, plan, tracked
-from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
-from pipeline.output.report.sweeps import RUNS_TABLE
-from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
-from pipeline.output.terminal import format_value, is_value
-from pipeline.output.words import QUANTITIES, TRACKING, count, label_of, quantity
-from recorders.atomic import whole_file
-from recorders.errors import BadInput, printable
-from recorders.parameters import Parameters, build
-from recorders.parsing import parse_json
+from fuselog.pipeline.output.alarms import Cause
+from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.output.report.evidence import Findings, Timings
+from fuselog.pipeline.output.report.first_run import first_run, picture_of_timeline
+from fuselog.pipeline.output.report.glossary import Term, glossary
+from fuselog.pipeline.output.report.kinds import Opening, opening
+from fuselog.pipeline.output.report.naming import distinct_names, text_colours, title_of
+from fuselog.pipeline.output.report.scene import lens, nis_chart, plan, tracked
+from fuselog.pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
+from fuselog.pipeline.output.report.sweeps import RUNS_TABLE
+from fuselog.pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
+from fuselog.pipeline.output.terminal import format_value, is_value
+from fuselog.pipeline.output.words import QUANTITIES, TRACKING, count, label_of, quantity
+from fuselog.recorders.atomic import whole_file
+from fuselog.recorders.errors import BadInput, printable
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.recorders.parsing import parse_json
 
 # On pages that have one of these, each has its own colour.
 USUAL = ("dead-reckoning", "ekf", "ukf")
@@ -128,7 +128,7 @@ def write_report(
 @cache
 def _template() -> Template:
     environment = Environment(
-        loader=PackageLoader("pipeline.output.report", "."),
+        loader=PackageLoader("fuselog.pipeline.output.report", "."),
         autoescape=select_autoescape(),
         finalize=_visible,
         trim_blocks=True,
@@ -176,7 +176,7 @@ def empty_cells(table: pd.DataFrame) -> list[str]:
 
 
 def _asset(name: str) -> str:
-    return (resources.files("pipeline.output.report") / name).read_text(encoding="utf-8")
+    return (resources.files("fuselog.pipeline.output.report") / name).read_text(encoding="utf-8")
 
 
 def _hashes(scripts: Sequence[str]) -> Markup:

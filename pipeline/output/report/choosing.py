@@ -2,8 +2,8 @@
 
 import math
 
-from pipeline.output.report.evidence import Evidence, Findings, relation
-from pipeline.output.words import listed
+from fuselog.pipeline.output.report.evidence import Evidence, Findings, relation
+from fuselog.pipeline.output.words import listed
 
 MOST_CARDS = 4
 

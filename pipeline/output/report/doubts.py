@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 
-from pipeline.output.alarms import Alarm
-from pipeline.output.report.evidence import Findings, relation
-from pipeline.output.words import count, listed
-from replay.judging.errors.differences import FEWEST_RUNS
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.report.evidence import Findings, relation
+from fuselog.pipeline.output.words import count, listed
+from fuselog.replay.judging.errors.differences import FEWEST_RUNS
 
 MOST_NAMED = 4  # more estimators are counted
 # What the checks of a replay found, of the estimators that they found it of.

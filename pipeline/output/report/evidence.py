@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.output.alarming import DIVERGED
-from pipeline.output.alarms import Stressing
-from pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
-from pipeline.output.words import is_error, quantity
-from replay.judging.errors.differences import (
+from fuselog.pipeline.output.alarming import DIVERGED
+from fuselog.pipeline.output.alarms import Stressing
+from fuselog.pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
+from fuselog.pipeline.output.words import is_error, quantity
+from fuselog.replay.judging.errors.differences import (
     Difference,
     Target,
     mean_interval,
@@ -304,7 +304,7 @@ class Findings:
 
     def _size(self, honest: tuple[float, float]) -> float:
         """Return of how many components NEES is: of as many as have this chi-square interval."""
-        from replay.judging.errors.evaluation import chi_square_interval
+        from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
         sizes = range(1, 100)
         runs = max(self.runs, 1)

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from recorders.atomic import scratch_folder
-from recorders.log import open_log, schemas, topics_of
-from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.streams.ensembles import ensemble_of
-from replay.engine.streams.sources import LogSource, Source
-from replay.judging.errors.evaluation import Innovations, split_topic
-from replay.judging.judge import Judge
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.log import open_log, schemas, topics_of
+from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
+from fuselog.replay.engine.streams.ensembles import ensemble_of
+from fuselog.replay.engine.streams.sources import LogSource, Source
+from fuselog.replay.judging.errors.evaluation import Innovations, split_topic
+from fuselog.replay.judging.judge import Judge
 
 Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
@@ -154,7 +154,7 @@ def picture_of_timeline(timeline: Path) -> bytes:
 
     Raises BadInput where there is no timeline, or no Vulkan driver to draw it with.
     """
-    from replay.timeline.viewer import screenshot
+    from fuselog.replay.timeline.viewer import screenshot
 
     with scratch_folder("fuselog-report") as folder:
         png = folder / "timeline.png"

@@ -3,8 +3,8 @@
 import math
 from typing import NamedTuple
 
-from pipeline.output.report.evidence import MATERIAL, Consistency
-from pipeline.output.words import Scale, alike, interval, number
+from fuselog.pipeline.output.report.evidence import MATERIAL, Consistency
+from fuselog.pipeline.output.words import Scale, alike, interval, number
 
 # It goes from a third of the aim to ten times the aim, evenly in the logarithm.
 GAUGE_ENDS = (1 / 3, 10.0)

@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, Series, curve
-from pipeline.output.claims import NO_VERDICT, Verdict
-from pipeline.output.report.choosing import MOST_CARDS
-from pipeline.output.report.evidence import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, curve
+from fuselog.pipeline.output.claims import NO_VERDICT, Verdict
+from fuselog.pipeline.output.report.choosing import MOST_CARDS
+from fuselog.pipeline.output.report.evidence import (
     MARGIN,
     MATERIAL,
     Findings,
@@ -24,10 +24,10 @@ from pipeline.output.report.evidence import (
     findings,
     runs_of,
 )
-from pipeline.output.report.story import Card, Story, story
-from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
-from pipeline.output.results import Measured, MetricTable, Result, read_table
-from pipeline.output.words import (
+from fuselog.pipeline.output.report.story import Card, Story, story
+from fuselog.pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
+from fuselog.pipeline.output.results import Measured, MetricTable, Result, read_table
+from fuselog.pipeline.output.words import (
     count,
     interval,
     is_error,
@@ -37,8 +37,8 @@ from pipeline.output.words import (
     quantity,
     scale,
 )
-from recorders.parameters import unit_of
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.recorders.parameters import unit_of
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
 # More estimators than these are counted, and more claims that are refuted stand in the table alone.

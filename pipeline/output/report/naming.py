@@ -9,10 +9,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.output.charts import COLOURS
-from pipeline.output.results import Result
-from pipeline.output.terminal import format_value
-from pipeline.output.words import count, listed
+from fuselog.pipeline.output.charts import COLOURS
+from fuselog.pipeline.output.results import Result
+from fuselog.pipeline.output.terminal import format_value
+from fuselog.pipeline.output.words import count, listed
 
 # The grounds of the page on which names stand; the first of each is the page's own.
 LIGHT, DARK = ("#ffffff", "#fdf1f5"), ("#14171a", "#2a1a20")

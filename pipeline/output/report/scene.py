@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, path, thinned
-from pipeline.output.report.first_run import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, path, thinned
+from fuselog.pipeline.output.report.first_run import (
     MOST_RUNS,
     PLANE,
     RUNS,
@@ -15,12 +15,12 @@ from pipeline.output.report.first_run import (
     Followed,
     innovations_of_runs,
 )
-from pipeline.output.words import count
-from recorders.log import open_log, read_streams, schemas, topics_of
-from replay.distributions import chi2
-from replay.engine.streams.sources import LogSource
-from replay.estimators.tracking.scans import ORIGIN, detected_places
-from replay.judging.errors.evaluation import chi_square_interval, split_topic
+from fuselog.pipeline.output.words import count
+from fuselog.recorders.log import open_log, read_streams, schemas, topics_of
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.estimators.tracking.scans import ORIGIN, detected_places
+from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 
 Floats = NDArray[np.float64]
 # Particles are drawn at so many times, and of each cloud so many of equal weight.

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
-from pipeline.output.results import Measured, MetricTable
-from pipeline.output.words import (
+from fuselog.pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
+from fuselog.pipeline.output.results import Measured, MetricTable
+from fuselog.pipeline.output.words import (
     ACCURACY,
     CONSISTENCY,
     COST,
@@ -24,7 +24,7 @@ from pipeline.output.words import (
     quantity,
     scale,
 )
-from replay.judging.errors.differences import mean_interval, rms_interval, target_of
+from fuselog.replay.judging.errors.differences import mean_interval, rms_interval, target_of
 
 MOST_ROWS = 12
 GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)

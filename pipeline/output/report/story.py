@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from pipeline.output.alarms import Alarm, Cause, Stressing
-from pipeline.output.report import choosing
-from pipeline.output.report.doubts import doubts_of
-from pipeline.output.report.evidence import (
+from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
+from fuselog.pipeline.output.report import choosing
+from fuselog.pipeline.output.report.doubts import doubts_of
+from fuselog.pipeline.output.report.evidence import (
     MARGIN,
     Evidence,
     Findings,
@@ -20,10 +20,20 @@ from pipeline.output.report.evidence import (
     is_withheld,
     relation,
 )
-from pipeline.output.report.gauge import Gauge, gauge, numbers_of
-from pipeline.output.words import MISSING, Scale, alike, count, interval, listed, number, quantity, scale
-from replay.judging.diagnostics import LEAST_SHARE
-from replay.judging.errors.differences import FEWEST_RUNS
+from fuselog.pipeline.output.report.gauge import Gauge, gauge, numbers_of
+from fuselog.pipeline.output.words import (
+    MISSING,
+    Scale,
+    alike,
+    count,
+    interval,
+    listed,
+    number,
+    quantity,
+    scale,
+)
+from fuselog.replay.judging.diagnostics import LEAST_SHARE
+from fuselog.replay.judging.errors.differences import FEWEST_RUNS
 
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long

@@ -12,11 +12,18 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, relation, runs_of
-from pipeline.output.report.story import Card, Story, story
-from pipeline.output.results import Result
-from pipeline.output.words import count, is_error, listed, quantity, scale, stated
-from recorders.parameters import unit_of
+from fuselog.pipeline.output.report.evidence import (
+    Consistency,
+    Findings,
+    Spread,
+    findings,
+    relation,
+    runs_of,
+)
+from fuselog.pipeline.output.report.story import Card, Story, story
+from fuselog.pipeline.output.results import Result
+from fuselog.pipeline.output.words import count, is_error, listed, quantity, scale, stated
+from fuselog.recorders.parameters import unit_of
 
 MOST_POINTS = 4  # more are counted
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point

@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import skew
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.acoustic.cases import (
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.acoustic.cases import (
     CROSS,
     LOCAL,
     NATIVE,
@@ -21,14 +21,14 @@ from pipeline.studies.acoustic.cases import (
     range_errors_m,
     run_case,
 )
-from pipeline.studies.acoustic.figures import figures
-from pipeline.studies.toolkit.repetitions import require_spread
-from replay.judging.consistency.consistency import component_error_squared, ellipse_area
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.pipeline.studies.acoustic.figures import figures
+from fuselog.pipeline.studies.toolkit.repetitions import require_spread
+from fuselog.replay.judging.consistency.consistency import component_error_squared, ellipse_area
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: AcousticOptions = setting.options
     require_spread(experiment.runs)
     pairs = [

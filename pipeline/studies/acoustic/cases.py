@@ -7,22 +7,27 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.inputs import Record, load_scenario
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
-from recorders.models.acoustic import local_estimate_covariances, range_from_time_difference
-from recorders.parameters import Parameters, build, merge
-from recorders.simulators.acoustic import AcousticParameters
-from replay.engine.replaying.estimator import configure
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.estimators.localization import acoustic
-from replay.estimators.localization.acoustic import Detections
-from replay.estimators.localization.acoustic_streams import ShooterParameters, gather_detections
-from replay.judging.consistency.consistency import ellipse_area
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.inputs import Record, load_scenario
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import (
+    Floats,
+    by_repetition,
+    errors_named,
+    root_mean_square,
+)
+from fuselog.recorders.models.acoustic import local_estimate_covariances, range_from_time_difference
+from fuselog.recorders.parameters import Parameters, build, merge
+from fuselog.recorders.simulators.acoustic import AcousticParameters
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.estimators.localization import acoustic
+from fuselog.replay.estimators.localization.acoustic import Detections
+from fuselog.replay.estimators.localization.acoustic_streams import ShooterParameters, gather_detections
+from fuselog.replay.judging.consistency.consistency import ellipse_area
 
 BEARINGS, LOCAL, NATIVE = "bearings-only", "local-estimates", "native-measurements"
 CROSS = "cross-covariances"

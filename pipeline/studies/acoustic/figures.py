@@ -7,11 +7,17 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, interval, path
-from pipeline.studies.acoustic.cases import AcousticOptions, Case, Mode, area_ratios, range_errors_m
-from pipeline.studies.toolkit.repetitions import EFFICIENT
-from replay.judging.errors.evaluation import chi_square_interval
-from replay.timeline.drawing.plane import ellipses
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, interval, path
+from fuselog.pipeline.studies.acoustic.cases import (
+    AcousticOptions,
+    Case,
+    Mode,
+    area_ratios,
+    range_errors_m,
+)
+from fuselog.pipeline.studies.toolkit.repetitions import EFFICIENT
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
+from fuselog.replay.timeline.drawing.plane import ellipses
 
 
 def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Chart | Figure]:

@@ -10,18 +10,18 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import record_ensemble
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.distributions import chi2
-from replay.engine.arrays import Floats
-from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.errors.evaluation import Errors
 
 
 class Published(Parameters):
@@ -63,7 +63,7 @@ class Options(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     label = next(iter(experiment.estimators), None)
     if label is None:

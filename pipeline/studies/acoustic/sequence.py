@@ -11,16 +11,21 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Interval, errors_named, mean_interval, require_spread
-from recorders.parameters import Parameters
-from replay.engine.arrays import Floats
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import (
+    Interval,
+    errors_named,
+    mean_interval,
+    require_spread,
+)
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.sources import MemorySource
 
 SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
@@ -36,7 +41,7 @@ class Options(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     require_spread(experiment.runs)
     outcome, tables = Outcome(), []

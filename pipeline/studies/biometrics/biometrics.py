@@ -12,21 +12,21 @@ from matplotlib.figure import Figure
 from pydantic import PositiveInt
 from scipy.stats import norm
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, thinned
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from recorders.models.scores import TOPIC, comparisons_of, matchers_of
-from recorders.parameters import Parameters
-from replay.engine.replaying.estimator import configure
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.biometrics.biometrics import LearnerParameters
-from replay.estimators.biometrics.pairs import subsets_of
-from replay.judging.consistency.verification import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, thinned
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.models.scores import TOPIC, comparisons_of, matchers_of
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.biometrics.biometrics import LearnerParameters
+from fuselog.replay.estimators.biometrics.pairs import subsets_of
+from fuselog.replay.judging.consistency.verification import (
     FALSE_ACCEPT_RATES,
     Fused,
     bootstrap_users,
@@ -34,7 +34,7 @@ from replay.judging.consistency.verification import (
     relative_rate_increase,
     roc,
 )
-from replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 # What Zheng & Blasch print of NIST BSSR1 set 1, in percent.
 METHODS, MODALITIES = ("face", "finger"), ("matcher-1", "matcher-2")
@@ -67,7 +67,7 @@ class BiometricsOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     runner = Runner(experiment, setting)
     replayed = runner.run()
     sources = replayed.sources

@@ -16,16 +16,16 @@ import pandas as pd
 from pydantic import Field, PositiveFloat, PositiveInt
 from scipy.special import ndtr
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.studies.biometrics.watched import Labelled, faulty, watching
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.arrays import Floats, Integers
-from replay.judging.consistency.sequential import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.biometrics.watched import Labelled, faulty, watching
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.judging.consistency.sequential import (
     Decisions,
     Rates,
     decide,
@@ -34,8 +34,8 @@ from replay.judging.consistency.sequential import (
     wald_bounds,
     wald_probes,
 )
-from replay.judging.consistency.verification import Fused, fused_of
-from replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.consistency.verification import Fused, fused_of
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 Share = Annotated[float, Field(gt=0, lt=0.5)]
 RatioOf = Callable[[Integers], Floats]
@@ -99,7 +99,7 @@ class Drawn(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     replayed = Runner(experiment, setting).run()
     ratios = {

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.arrays import Booleans, Floats
 
 DRIFT_SIGMA = 1.0
 

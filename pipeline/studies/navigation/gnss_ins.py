@@ -13,14 +13,14 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.navigation.outages import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.navigation.outages import (
     COASTED,
     FIX,
     HERMITE,
@@ -35,14 +35,14 @@ from pipeline.studies.navigation.outages import (
     windows_of,
     withheld,
 )
-from recorders.errors import BadInput
-from recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
-from recorders.parameters import Parameters
-from recorders.recording import import_run
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # of three components
 RUNS_AT_ONCE = 2  # in memory, with their estimates
@@ -83,7 +83,7 @@ class Innovations(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: GnssInsOptions = setting.options
     experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)

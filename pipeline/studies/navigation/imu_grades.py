@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from recorders.simulators.navigation_parameters import NavigationParameters
-from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.navigation_parameters import NavigationParameters
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.errors.evaluation import Errors
 
 
 class Options(Parameters):
@@ -40,7 +40,7 @@ class Span(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []

@@ -11,17 +11,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import Errors
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     replayed = Runner(experiment, setting).run()
     trials = movement_table(replayed.errors, replayed.sources)
     means = {

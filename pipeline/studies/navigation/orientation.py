@@ -16,22 +16,22 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.navigation.inertial import is_moving
-from pipeline.studies.toolkit.repetitions import mean_interval
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.orientation import compose, conjugate
-from recorders.parameters import Parameters
-from recorders.recording import import_run
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.consistency.disturbances import COMPONENTS, disturbances
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.navigation.inertial import is_moving
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.consistency.disturbances import COMPONENTS, disturbances
 
 KINDS = ("undisturbed", "disturbed", "slow", "fast", "rotation", "translation", "combined")
 PARTS = ("total", "heading", "inclination")
@@ -63,7 +63,7 @@ class ErrorAngles(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: OrientationOptions = setting.options
     missing = [label for label in experiment.estimators if label == "vqf" and not find_spec("vqf")]
     experiment = experiment.model_copy(

@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
-from recorders.common_streams import outage_stream
-from recorders.errors import BadInput
-from recorders.log import Stream
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
-from replay.engine.vectors.tangent import states_at
+from fuselog.recorders.common_streams import outage_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.tangent import states_at
 
 FIX, VELOCITY, TRUTH, INERTIAL = "/fix", "/velocity", "/truth", "/inertial"
 NEEDED = (FIX, VELOCITY, TRUTH, INERTIAL)

@@ -15,29 +15,29 @@ import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import rms_length
-from recorders.common_streams import prior_stream, truth_stream
-from recorders.errors import BadInput
-from recorders.importers.tables.mapping import read_mapping, recordings_in
-from recorders.log import Stream, make_stream, schemas
-from recorders.models.orientation import compose, heading
-from recorders.models.planar import wrap_angle
-from recorders.models.states import NAVIGATION
-from recorders.parameters import Parameters
-from recorders.recording import import_run
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import difference
-from replay.estimators.networks.covariance_intersection import fuse
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import rms_length
+from fuselog.recorders.common_streams import prior_stream, truth_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.mapping import read_mapping, recordings_in
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.orientation import compose, heading
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.models.states import NAVIGATION
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.estimators.networks.covariance_intersection import fuse
 
 # Position, velocity and orientation, which all filters estimate; the biases are those of their units.
 POSE, POSE_TANGENT = 10, 9
@@ -93,7 +93,7 @@ class Flight(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: QuadInertialOptions = setting.options
     flights = _flights(experiment, setting)
     filter_alone = {options.filter: experiment.estimators[options.filter]}

@@ -5,14 +5,14 @@ Its paper, Jin, Lee, Hashimoto, DIND networks, has no numbers of real robots.
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.toolkit import localization
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.toolkit import localization
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     outcome = localization.study(experiment, setting)
     outcome.figures["modes"] = mode_chart(outcome.metrics, list(experiment.estimators))
     return outcome

@@ -15,17 +15,17 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.parameters import Parameters
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Booleans = NDArray[np.bool_]
 
@@ -54,7 +54,7 @@ Keep = Callable[[Stream, int, Booleans], Booleans]
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: CooperativeStressOptions = setting.options
     runner = Runner(experiment, setting)
     calm = runner.run()

@@ -13,21 +13,21 @@ import numpy as np
 import pandas as pd
 from pydantic import NonNegativeFloat
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summarise
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.blocks import gather, run_of_rows
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.networks.covariance_intersection import fuse
-from replay.estimators.networks.networks import CENTRALISED, NetworkParameters, message_bytes
-from replay.judging.errors.evaluation import Errors
-from replay.judging.judge import Judge
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summarise
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.blocks import gather, run_of_rows
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.networks.covariance_intersection import fuse
+from fuselog.replay.estimators.networks.networks import CENTRALISED, NetworkParameters, message_bytes
+from fuselog.replay.judging.errors.evaluation import Errors
+from fuselog.replay.judging.judge import Judge
 
 CI = "ci-trace"
 
@@ -47,7 +47,7 @@ class NetworkOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: NetworkOptions = setting.options
     runner = Runner(experiment, setting)
     replayed = runner.run()

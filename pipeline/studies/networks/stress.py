@@ -13,17 +13,17 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, curves, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.blocks import Ragged
-from replay.estimators.networks.networks import message_bytes
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, curves, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.estimators.networks.networks import message_bytes
 
 CALM, CI, NAIVE = "calm", "ci", "naive"
 INTERVAL, NEWS = "at most once in an interval", "when it has news"
@@ -55,7 +55,7 @@ class StressOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: StressOptions = setting.options
     for name in (CI, NAIVE):
         if name not in experiment.estimators:

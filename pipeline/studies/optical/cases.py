@@ -7,23 +7,28 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.inputs import Record, load_scenario
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
-from recorders.errors import BadInput
-from recorders.models.optical import ANGLES
-from recorders.parameters import Parameters, build, merge
-from recorders.simulators.optical import OpticalParameters
-from replay.engine.replaying.estimator import configure
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.estimators.localization import optical
-from replay.estimators.localization.least_squares import cramer_rao_bound
-from replay.estimators.localization.optical import Observability, Scene
-from replay.estimators.localization.optical_streams import known_biases
-from replay.judging.consistency.consistency import component_error_squared, dilution_of_precision
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.inputs import Record, load_scenario
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import (
+    Floats,
+    by_repetition,
+    errors_named,
+    root_mean_square,
+)
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.optical import ANGLES
+from fuselog.recorders.parameters import Parameters, build, merge
+from fuselog.recorders.simulators.optical import OpticalParameters
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.estimators.localization import optical
+from fuselog.replay.estimators.localization.least_squares import cramer_rao_bound
+from fuselog.replay.estimators.localization.optical import Observability, Scene
+from fuselog.replay.estimators.localization.optical_streams import known_biases
+from fuselog.replay.judging.consistency.consistency import component_error_squared, dilution_of_precision
 
 ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, interval, path
-from pipeline.studies.optical.cases import Case, bias_names
-from pipeline.studies.toolkit.repetitions import EFFICIENT, groups
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, interval, path
+from fuselog.pipeline.studies.optical.cases import Case, bias_names
+from fuselog.pipeline.studies.toolkit.repetitions import EFFICIENT, groups
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 
 def figures(cases: Sequence[Case], runs: int) -> dict[str, Chart]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.optical.cases import (
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.optical.cases import (
     ALONE,
     BLIND,
     JOINT,
@@ -24,19 +24,19 @@ from pipeline.studies.optical.cases import (
     one_bias_known,
     run_case,
 )
-from pipeline.studies.optical.figures import figures
-from pipeline.studies.optical.printed import (
+from fuselog.pipeline.studies.optical.figures import figures
+from fuselog.pipeline.studies.optical.printed import (
     metrics_beside_print,
     metrics_of_geometry,
     metrics_of_print,
     steepest_deg,
 )
-from pipeline.studies.toolkit.repetitions import require_spread, root_mean_square
-from recorders.models.optical import ANGLES
+from fuselog.pipeline.studies.toolkit.repetitions import require_spread, root_mean_square
+from fuselog.recorders.models.optical import ANGLES
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: LosOptions = setting.options
     require_spread(experiment.runs)
     cases = [

@@ -12,20 +12,25 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval
-from recorders.models.optical import TARGETS, bias_components, clock_component, moving_target_components
-from recorders.parameters import Parameters
-from recorders.simulators.moving_optical import MovingOpticalParameters
-from replay.engine.arrays import Floats
-from replay.engine.streams.sources import MemorySource
-from replay.inference.observability import OBSERVABILITY
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.recorders.models.optical import (
+    TARGETS,
+    bias_components,
+    clock_component,
+    moving_target_components,
+)
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.moving_optical import MovingOpticalParameters
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.inference.observability import OBSERVABILITY
+from fuselog.replay.judging.errors.evaluation import Errors
 
 MODEL = "moving-sights"
 ALIGNED_S, LAST_S = 10.0, 10.0
@@ -44,7 +49,7 @@ class Options(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []

@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.studies.optical.cases import (
+from fuselog.pipeline.studies.optical.cases import (
     JOINT,
     Case,
     Printed,
     observabilities,
     one_bias_known,
 )
-from pipeline.studies.toolkit.repetitions import Floats, root_mean_square, worst_deviation
-from recorders.models.optical import ANGLES
-from replay.estimators.localization import optical
+from fuselog.pipeline.studies.toolkit.repetitions import Floats, root_mean_square, worst_deviation
+from fuselog.recorders.models.optical import ANGLES
+from fuselog.replay.estimators.localization import optical
 
 # The paper's own rule for the RMSE of 100 runs.
 RULE = 0.15

@@ -7,18 +7,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.parameters import Parameters
-from recorders.recording import import_run
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):

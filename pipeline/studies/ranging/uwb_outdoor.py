@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from pydantic import PositiveFloat
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.ranging.ranging import (
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.ranging.ranging import (
     RangingOptions,
     Recording,
     Reference,
@@ -25,10 +25,10 @@ from pipeline.studies.ranging.ranging import (
     recordings,
     replayed,
 )
-from pipeline.studies.toolkit.repetitions import rms_length
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.arrays import Booleans, Floats
+from fuselog.pipeline.studies.toolkit.repetitions import rms_length
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.arrays import Booleans, Floats
 
 PUBLISHED = ("LS", "ESKF")
 
@@ -82,7 +82,7 @@ class UwbOutdoorOptions(RangingOptions):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: UwbOutdoorOptions = setting.options
     folders = [path.parent for path in recordings(setting, "trajectory.csv")]
     named = [Recording("-".join(each.resolve().parts[-3:]), each) for each in folders]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeFloat
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.ranging.ranging import (
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.ranging.ranging import (
     RangingOptions,
     Recording,
     Reference,
@@ -23,11 +23,11 @@ from pipeline.studies.ranging.ranging import (
     recordings,
     replayed,
 )
-from pipeline.studies.toolkit.repetitions import rms_length
-from recorders.errors import BadInput
-from recorders.models.orientation import heading
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats, Integers
+from fuselog.pipeline.studies.toolkit.repetitions import rms_length
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class UwbPoseOptions(RangingOptions):
@@ -43,7 +43,7 @@ class UwbPoseOptions(RangingOptions):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     pairs = []
     for path in recordings(setting, "UWB*.csv"):
         captured = path.with_name(path.name.replace("UWB", "motion_capture", 1))

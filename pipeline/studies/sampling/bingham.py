@@ -14,24 +14,24 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveInt
 
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.inputs import load_scenario
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval, require_spread, rmse_of_runs
-from recorders.errors import BadInput
-from recorders.models.orientation import axis_angle_between
-from recorders.parameters import Parameters, build, merge
-from recorders.recording import Recorder
-from recorders.registry import load
-from recorders.simulators.orientation import AxisParameters
-from replay.distributions import bingham
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.directional.bingham import BinghamNoise, make_steps
-from replay.estimators.directional.directional import as_bingham, as_covariance
-from replay.estimators.directional.grid import run_axis_grid_filter
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.inputs import load_scenario
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval, require_spread, rmse_of_runs
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.orientation import axis_angle_between
+from fuselog.recorders.parameters import Parameters, build, merge
+from fuselog.recorders.recording import Recorder
+from fuselog.recorders.registry import load
+from fuselog.recorders.simulators.orientation import AxisParameters
+from fuselog.replay.distributions import bingham
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.directional.bingham import BinghamNoise, make_steps
+from fuselog.replay.estimators.directional.directional import as_bingham, as_covariance
+from fuselog.replay.estimators.directional.grid import run_axis_grid_filter
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class BinghamOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: BinghamOptions = setting.options
     if options.estimator not in experiment.estimators:
         raise BadInput(

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, band
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.sampling.linearization import (
+from fuselog.pipeline.output.charts import Axis, Chart, band
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.sampling.linearization import (
     REFERENCE,
     Ensemble,
     Floats,
@@ -23,7 +23,7 @@ from pipeline.studies.sampling.linearization import (
     error_panel,
     rmse,
 )
-from recorders.models.extended_target import area_m2
+from fuselog.recorders.models.extended_target import area_m2
 
 TURNED = "-rotation-"
 KEY_STEPS = (25, 75, 150)
@@ -31,7 +31,7 @@ SMART = ("s2kf-25", "s2kf-50", "s2kf-100", "s2kf-200")
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     turned = rotated_estimators(experiment, options.rotations)
     tables, sources = [], []

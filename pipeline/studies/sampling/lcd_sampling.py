@@ -14,17 +14,17 @@ from matplotlib.figure import Figure
 from pydantic import Field, PositiveInt
 from scipy.spatial.distance import pdist
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from recorders.log import LogWriter, RunMetadata, make_stream, schemas
-from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.distributions import chi2
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.sources import MemorySource
-from replay.sampling import Samples, lcd_distance, lcd_samples, moment_corrected, parse_sampling
-from replay.sampling.samplers import unscented
-from replay.timeline.show import show
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.log import LogWriter, RunMetadata, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.sampling import Samples, lcd_distance, lcd_samples, moment_corrected, parse_sampling
+from fuselog.replay.sampling.samplers import unscented
+from fuselog.replay.timeline.show import show
 
 Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
@@ -46,7 +46,7 @@ class LcdOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: LcdOptions = setting.options
     optimised(2, 3, 1, experiment.seed)  # compiles, so that the first set's time is its own
     rows = [

@@ -12,14 +12,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
-from pipeline.output.charts import Axis, Panel, curve
-from pipeline.runs.experiment import Experiment, Setting
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.charts import Axis, Panel, curve
+from fuselog.pipeline.runs.experiment import Experiment, Setting
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 REFERENCE = "analytic"

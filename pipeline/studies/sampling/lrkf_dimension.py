@@ -15,20 +15,20 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.inputs import Record
-from pipeline.runs.recorded import judge, replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval, rmse_of_runs
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
-from replay.sampling import Sampler, Samples, parse_sampling
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.inputs import Record
+from fuselog.pipeline.runs.recorded import judge, replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval, rmse_of_runs
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.sampling import Sampler, Samples, parse_sampling
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
 RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others
@@ -69,7 +69,7 @@ class Moments(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     samplings = samplings_of(experiment)
     moments = moment_errors(samplings, options, experiment.seed)

@@ -8,12 +8,12 @@ two numbers swapped: only with these do the figure's curves come out.
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Chart
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.inputs import Record
-from pipeline.studies.sampling.linearization import (
+from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.inputs import Record
+from fuselog.pipeline.studies.sampling.linearization import (
     REFERENCE,
     Ensemble,
     Options,
@@ -21,14 +21,14 @@ from pipeline.studies.sampling.linearization import (
     error_panel,
     rmse,
 )
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 CASES = {"printed": "prior as printed", "swapped": "prior swapped"}
 EARLY = 5  # steps that count as the beginning
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     outcome = Outcome()
     sources = []

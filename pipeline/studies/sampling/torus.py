@@ -14,23 +14,23 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed, require_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import rmse_of_runs, table_of_runs
-from recorders.errors import BadInput
-from recorders.models.headings import turn_together
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from recorders.simulators.headings import HeadingsParameters
-from replay.distributions import wrapped_normal
-from replay.distributions.wrapped_normal import Samples, WrappedNormal
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
-from replay.estimators.directional.torus import make_heading_model
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed, require_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import rmse_of_runs, table_of_runs
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.headings import turn_together
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.headings import HeadingsParameters
+from fuselog.replay.distributions import wrapped_normal
+from fuselog.replay.distributions.wrapped_normal import Samples, WrappedNormal
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from fuselog.replay.estimators.directional.torus import make_heading_model
 
 Floats = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ def _moved(samples: Samples, coupling_rad: float) -> Samples:
 
 
 def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study propagation, figure 3; see `pipeline.runs.experiment.Study`. `runs` are the random ones."""
+    """Study propagation, figure 3; see `fuselog.pipeline.runs.experiment.Study`. `runs` are the random ones."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")
@@ -193,7 +193,7 @@ class FilterOptions(Parameters):
 
 
 def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study the toroidal filter beside unscented ones; see `pipeline.runs.experiment.Study`."""
+    """Study the toroidal filter beside unscented ones; see `fuselog.pipeline.runs.experiment.Study`."""
     options: FilterOptions = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []

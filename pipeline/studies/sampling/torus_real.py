@@ -16,30 +16,30 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 from threadpoolctl import threadpool_limits
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
-from recorders.errors import BadInput
-from recorders.models.headings import turn_on
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from replay.distributions import wrapped_normal
-from replay.distributions.torus_mixtures import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.headings import turn_on
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import wrapped_normal
+from fuselog.replay.distributions.torus_mixtures import (
     VonMisesMixture,
     WrappedMixture,
     fit_von_mises_mixture,
     fit_wrapped_mixture,
 )
-from replay.distributions.wrapped_normal import Samples, WrappedNormal
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.results import state_stream
-from replay.engine.vectors.components import Components
-from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
-from replay.estimators.directional.torus import (
+from fuselog.replay.distributions.wrapped_normal import Samples, WrappedNormal
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.results import state_stream
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from fuselog.replay.estimators.directional.torus import (
     HeadingModel,
     make_heading_model,
     run_toroidal_filter,
@@ -89,7 +89,7 @@ class Prediction(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Fit and predict; see `pipeline.runs.experiment.Study`."""
+    """Fit and predict; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     if experiment.estimators:
         raise BadInput("study torus-real has filters of its own: leave out estimators")

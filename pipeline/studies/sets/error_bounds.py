@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from replay.engine.streams.sources import MemorySource
-from replay.engine.vectors.tangent import truth_at
-from replay.judging.sets.filter_evaluation import POSE, odometry_error
-from replay.regions.frames import ERRORS
-from replay.regions.moving_sets import Growth, odometry_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.judging.sets.filter_evaluation import POSE, odometry_error
+from fuselog.replay.regions.frames import ERRORS
+from fuselog.replay.regions.moving_sets import Growth, odometry_of
 
 Floats = NDArray[np.float64]
 

@@ -10,18 +10,18 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
-from pipeline.studies.toolkit.repetitions import mean_interval
-from replay.distributions import chi2
-from replay.judging.errors.evaluation import Errors
-from replay.judging.sets.evaluation import JudgedSets, judge_sets
-from replay.judging.sets.filter_evaluation import JudgedFilter, judge_filter
-from replay.regions.frames import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.replay.distributions import chi2
+from fuselog.replay.judging.errors.evaluation import Errors
+from fuselog.replay.judging.sets.evaluation import JudgedSets, judge_sets
+from fuselog.replay.judging.sets.filter_evaluation import JudgedFilter, judge_filter
+from fuselog.replay.regions.frames import (
     CONTRADICTS_ITSELF,
     CONTRADICTS_PAST,
     FRAME_WRONG,
@@ -35,7 +35,7 @@ KEYS = ["case", "run", "time_ns"]
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     runner, gap_limit_s = Runner(experiment, setting), experiment.gap_limit_s
     sources = state_bounds(runner.obtain(), setting.options, gap_limit_s)
     replayed = runner.replay(sources)

@@ -10,16 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, path
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.inputs import Record
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.sets.evaluation import JudgedSets, judge_sets
-from replay.judging.sets.regions import rings_of
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, path
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.inputs import Record
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.sets.evaluation import JudgedSets, judge_sets
+from fuselog.replay.judging.sets.regions import rings_of
 
 EXACT, BOX, L4, L8 = "exact", "box", "l4", "l8"
 FIRST_PAIR, SECTION_V = "section-v-first-pair", "section-v"
@@ -27,7 +27,7 @@ FREE = ".error-free"
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     runner = Runner(experiment, setting)
     replayed = runner.replay(runner.obtain())
     found = judge_sets(replayed.outputs, replayed.sources, experiment.gap_limit_s)

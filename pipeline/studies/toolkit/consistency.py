@@ -7,10 +7,10 @@ Applications to Tracking and Navigation, 2001, section 5.4.2.
 
 from pydantic import NonNegativeFloat
 
-from pipeline.output.results import Outcome
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.studies.toolkit import localization
-from recorders.parameters import Parameters
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.studies.toolkit import localization
+from fuselog.recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
@@ -24,7 +24,7 @@ class ConsistencyOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: ConsistencyOptions = setting.options
     outcome = localization.study(experiment, setting)
     steps = outcome.tables["steps"]

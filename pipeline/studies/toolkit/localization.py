@@ -4,14 +4,14 @@ It is what most experiments need: record or import, replay, judge, draw. Familie
 add their own tables, figures and claims.
 """
 
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summarise
-from pipeline.runs.campaigns import judge
-from pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summarise
+from fuselog.pipeline.runs.campaigns import judge
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     done = judge(experiment, setting)
     outcome = summarise(done.judge, done.coverage, done.parameters)
     outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters

@@ -13,10 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
-from pipeline.output.charts import Axis, Series, curve
-from pipeline.runs.recorded import Replayed
-from recorders.errors import BadInput
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.output.charts import Axis, Series, curve
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.judging.errors.evaluation import Errors
 
 Floats = NDArray[np.float64]
 # Where a mean NEES lies with 95 %.

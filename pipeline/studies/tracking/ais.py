@@ -1,24 +1,24 @@
 """Studies tracks of reports without identities: which vessels kept one track of their own.
 
 The identities that the log has are used to judge alone. A vessel's own track is the one that it is
-assigned when tracks and vessels are paired one to one: see `replay.judging.tracks.tracks`.
+assigned when tracks and vessels are paired one to one: see `fuselog.replay.judging.tracks.tracks`.
 """
 
 import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
-from pipeline.output.charts import Axis, Chart, Panel, curve, level, thinned
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import Replayed
-from pipeline.runs.runner import Runner
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.judging.metrics.measuring import Output
-from replay.judging.tracks.tracks import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level, thinned
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import Replayed
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.tracks.tracks import (
     KEPT_SHARE,
     MANY_REPORTS,
     live_counts,
@@ -38,7 +38,7 @@ class AisOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: AisOptions = setting.options
     replayed = Runner(experiment, setting).run()
     vessels = vessel_table(replayed)
@@ -53,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def vessel_table(replayed: Replayed) -> pd.DataFrame:
-    """Return the tables of `replay.judging.tracks.tracks.track_table` of all estimators."""
+    """Return the tables of `fuselog.replay.judging.tracks.tracks.track_table` of all estimators."""
     tables = [
         table.assign(estimator=each.estimator)
         for each in replayed.judged

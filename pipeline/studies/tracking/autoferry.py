@@ -10,26 +10,26 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.tracking.tracking import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.tracking.tracking import (
     means_of,
     measure_changes,
     nis_metrics,
     sets_of,
     table_of,
 )
-from recorders.parameters import Parameters
-from recorders.recording import import_run
-from replay.engine.replaying.late import parse_late
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.tracks.errors import Judged, instants_of, tracks_at
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.replaying.late import parse_late
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.tracks.errors import Judged, instants_of, tracks_at
 
 
 class AutoferryOptions(Parameters):
@@ -48,7 +48,7 @@ class AutoferryOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     names, sources = _scenarios(experiment, setting)
     runner = Runner(experiment, setting)
     replayed = runner.replay(sources)

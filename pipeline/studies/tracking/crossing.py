@@ -9,15 +9,15 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, band, curve
-from pipeline.output.results import Outcome
-from pipeline.output.summary import summary_table
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import mean_interval
-from pipeline.studies.tracking.tracking import means_of, measure_changes, table_of
-from recorders.parameters import Parameters
-from replay.judging.tracks.errors import instants_of
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
+from fuselog.pipeline.studies.tracking.tracking import means_of, measure_changes, table_of
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.judging.tracks.errors import instants_of
 
 
 class CrossingOptions(Parameters):
@@ -35,7 +35,7 @@ class CrossingOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     grid = list(product(setting.options.clutter_per_scan, setting.options.detection_probability))
     cases = {
         _case(*point): dict(zip(("clutter_per_scan", "detection_probability"), point, strict=True))

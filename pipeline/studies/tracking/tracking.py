@@ -1,6 +1,6 @@
 """Shares what studies of trackers need: tracks judged by run, and differences of trackers.
 
-Tracks are judged as `replay.judging.tracks.errors` says, at instants that are the same for all trackers.
+Tracks are judged as `fuselog.replay.judging.tracks.errors` says, at instants that are the same for all trackers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.results import Outcome
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
-from recorders.errors import BadInput
-from recorders.log import Stream
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import Ragged
-from replay.judging.errors.evaluation import Innovations
-from replay.judging.tracks.distances import trajectory_gospa
-from replay.judging.tracks.errors import (
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.judging.errors.evaluation import Innovations
+from fuselog.replay.judging.tracks.distances import trajectory_gospa
+from fuselog.replay.judging.tracks.errors import (
     CUTOFF_M,
     PERIOD_S,
     Judged,

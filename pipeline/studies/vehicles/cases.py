@@ -9,14 +9,18 @@ from pydantic import NonNegativeInt
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from recorders.parameters import Parameters
-from recorders.simulators.vehicles import VehiclesParameters
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource, Source
-from replay.estimators.vehicles.streams import vehicle_numbers
-from replay.estimators.vehicles.updates import split_method
-from replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error, total_error
-from replay.judging.sets.errors import CUTOFF_M, SetErrors
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.vehicles import VehiclesParameters
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource, Source
+from fuselog.replay.estimators.vehicles.streams import vehicle_numbers
+from fuselog.replay.estimators.vehicles.updates import split_method
+from fuselog.replay.judging.errors.label_errors import (
+    assigned_squared_error,
+    fixed_squared_error,
+    total_error,
+)
+from fuselog.replay.judging.sets.errors import CUTOFF_M, SetErrors
 
 Floats = NDArray[np.float64]
 

@@ -13,16 +13,16 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.output.charts import Axis, Chart, Panel, curves
-from pipeline.output.results import Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import judge, replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.vehicles.cases import scores_of
-from recorders.errors import BadInput
-from recorders.parameters import Parameters
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import judge, replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.vehicles.cases import scores_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
 
 TICKS = (2, 5, 10, 20, 50, 100)
 
@@ -65,7 +65,7 @@ class Growth(NamedTuple):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: ScalingOptions = setting.options
     if not experiment.record or set(options.methods) != set(experiment.estimators):
         raise BadInput(

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.recorded import replay_in_memory
-from pipeline.runs.runner import Runner
-from pipeline.studies.vehicles.cases import (
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
+from fuselog.pipeline.output.results import MetricValue, Outcome
+from fuselog.pipeline.runs.estimates import hash_streams
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.studies.vehicles.cases import (
     TRACK_BYTES,
     Case,
     Floats,
@@ -25,12 +25,12 @@ from pipeline.studies.vehicles.cases import (
     bytes_per_step,
     scores_of,
 )
-from recorders.errors import BadInput
-from replay.estimators.vehicles.bounds import bounds, exact_total_error
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.vehicles.bounds import bounds, exact_total_error
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: VehiclesOptions = setting.options
     if options.reference not in experiment.estimators:
         raise BadInput(

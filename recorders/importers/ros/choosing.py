@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from recorders.errors import BadInput, choices, some_of
-from recorders.importers.ros.files.bags import Bag
-from recorders.importers.ros.files.raw import Connection
-from recorders.importers.ros.layouts import MessageType, Undecodable, definitions_of
-from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
-from recorders.importers.ros.messages import FRAME, STAMP, TRANSFORM_TYPES, TYPES, Taken
-from recorders.importers.ros.parameters import RosParameters
+from fuselog.recorders.errors import BadInput, choices, some_of
+from fuselog.recorders.importers.ros.files.bags import Bag
+from fuselog.recorders.importers.ros.files.raw import Connection
+from fuselog.recorders.importers.ros.layouts import MessageType, Undecodable, definitions_of
+from fuselog.recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
+from fuselog.recorders.importers.ros.messages import FRAME, STAMP, TRANSFORM_TYPES, TYPES, Taken
+from fuselog.recorders.importers.ros.parameters import RosParameters
 
 
 class Reader(NamedTuple):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import to_ns
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import to_ns
 
 
 @dataclass

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.ros.choosing import choose, stream_names
-from recorders.importers.ros.clocks import Clocks
-from recorders.importers.ros.files.bags import Bag, open_bag
-from recorders.importers.ros.files.raw import Batch, Connection
-from recorders.importers.ros.layouts import Messages, Undecodable, by_size
-from recorders.importers.ros.messages import CHILD_FRAME, Part, as_estimate, as_truth, stamps_ns
-from recorders.importers.ros.mountings import Mountings
-from recorders.importers.ros.parameters import RosParameters
-from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
-from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
-from recorders.log import Stream, schemas
-from recorders.log.planes import Origin
-from recorders.recording import Blocks, Importer
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.choosing import choose, stream_names
+from fuselog.recorders.importers.ros.clocks import Clocks
+from fuselog.recorders.importers.ros.files.bags import Bag, open_bag
+from fuselog.recorders.importers.ros.files.raw import Batch, Connection
+from fuselog.recorders.importers.ros.layouts import Messages, Undecodable, by_size
+from fuselog.recorders.importers.ros.messages import CHILD_FRAME, Part, as_estimate, as_truth, stamps_ns
+from fuselog.recorders.importers.ros.mountings import Mountings
+from fuselog.recorders.importers.ros.parameters import RosParameters
+from fuselog.recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
+from fuselog.recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.recording import Blocks, Importer
 
 # A block ends when it has so many messages, or bytes.
 _BLOCK_MESSAGES = 1 << 17

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-from recorders.log.layout import windows
+from fuselog.recorders.log.layout import windows
 
 Encoding = Literal["cdr", "ros1"]
 # What a definition says of each message type: its constants, and the names and types of its fields.

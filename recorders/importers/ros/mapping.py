@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recorders.errors import BadInput, choices
-from recorders.importers.mapping import Source, StreamMapping, mapped, schema_of
-from recorders.importers.ros.layouts import Messages
-from recorders.importers.ros.messages import FRAME, STAMP, Part, Taken
-from recorders.parameters import Parameters, build
-from recorders.parsing import read_toml
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.importers.mapping import Source, StreamMapping, mapped, schema_of
+from fuselog.recorders.importers.ros.layouts import Messages
+from fuselog.recorders.importers.ros.messages import FRAME, STAMP, Part, Taken
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.recorders.parsing import read_toml
 
 
 class MessageMapping(StreamMapping):

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.importers.ros.layouts import Messages
-from recorders.importers.stamps import to_ns
-from recorders.log import Schema, schemas
-from recorders.models.orientation import heading
+from fuselog.recorders.importers.ros.layouts import Messages
+from fuselog.recorders.importers.stamps import to_ns
+from fuselog.recorders.log import Schema, schemas
+from fuselog.recorders.models.orientation import heading
 
 Floats = NDArray[np.float64]
 STAMP, FRAME, CHILD_FRAME = "header.stamp", "header.frame_id", "child_frame_id"

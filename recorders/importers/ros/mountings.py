@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.importers.ros.transforms import Chain, Floats, Pair, Transforms, path_between
-from recorders.log import schemas
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.transforms import Chain, Floats, Pair, Transforms, path_between
+from fuselog.recorders.log import schemas
 
 BASES = ("base_link", "base_footprint", "base")
 LEAST = 1e-4  # m and rad, of what is worth a setting

@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, PositiveFloat
 
-from recorders.importers.mapping import Place, Quaternions
-from recorders.parameters import Parameters
+from fuselog.recorders.importers.mapping import Place, Quaternions
+from fuselog.recorders.parameters import Parameters
 
 Clock = Literal["header", "bag"]
 Distribution = Literal[

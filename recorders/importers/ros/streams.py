@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.importers.mapping import (
+from fuselog.recorders.importers.mapping import (
     NOT_UNIT,
     SCALED,
     Quaternions,
@@ -18,10 +18,10 @@ from recorders.importers.mapping import (
     off_unit,
     with_unit_quaternions,
 )
-from recorders.importers.ros.messages import SIGMAS, Part
-from recorders.importers.ros.parameters import Clock
-from recorders.log import Schema, Stream, make_stream
-from recorders.log.planes import Origin, is_planar
+from fuselog.recorders.importers.ros.messages import SIGMAS, Part
+from fuselog.recorders.importers.ros.parameters import Clock
+from fuselog.recorders.log import Schema, Stream, make_stream
+from fuselog.recorders.log.planes import Origin, is_planar
 
 # Names of frames, and which messages (n,) name them.
 Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]

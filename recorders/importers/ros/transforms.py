@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.mapping import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.mapping import (
     NOT_UNIT,
     SCALED,
     Quaternions,
     off_unit,
     with_unit_quaternions,
 )
-from recorders.importers.ros.layouts import Messages
-from recorders.importers.ros.messages import quaternion, stamps_ns, vector
-from recorders.models.orientation import compose, conjugate, rotate
+from fuselog.recorders.importers.ros.layouts import Messages
+from fuselog.recorders.importers.ros.messages import quaternion, stamps_ns, vector
+from fuselog.recorders.models.orientation import compose, conjugate, rotate
 
 Floats = NDArray[np.float64]
 Pair = tuple[str, str]

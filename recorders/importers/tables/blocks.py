@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from recorders.trajectories import NO_END
+from fuselog.recorders.trajectories import NO_END
 
 BLOCK_BYTES = 1 << 23
 COMMENTS = (b"%", b"#")

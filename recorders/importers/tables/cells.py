@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import BEYOND, NOT_A_TIME, Stamps, to_ns
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import BEYOND, NOT_A_TIME, Stamps, to_ns
 
 # Numbers that a decimal of 38 digits holds if they are short; a large exponent crashes Arrow.
 _PARTS = r"^[-+]?[0-9]*\.?(?P<part>[0-9]*)(?P<power>(?:[eE][-+]?[0-9]{1,2})?)$"

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.tables.columns import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.columns import (
     ASSUMED,
     GuessedColumn,
     GuessedTable,
@@ -25,7 +25,7 @@ from recorders.importers.tables.columns import (
     unit_by_largest,
     unit_by_size,
 )
-from recorders.importers.tables.guessed_places import (
+from fuselog.recorders.importers.tables.guessed_places import (
     ALTITUDE,
     accuracy_of,
     altitude_of,
@@ -34,8 +34,8 @@ from recorders.importers.tables.guessed_places import (
     places_of,
     speed_unit_of,
 )
-from recorders.importers.units import unit
-from recorders.models.geodesy import local_metres
+from fuselog.recorders.importers.units import unit
+from fuselog.recorders.models.geodesy import local_metres
 
 # What vectors are called.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")

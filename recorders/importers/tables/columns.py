@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.units import unit
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.units import unit
 
 # What stands for a unit in names of columns with times of the day, hhmmss.
 TIME_OF_DAY = "hhmmss"

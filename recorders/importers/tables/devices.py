@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from recorders.importers.tables.columns import GuessedColumn, known_of
-from recorders.importers.tables.files import VBOX_UNITS
+from fuselog.recorders.importers.tables.columns import GuessedColumn, known_of
+from fuselog.recorders.importers.tables.files import VBOX_UNITS
 
 # The counter of Xsens, and at how many samples a second it is in us, as of a DOT, else in 0.1 ms.
 _XSENS, _DOT_RATES_HZ = "SampleTimeFine", np.array([1, 4, 10, 12, 15, 20, 30, 60, 120])

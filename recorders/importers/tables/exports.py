@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
-from recorders.importers.tables.columns import stream_lines
-from recorders.importers.tables.files import Batch
-from recorders.log import Schema, schemas
+from fuselog.recorders.importers.tables.columns import stream_lines
+from fuselog.recorders.importers.tables.files import Batch
+from fuselog.recorders.log import Schema, schemas
 
 _CLOCKS = ("publish_time_ns", "log_time_ns", "sensor_time_ns")
 _NAMED_VECTORS = ("value", "state", "mean")

@@ -29,8 +29,8 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput, choices
-from recorders.importers.tables.blocks import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.importers.tables.blocks import (
     BLOCK_BYTES,
     Chunks,
     blocks_of,
@@ -40,11 +40,11 @@ from recorders.importers.tables.blocks import (
     utf8,
     without,
 )
-from recorders.importers.tables.layout import Layout, layout_of
-from recorders.importers.tables.npz import columns_of
-from recorders.importers.tables.tagged import Tagged, tagged_of
-from recorders.parsing import DEEPEST
-from recorders.trajectories import NO_END, read_trajectory
+from fuselog.recorders.importers.tables.layout import Layout, layout_of
+from fuselog.recorders.importers.tables.npz import columns_of
+from fuselog.recorders.importers.tables.tagged import Tagged, tagged_of
+from fuselog.recorders.parsing import DEEPEST
+from fuselog.recorders.trajectories import NO_END, read_trajectory
 
 Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc", "vbo"]
 Batch = dict[str, pa.Array]

@@ -6,9 +6,9 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from recorders.errors import BadInput
-from recorders.importers.tables.blocks import COMMENTS, lines_of
-from recorders.importers.tables.files import open_decompressed
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
+from fuselog.recorders.importers.tables.files import open_decompressed
 
 # How many files of one row are one table at least.
 _FEWEST = 3

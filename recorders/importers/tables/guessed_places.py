@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.tables.columns import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.columns import (
     ASSUMED,
     GuessedColumn,
     GuessedTable,
@@ -20,8 +20,8 @@ from recorders.importers.tables.columns import (
     parted,
     stated_unit,
 )
-from recorders.importers.units import unit
-from recorders.models.geodesy import local_metres
+from fuselog.recorders.importers.units import unit
+from fuselog.recorders.models.geodesy import local_metres
 
 # Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
 _AIS = {

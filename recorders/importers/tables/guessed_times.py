@@ -15,12 +15,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.columns import ASSUMED, TIME_OF_DAY, GuessedColumn, known_of, parted
-from recorders.importers.tables.files import Batch
-from recorders.importers.tables.order import Order, is_reversed, rollover_of
-from recorders.importers.tables.times import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps
+from fuselog.recorders.importers.tables.columns import (
+    ASSUMED,
+    TIME_OF_DAY,
+    GuessedColumn,
+    known_of,
+    parted,
+)
+from fuselog.recorders.importers.tables.files import Batch
+from fuselog.recorders.importers.tables.order import Order, is_reversed, rollover_of
+from fuselog.recorders.importers.tables.times import (
     DIGITS,
     ISO,
     OWN_OFFSET,
@@ -32,7 +38,7 @@ from recorders.importers.tables.times import (
     stamps_ns,
     texts_of,
 )
-from recorders.models.geodesy import local_metres
+from fuselog.recorders.models.geodesy import local_metres
 
 UNKNOWN_ZERO = "2026-01-01"
 # What times of FIT files count from in s, and where numbers are more likely of 1970.

@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.cells import sided
-from recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
-from recorders.importers.tables.columns import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps
+from fuselog.recorders.importers.tables.cells import sided
+from fuselog.recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
+from fuselog.recorders.importers.tables.columns import (
     ASSUMED,
     GuessedColumn,
     GuessedTable,
@@ -30,12 +30,12 @@ from recorders.importers.tables.columns import (
     underlined,
     unit_in,
 )
-from recorders.importers.tables.devices import of_device
-from recorders.importers.tables.exports import export_mapping
-from recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
-from recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
-from recorders.importers.tables.guessed_places import prepared_lines, without_codes
-from recorders.importers.tables.guessed_times import GuessedTime, first_cell, guess_time
+from fuselog.recorders.importers.tables.devices import of_device
+from fuselog.recorders.importers.tables.exports import export_mapping
+from fuselog.recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
+from fuselog.recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
+from fuselog.recorders.importers.tables.guessed_places import prepared_lines, without_codes
+from fuselog.recorders.importers.tables.guessed_times import GuessedTime, first_cell, guess_time
 
 # How many rows are read.
 _ROWS = 100_000

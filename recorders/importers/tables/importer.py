@@ -10,8 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
-from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import (
+from fuselog.recorders.errors import BadInput, some_of
+from fuselog.recorders.importers.mapping import (
     Place,
     Quaternions,
     checked,
@@ -20,7 +20,7 @@ from recorders.importers.mapping import (
     schema_of,
     with_unit_quaternions,
 )
-from recorders.importers.tables.mapping import (
+from fuselog.recorders.importers.tables.mapping import (
     ConstantStream,
     Delay,
     LogMapping,
@@ -30,11 +30,11 @@ from recorders.importers.tables.mapping import (
     read_mapping,
     shipped,
 )
-from recorders.importers.tables.plane import Plane
-from recorders.importers.tables.rows import ReadCounts, Rows
-from recorders.log import Stream, make_stream
-from recorders.parameters import Parameters
-from recorders.recording import Blocks, Importer
+from fuselog.recorders.importers.tables.plane import Plane
+from fuselog.recorders.importers.tables.rows import ReadCounts, Rows
+from fuselog.recorders.log import Stream, make_stream
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import BinaryIO, NamedTuple
 
-from recorders.importers.tables.blocks import COMMENTS, lines_of
+from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
 
 # How many lines are looked at, and at most about how many bytes of them.
 _LINES, _BYTES = 40, 1 << 20

@@ -27,9 +27,9 @@ from pydantic import (
     model_validator,
 )
 
-from recorders.atomic import is_being_written
-from recorders.errors import BadInput, choices, some_of
-from recorders.importers.mapping import (
+from fuselog.recorders.atomic import is_being_written
+from fuselog.recorders.errors import BadInput, choices, some_of
+from fuselog.recorders.importers.mapping import (
     Latitude,
     Longitude,
     OneOrMore,
@@ -37,11 +37,11 @@ from recorders.importers.mapping import (
     StreamMapping,
     schema_of,
 )
-from recorders.importers.tables.files import Format
-from recorders.importers.tables.patterns import fitted, names_in
-from recorders.importers.tables.times import TimeMapping
-from recorders.parameters import Parameters, build
-from recorders.parsing import read_toml
+from fuselog.recorders.importers.tables.files import Format
+from fuselog.recorders.importers.tables.patterns import fitted, names_in
+from fuselog.recorders.importers.tables.times import TimeMapping
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.recorders.parsing import read_toml
 
 # In s; a larger one is a slip.
 Delay = Annotated[float, Field(ge=-1e9, le=1e9)]

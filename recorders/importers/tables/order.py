@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps
-from recorders.importers.tables.times import DIGITS, TimeMapping
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps
+from fuselog.recorders.importers.tables.times import DIGITS, TimeMapping
 
 # How many rows in a row, and by how many usual steps, are behind a row before where a clock began again.
 _ROWS, _STEPS = 10, 5.0

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.extras import extra
-from recorders.importers.tables.mapping import Origin
-from recorders.models.geodesy import into_tangent_plane
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.extras import extra
+from fuselog.recorders.importers.tables.mapping import Origin
+from fuselog.recorders.models.geodesy import into_tangent_plane
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import (
+from fuselog.recorders.errors import BadInput, some_of
+from fuselog.recorders.importers.mapping import (
     NOT_UNIT,
     SCALED,
     Mapped,
@@ -27,10 +27,10 @@ from recorders.importers.mapping import (
     schema_of,
     with_unit_quaternions,
 )
-from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
-from recorders.importers.tables.blocks import lines_of
-from recorders.importers.tables.cells import read_ns, sided
-from recorders.importers.tables.files import (
+from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
+from fuselog.recorders.importers.tables.blocks import lines_of
+from fuselog.recorders.importers.tables.cells import read_ns, sided
+from fuselog.recorders.importers.tables.files import (
     Batch,
     Table,
     TextOptions,
@@ -38,13 +38,13 @@ from recorders.importers.tables.files import (
     open_decompressed,
     open_table,
 )
-from recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
-from recorders.importers.tables.order import Order, is_reversed
-from recorders.importers.tables.plane import Plane
-from recorders.importers.tables.times import MEND, Reading, TimeMapping, read_counter, stamps_ns
-from recorders.importers.units import conversion
-from recorders.log import Stream, make_stream
-from recorders.log.planes import FRAME, is_planar
+from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
+from fuselog.recorders.importers.tables.order import Order, is_reversed
+from fuselog.recorders.importers.tables.plane import Plane
+from fuselog.recorders.importers.tables.times import MEND, Reading, TimeMapping, read_counter, stamps_ns
+from fuselog.recorders.importers.units import conversion
+from fuselog.recorders.log import Stream, make_stream
+from fuselog.recorders.log.planes import FRAME, is_planar
 
 PLACE = ("east_m", "north_m", "up_m")
 QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")

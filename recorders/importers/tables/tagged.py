@@ -7,8 +7,8 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from recorders.errors import BadInput
-from recorders.importers.tables.blocks import lines_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.blocks import lines_of
 
 _HEADER_LINES = 1000
 _NOVATEL = re.compile(rb"[#%][A-Z0-9]{3,}A,")

@@ -15,10 +15,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
-from recorders.errors import BadInput
-from recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
-from recorders.importers.tables.cells import read_ns
-from recorders.parameters import Parameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
+from fuselog.recorders.importers.tables.cells import read_ns
+from fuselog.recorders.parameters import Parameters
 
 CountUnit = Literal["s", "ms", "0.1 ms", "us", "ns"]
 Unit = Literal["s", "ms", "0.1 ms", "us", "ns", "date"]

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.importers.ulog.file import Rows
-from recorders.importers.ulog.frames import orientations, to_enu
-from recorders.importers.ulog.sensors import BODY, Fields, Part
-from recorders.log import schemas
-from recorders.models.orientation import conjugate, left_matrix, rotate
-from recorders.models.states import NAVIGATION, state_metadata
+from fuselog.recorders.importers.ulog.file import Rows
+from fuselog.recorders.importers.ulog.frames import orientations, to_enu
+from fuselog.recorders.importers.ulog.sensors import BODY, Fields, Part
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.orientation import conjugate, left_matrix, rotate
+from fuselog.recorders.models.states import NAVIGATION, state_metadata
 
 Floats = NDArray[np.float64]
 TRUTH = f"{BODY}/truth"

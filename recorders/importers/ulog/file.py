@@ -13,9 +13,24 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.ulog.formats import TYPES, Damaged, FormatField, Layout, layout_of, parsed
-from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, NUMBERS, Known, resume, sort, walk
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ulog.formats import (
+    TYPES,
+    Damaged,
+    FormatField,
+    Layout,
+    layout_of,
+    parsed,
+)
+from fuselog.recorders.importers.ulog.loops import (
+    BEYOND_BYTES,
+    HEAD_BYTES,
+    NUMBERS,
+    Known,
+    resume,
+    sort,
+    walk,
+)
 
 MAGIC = bytes.fromhex("554c6f67011235")
 _SYNC = bytes.fromhex("080053") + bytes.fromhex("2f731320250cbb12")

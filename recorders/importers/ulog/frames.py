@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.models.orientation import compose
+from fuselog.recorders.models.orientation import compose
 
 Floats = NDArray[np.float64]
 # The rotation from north, east, down to east, north, up: half a turn about north-east.

@@ -8,17 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import not_finite
-from recorders.importers.stamps import to_ns
-from recorders.importers.ulog.estimator import TOPICS, Autopilot
-from recorders.importers.ulog.file import Rows, UlogFile
-from recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part, heights
-from recorders.importers.ulog.settings import carried, stated_noise
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.planes import Origin, in_plane
-from recorders.parameters import Parameters
-from recorders.recording import Blocks, Importer
+from fuselog.recorders.errors import BadInput, some_of
+from fuselog.recorders.importers.mapping import not_finite
+from fuselog.recorders.importers.stamps import to_ns
+from fuselog.recorders.importers.ulog.estimator import TOPICS, Autopilot
+from fuselog.recorders.importers.ulog.file import Rows, UlogFile
+from fuselog.recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part, heights
+from fuselog.recorders.importers.ulog.settings import carried, stated_noise
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.planes import Origin, in_plane
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Blocks, Importer
 
 _PLACED = ("vehicle_local_position", "vehicle_gps_position", "sensor_gps")
 

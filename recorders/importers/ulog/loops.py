@@ -1,11 +1,11 @@
-"""Loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
+"""Loops over a ULog's data: where messages begin, and which are whose; see `fuselog.recorders.log.loops`."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log.loops import loop_for, words_of
+from fuselog.recorders.log.loops import loop_for, words_of
 
 HEAD_BYTES = 3
 # So many rows after one another, whose lengths are those of their topics, are no chance.

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.importers.ulog.file import Rows
-from recorders.importers.ulog.frames import to_enu, to_flu
-from recorders.log import Schema, schemas
+from fuselog.recorders.importers.ulog.file import Rows
+from fuselog.recorders.importers.ulog.frames import to_enu, to_flu
+from fuselog.recorders.log import Schema, schemas
 
 Floats = NDArray[np.float64]
 BODY = "/vehicle"

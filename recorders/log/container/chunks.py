@@ -19,8 +19,8 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from recorders.log.loops import HEAD_BYTES, scan
-from recorders.log.streams import Clock
+from fuselog.recorders.log.loops import HEAD_BYTES, scan
+from fuselog.recorders.log.streams import Clock
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log.container.chunks import Span
-from recorders.log.layout import windows
+from fuselog.recorders.log.container.chunks import Span
+from fuselog.recorders.log.layout import windows
 
 INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
 

@@ -22,10 +22,17 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap import records
 from mcap.opcode import Opcode
 
-from recorders.errors import BadInput
-from recorders.log.container.chunks import MAGIC, RECORD_HEAD, Damaged, Span, open_region, read_records
-from recorders.log.container.sealed import unseal
-from recorders.log.streams import Clock
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.container.chunks import (
+    MAGIC,
+    RECORD_HEAD,
+    Damaged,
+    Span,
+    open_region,
+    read_records,
+)
+from fuselog.recorders.log.container.sealed import unseal
+from fuselog.recorders.log.streams import Clock
 
 _FOOTER = struct.Struct("<BQQQI8s")
 # The part of the footer that the summary's checksum covers.

@@ -4,7 +4,7 @@ import json
 import zlib
 from collections.abc import Mapping
 
-from recorders.log.container.chunks import Damaged, Span
+from fuselog.recorders.log.container.chunks import Damaged, Span
 
 OWN_NAMES = "fuselog."
 # When the messages of each chunk were published: what MCAP's index has of log times only.

@@ -17,12 +17,12 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from recorders.atomic import whole_file
-from recorders.errors import BadInput
-from recorders.log.container.ahead import ahead
-from recorders.log.container.chunks import COMPRESSIONS, MAGIC, RECORD_HEAD, chunk_record
-from recorders.log.container.packing import INDEX_ENTRY, Chunk
-from recorders.log.container.sealed import PUBLISH_SPANS, note_span, seal
+from fuselog.recorders.atomic import whole_file
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log.container.ahead import ahead
+from fuselog.recorders.log.container.chunks import COMPRESSIONS, MAGIC, RECORD_HEAD, chunk_record
+from fuselog.recorders.log.container.packing import INDEX_ENTRY, Chunk
+from fuselog.recorders.log.container.sealed import PUBLISH_SPANS, note_span, seal
 
 LIBRARY = "fuselog"
 _INDEX_HEAD = struct.Struct("<HI")

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from recorders.log import Schema, Topic, schemas
-from recorders.parameters import Parameters, ParametersType
-from replay.engine.api.inputs import Binding
-from replay.engine.replaying.estimator import Bound, Estimator
-from replay.engine.streams.channels import bindings, resolved
-from replay.engine.vectors.components import Components
+from fuselog.recorders.log import Schema, Topic, schemas
+from fuselog.recorders.parameters import Parameters, ParametersType
+from fuselog.replay.engine.api.inputs import Binding
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator
+from fuselog.replay.engine.streams.channels import bindings, resolved
+from fuselog.replay.engine.vectors.components import Components
 
 Find = Callable[[str, Mapping[str, Topic], Any], Iterable[Binding]]
 

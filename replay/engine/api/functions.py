@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Schema
-from recorders.parameters import Parameters, ParametersType
-from replay.engine.api.binding import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema
+from fuselog.recorders.parameters import Parameters, ParametersType
+from fuselog.replay.engine.api.binding import (
     Find,
     bindings_by_name,
     estimator_of,
@@ -26,16 +26,16 @@ from replay.engine.api.binding import (
     requirements_of,
     topics_of,
 )
-from replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
-from replay.engine.api.outputs import Estimates, Outputs, Solved
-from replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
-from replay.engine.renamed import renamed
-from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
-from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.channels import resolved
-from replay.engine.streams.failures import Failure, reason_of
-from replay.engine.streams.measurements import Vectors
-from replay.engine.vectors.components import Components
+from fuselog.replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
+from fuselog.replay.engine.api.outputs import Estimates, Outputs, Solved
+from fuselog.replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
+from fuselog.replay.engine.renamed import renamed
+from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.engine.streams.channels import resolved
+from fuselog.replay.engine.streams.failures import Failure, reason_of
+from fuselog.replay.engine.streams.measurements import Vectors
+from fuselog.replay.engine.vectors.components import Components
 
 Generators = tuple[np.random.Generator | None, ...]
 Advance = Callable[[Any, Any, Block], tuple[Any, list[Ragged]]]
@@ -108,14 +108,14 @@ def recursive(
             which did not come any more, such as those that are smoothed.
         compiled: whether `follow` is compiled; plain Python is a hundred times slower.
         allocates: whether `follow` makes arrays, see
-            `replay.engine.compiling.compile.compile_over_runs`.
+            `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     Returns:
         The estimator, which `replay` takes.
 
     The shortest range so far, of everything that was seen:
 
-    >>> from recorders.log import RunMetadata, make_stream, schemas
+    >>> from fuselog.recorders.log import RunMetadata, make_stream, schemas
     >>> class Shortest(NamedTuple):
     ...     range_m: np.ndarray
     >>> def start(given):
@@ -133,9 +133,9 @@ def recursive(
     ...     follow=follow,
     ...     compiled=False,
     ... )
-    >>> from recorders.recording import Recording
-    >>> from replay.engine.replaying.replaying import collect, replay
-    >>> from replay.engine.streams.sources import memory_source
+    >>> from fuselog.recorders.recording import Recording
+    >>> from fuselog.replay.engine.replaying.replaying import collect, replay
+    >>> from fuselog.replay.engine.streams.sources import memory_source
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
     >>> source = memory_source(Recording([seen]), RunMetadata("example"))
     >>> bound = nearest.bind("nearest", source.topics, Parameters())
@@ -301,7 +301,7 @@ def batch(
 
     The mean of all ranges:
 
-    >>> from recorders.log import RunMetadata, make_stream, schemas
+    >>> from fuselog.recorders.log import RunMetadata, make_stream, schemas
     >>> def mean_range(streams, parameters):
     ...     ranges = streams["/range"]
     ...     mean, covariance = ranges["range_m"].mean().reshape(1, 1), np.full((1, 1, 1), 0.01)
@@ -312,9 +312,9 @@ def batch(
     ...     components={"range_m": "linear"},
     ...     solve=each_run(mean_range),
     ... )
-    >>> from recorders.recording import Recording
-    >>> from replay.engine.replaying.replaying import collect, replay
-    >>> from replay.engine.streams.sources import memory_source
+    >>> from fuselog.recorders.recording import Recording
+    >>> from fuselog.replay.engine.replaying.replaying import collect, replay
+    >>> from fuselog.replay.engine.streams.sources import memory_source
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
     >>> source = memory_source(Recording([seen]), RunMetadata("example"))
     >>> estimates = collect(replay([source], average.bind("average", source.topics, Parameters())))

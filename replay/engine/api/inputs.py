@@ -9,14 +9,14 @@ from typing import Any, Generic, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, Topic
-from recorders.parameters import ParametersType
-from replay.engine.philox import run_key
-from replay.engine.streams.blocks import Block, Ragged, ragged_rows
-from replay.engine.streams.channels import given_or_stated
-from replay.engine.streams.measurements import Vectors, numbers_of
-from replay.engine.streams.priors import gaussians
-from replay.engine.vectors.components import Components
+from fuselog.recorders.log import Stream, Topic
+from fuselog.recorders.parameters import ParametersType
+from fuselog.replay.engine.philox import run_key
+from fuselog.replay.engine.streams.blocks import Block, Ragged, ragged_rows
+from fuselog.replay.engine.streams.channels import given_or_stated
+from fuselog.replay.engine.streams.measurements import Vectors, numbers_of
+from fuselog.replay.engine.streams.priors import gaussians
+from fuselog.replay.engine.vectors.components import Components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -8,21 +8,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Schema, Stream, make_stream, schemas
-from replay.engine.api.inputs import Floats, Integers, Messages, Skipped
-from replay.engine.streams.blocks import Ragged, gather, last_of_equals
-from replay.engine.streams.failures import Failure, reason_stream
-from replay.engine.streams.results import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.replay.engine.api.inputs import Floats, Integers, Messages, Skipped
+from fuselog.replay.engine.streams.blocks import Ragged, gather, last_of_equals
+from fuselog.replay.engine.streams.failures import Failure, reason_stream
+from fuselog.replay.engine.streams.results import (
     InnovationColumns,
     failures_by_run,
     innovation_stream,
     state_stream,
     states_in,
 )
-from replay.engine.vectors.components import Components
-from replay.engine.vectors.covariances import log_likelihood
-from replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.engine.vectors.covariances import log_likelihood
+from fuselog.replay.engine.vectors.tangent import tangent_components
 
 DIVERGED = "the estimate is no longer finite: the filter diverged"
 
@@ -32,7 +32,7 @@ class Results(NamedTuple):
 
     Attributes:
         mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
-            space (see `replay.engine.vectors.tangent`), d where all are linear or angles.
+            space (see `fuselog.replay.engine.vectors.tangent`), d where all are linear or angles.
         innovation, innovation_covariance: (n, m), (n, m, m) of the message.
         squared: (n,) the normalised innovation squared. With the two above the message has a likelihood,
             by which `tune` and `diagnose` go.

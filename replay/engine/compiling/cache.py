@@ -16,9 +16,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from recorders.atomic import whole_file
-from recorders.environment import cache_folder as cache_folder
-from recorders.errors import BadInput
+from fuselog.recorders.atomic import whole_file
+from fuselog.recorders.environment import cache_folder as cache_folder
+from fuselog.recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
 # Nothing that is kept takes longer to make, on a slow and busy machine.

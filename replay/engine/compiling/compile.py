@@ -1,8 +1,8 @@
 """Compiles functions of one run into loops over all runs, which the cores share.
 
 A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
-arrays is written in LLVM's text by ourselves (`replay.engine.compiling.kernels`), in milliseconds; any
-other goes through numba (`replay.engine.compiling.through_numba`). With FUSELOG_UNCOMPILED=1 all are
+arrays is written in LLVM's text by ourselves (`fuselog.replay.engine.compiling.kernels`), in milliseconds; any
+other goes through numba (`fuselog.replay.engine.compiling.through_numba`). With FUSELOG_UNCOMPILED=1 all are
 plain Python, which a debugger can follow: that is the reference.
 """
 
@@ -16,9 +16,9 @@ from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
-from recorders import environment
-from replay.engine.compiling.notices import done_once
-from replay.engine.compiling.scratch import Memory, Scratch
+from fuselog.recorders import environment
+from fuselog.replay.engine.compiling.notices import done_once
+from fuselog.replay.engine.compiling.scratch import Memory, Scratch
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -56,9 +56,9 @@ def compiled(
     @cache
     def kernel() -> Callable[Parameters, Result]:
         if allocates:
-            from replay.engine.compiling.through_numba import function_of
+            from fuselog.replay.engine.compiling.through_numba import function_of
         else:
-            from replay.engine.compiling.kernels.native import function_of
+            from fuselog.replay.engine.compiling.kernels.native import function_of
         return function_of(function)
 
     @wraps(function)
@@ -98,10 +98,10 @@ def compile_over_runs(
     @cache
     def loop() -> Loop:
         if allocates:
-            from replay.engine.compiling.through_numba import loop_of
+            from fuselog.replay.engine.compiling.through_numba import loop_of
 
             return loop_of(run_once, title)
-        from replay.engine.compiling.kernels.native import Kernel
+        from fuselog.replay.engine.compiling.kernels.native import Kernel
 
         return Kernel(cast(FunctionType, run_once), title)
 

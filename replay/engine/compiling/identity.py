@@ -40,7 +40,7 @@ def _words(value: Any, known: dict[int, int], kept: list[Any], names: Sequence[s
         return _words(part, known, kept, names)
 
     own = getattr(value, "kernel_identity", None)
-    if callable(own) and not isinstance(value, type):  # it knows what it is, see replay.tracing
+    if callable(own) and not isinstance(value, type):  # it knows what it is, see fuselog.replay.tracing
         yield own()
     elif isinstance(value, bool | int | float | complex | str | bytes | None | np.generic):
         yield repr(value)

@@ -25,8 +25,8 @@ from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
-from recorders.errors import BadInput
-from replay.engine.compiling.cache import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.cache import (
     cache_folder,
     in_turn,
     is_private,
@@ -34,7 +34,7 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
-from replay.engine.compiling.notices import compiling, done_once
+from fuselog.replay.engine.compiling.notices import compiling, done_once
 
 # In place of the colours in which numba sets its error messages.
 _COLOURLESS = SimpleNamespace(

@@ -11,9 +11,9 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from recorders import environment
-from recorders.errors import BadInput
-from replay.engine.compiling.kernels.program import definition_of
+from fuselog.recorders import environment
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.kernels.program import definition_of
 
 # What a version names, which is part of every key; of any other module the sources are needed.
 _VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}

@@ -20,10 +20,10 @@ import numba
 import numpy as np
 from numba.core.errors import NumbaError
 
-from replay.engine.compiling.inlining import Inlined
-from replay.engine.compiling.kernel_cache import execute, load
-from replay.engine.compiling.kernel_source import DoesNotCompile, KernelSource
-from replay.engine.compiling.scratch import Memory
+from fuselog.replay.engine.compiling.inlining import Inlined
+from fuselog.replay.engine.compiling.kernel_cache import execute, load
+from fuselog.replay.engine.compiling.kernel_source import DoesNotCompile, KernelSource
+from fuselog.replay.engine.compiling.scratch import Memory
 
 # Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
 _PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))

@@ -6,9 +6,9 @@ LLVM ends the process that gives it a processor or features that do not go toget
 import subprocess
 from functools import cache
 
-from recorders import environment
-from recorders.errors import BadInput
-from recorders.processes import start_module
+from fuselog.recorders import environment
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.processes import start_module
 
 
 def require_processor() -> None:
@@ -32,7 +32,7 @@ def _try(name: str | None, features: str | None) -> None:
 
 def main() -> None:
     """Compile a function that adds for the processor that is asked for."""
-    from replay.engine.compiling.kernels.native import object_code
+    from fuselog.replay.engine.compiling.kernels.native import object_code
 
     object_code(
         "define double @add(double %a, double %b) {\n %c = fadd double %a, %b\n ret double %c\n}"

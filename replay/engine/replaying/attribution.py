@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Clock
-from replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.recorders.log import Clock
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 
 Integers = NDArray[np.int64]
 # Messages that no innovation has passed, of a run that ended, are let go from so many on.

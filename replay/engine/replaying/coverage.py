@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Ragged
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

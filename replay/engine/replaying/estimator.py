@@ -15,17 +15,17 @@ from typing import Any, Generic, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream, Topic
-from recorders.parameters import Parameters, ParametersType, build, merge, nested
-from recorders.registry import foreign_code, load
-from replay.engine.compiling.kernel_source import DoesNotCompile
-from replay.engine.renamed import renamed
-from replay.engine.replaying.truth import refuse_truths, truths_among
-from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.ensembles import Ensemble, ensemble_of
-from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import Components
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream, Topic
+from fuselog.recorders.parameters import Parameters, ParametersType, build, merge, nested
+from fuselog.recorders.registry import foreign_code, load
+from fuselog.replay.engine.compiling.kernel_source import DoesNotCompile
+from fuselog.replay.engine.renamed import renamed
+from fuselog.replay.engine.replaying.truth import refuse_truths, truths_among
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.engine.streams.ensembles import Ensemble, ensemble_of
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.vectors.components import Components
 
 
 class Initialized(NamedTuple):
@@ -107,8 +107,8 @@ class Recursive:
             never changes the one it is handed.
         priors: the static topics that are Gaussian priors, and the components that are wanted of each.
             `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
-            see `replay.engine.streams.priors`.
-        given: static topics that are not read from the runs, see `pipeline.runs.initial_states`.
+            see `fuselog.replay.engine.streams.priors`.
+        given: static topics that are not read from the runs, see `fuselog.pipeline.runs.initial_states`.
         finish: the state after the last block -> the outputs that waited for messages which did not
             come any more.
         parameters: those that it was bound with, defaults included.

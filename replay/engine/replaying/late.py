@@ -11,8 +11,8 @@ arrive and does one of three things about it:
 What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
 was waited for on `waited`, as a `schemas.WAITED`. For what is gone back for, the estimator does both
 itself, and says so on `rewound`, as a `schemas.REWOUND` (`Recursive.out_of_sequence`; for filters of
-models, `replay.inference.run.out_of_sequence`, for those of libraries
-`replay.foreign.native.out_of_sequence`).
+models, `fuselog.replay.inference.run.out_of_sequence`, for those of libraries
+`fuselog.replay.foreign.native.out_of_sequence`).
 """
 
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput, choices
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Booleans, Integers
-from replay.engine.replaying.estimator import Bound, Recursive
-from replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals, run_of_rows
-from replay.engine.streams.failures import reason_stream
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Integers
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals, run_of_rows
+from fuselog.replay.engine.streams.failures import reason_stream
 
 POLICIES = ("drop", "wait", "rewind")
 OLDER = "older than what was used before"  # of every message that is left out for being late

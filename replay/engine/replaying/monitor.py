@@ -16,16 +16,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Clock, make_stream, schemas
-from recorders.log.planes import Origin, in_plane
-from replay.engine.compiling.notices import seconds_done_once
-from replay.engine.compiling.scratch import Scratch
-from replay.engine.replaying.coverage import Coverage
-from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
-from replay.engine.replaying.usage import Usage
-from replay.engine.streams.blocks import Ragged, join, ragged_rows, run_of_rows
-from replay.engine.streams.failures import Failure, failure_stream, reason_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, make_stream, schemas
+from fuselog.recorders.log.planes import Origin, in_plane
+from fuselog.replay.engine.compiling.notices import seconds_done_once
+from fuselog.replay.engine.compiling.scratch import Scratch
+from fuselog.replay.engine.replaying.coverage import Coverage
+from fuselog.replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
+from fuselog.replay.engine.replaying.usage import Usage
+from fuselog.replay.engine.streams.blocks import Ragged, join, ragged_rows, run_of_rows
+from fuselog.replay.engine.streams.failures import Failure, failure_stream, reason_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

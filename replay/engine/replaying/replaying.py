@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Clock
-from recorders.log.planes import Origin, common_origin
-from replay.engine.replaying.estimator import Batch, Bound, Initialized, Recursive, code_of
-from replay.engine.replaying.late import Late, taking_late
-from replay.engine.replaying.monitor import RunMonitor
-from replay.engine.replaying.usage import Usage
-from replay.engine.streams.blocks import Block, Ragged, gather, join
-from replay.engine.streams.ensembles import Ensemble, ensemble_of
-from replay.engine.streams.priors import start_of_runs
-from replay.engine.streams.sources import Source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock
+from fuselog.recorders.log.planes import Origin, common_origin
+from fuselog.replay.engine.replaying.estimator import Batch, Bound, Initialized, Recursive, code_of
+from fuselog.replay.engine.replaying.late import Late, taking_late
+from fuselog.replay.engine.replaying.monitor import RunMonitor
+from fuselog.replay.engine.replaying.usage import Usage
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, join
+from fuselog.replay.engine.streams.ensembles import Ensemble, ensemble_of
+from fuselog.replay.engine.streams.priors import start_of_runs
+from fuselog.replay.engine.streams.sources import Source
 
 BLOCK_MESSAGES = 1 << 16
 # Of a run, those that an initialization looks at.
@@ -74,10 +74,10 @@ def replay(
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
             follow none of them: they fail, and the report says so.
 
-    A run that an estimator cannot follow fails alone, see `replay.engine.replaying.monitor`; the
+    A run that an estimator cannot follow fails alone, see `fuselog.replay.engine.replaying.monitor`; the
     failures come last.
     Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
-    begins after the prior of an estimator (see `pipeline.runs.initial_states`), or it cannot do as
+    begins after the prior of an estimator (see `fuselog.pipeline.runs.initial_states`), or it cannot do as
     `late` says.
     """
     if late is not None:

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.vectors.covariances import ROUNDING
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.vectors.covariances import ROUNDING
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -7,8 +7,8 @@ and may; a replay that starts from the truth hands over a prior.
 
 from collections.abc import Collection, Mapping
 
-from recorders.errors import BadInput
-from recorders.log import Topic, schemas
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, schemas
 
 TRUTH = schemas.TRUTH_STATE.full_name
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Clock, Stream, schemas
-from replay.engine.replaying.attribution import Attribution
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
+from fuselog.recorders.log import Clock, Stream, schemas
+from fuselog.replay.engine.replaying.attribution import Attribution
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
 
 # What drives a motion is no measurement, and has no innovation.
 CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}

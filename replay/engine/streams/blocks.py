@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Clock, Stream
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.failures import join_streams
+from fuselog.recorders.log import Clock, Stream
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.failures import join_streams
 
 Found = TypeVar("Found")
 
@@ -95,7 +95,7 @@ class Block(NamedTuple):
         streams: by topic.
         events: the messages of all topics in the order in which they are taken.
         arrival: (n, 2), of every event when it was taken and its place in the file, where that is not
-            its stamp's order alone; see `replay.engine.replaying.late`.
+            its stamp's order alone; see `fuselog.replay.engine.replaying.late`.
         findings: of a block that is replayed again; None of any other.
     """
 

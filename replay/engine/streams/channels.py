@@ -6,9 +6,9 @@ from functools import lru_cache
 import numpy as np
 from pydantic import PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Schema, Topic
-from recorders.parameters import Parameters, build
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Topic
+from fuselog.recorders.parameters import Parameters, build
 
 
 def stated(

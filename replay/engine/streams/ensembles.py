@@ -5,10 +5,17 @@ from functools import cached_property
 from itertools import zip_longest
 from typing import TypeVar
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream
-from replay.engine.streams.blocks import Block, Findings, Ragged, gather, is_in_order, merge_events
-from replay.engine.streams.sources import MemorySource, Source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream
+from fuselog.replay.engine.streams.blocks import (
+    Block,
+    Findings,
+    Ragged,
+    gather,
+    is_in_order,
+    merge_events,
+)
+from fuselog.replay.engine.streams.sources import MemorySource, Source
 
 SourceType = TypeVar("SourceType", bound=Source)
 # Of a block of few messages it is kept what a few filters make of it: of more that takes much memory.

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.log.streams import concatenate, empty_stream
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.recorders.log.streams import concatenate, empty_stream
 
 REASONS = "reasons"
 UNSTATED = "no reason given"

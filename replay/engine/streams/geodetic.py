@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, schemas
-from recorders.log.planes import ALTITUDE, LATITUDE, LONGITUDE
-from recorders.models.geodesy import into_tangent_plane, tangent_axes
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.engine.streams.channels import stated
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, schemas
+from fuselog.recorders.log.planes import ALTITUDE, LATITUDE, LONGITUDE
+from fuselog.recorders.models.geodesy import into_tangent_plane, tangent_axes
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.channels import stated
 
 Floats = NDArray[np.float64]
 GEODETIC = schemas.GEODETIC_FIX.full_name

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from replay.engine.vectors.components import Components, match_components, match_tangent
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.vectors.components import Components, match_components, match_tangent
 
 Floats = NDArray[np.float64]
 PLANE: Components = {"x_m": "linear", "y_m": "linear"}

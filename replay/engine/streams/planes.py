@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.log.planes import Origin, stated_in
-from recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane, tangent_axes
-from recorders.models.orientation import compose
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats
-from replay.engine.vectors.components import in_body_axes, stated_components
-from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import Origin, stated_in
+from fuselog.recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane, tangent_axes
+from fuselog.recorders.models.orientation import compose
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.vectors.components import in_body_axes, stated_components
+from fuselog.replay.engine.vectors.tangent import manifold_blocks, tangent_components
 
 # Components of one vector in the log's frame, which turn together; the first is the position.
 VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]

@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.results import gaussian_stream
-from replay.engine.vectors.components import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.results import gaussian_stream
+from fuselog.replay.engine.vectors.components import (
     Components,
     in_body_axes,
     match_components,
     match_tangent,
     stated_components,
 )
-from replay.engine.vectors.covariances import is_positive_definite
-from replay.engine.vectors.tangent import Kind, tangent_components
+from fuselog.replay.engine.vectors.covariances import is_positive_definite
+from fuselog.replay.engine.vectors.tangent import Kind, tangent_components
 
 MISSING = "there is no prior message"
 NOT_FINITE = "the prior is not finite"

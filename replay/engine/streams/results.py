@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.streams import stream_of
-from recorders.models.planar import wrap_angle
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import Failure, failure_stream, reason_stream
-from replay.engine.vectors.components import Components
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.streams import stream_of
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import Failure, failure_stream, reason_stream
+from fuselog.replay.engine.vectors.components import Components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -8,8 +8,8 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import (
+from fuselog.recorders.errors import BadInput, UnknownName, choices
+from fuselog.recorders.log import (
     Clock,
     Log,
     RunMetadata,
@@ -20,9 +20,9 @@ from recorders.log import (
     read_span,
     read_streams,
 )
-from recorders.log.impossible import Rejections, main_span, main_span_of, possible
-from recorders.recording import Recording
-from replay.engine.streams.blocks import gather, is_in_order
+from fuselog.recorders.log.impossible import Rejections, main_span, main_span_of, possible
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import gather, is_in_order
 
 
 class Source(Protocol):
@@ -57,7 +57,7 @@ class Source(Protocol):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Return topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
+        """Return topics in blocks that follow one another in time; see `fuselog.recorders.log.read_blocks`."""
 
     def whole(self) -> "Source":
         """Return the run without a span."""

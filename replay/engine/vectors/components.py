@@ -6,11 +6,11 @@ from typing import cast
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.orientation import conjugate, rotate
-from recorders.models.states import state_metadata
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.orientation import conjugate, rotate
+from fuselog.recorders.models.states import state_metadata
+from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
 
 Components = Mapping[str, Kind]
 # In the metadata of Gaussian estimates: the axes of the rotation vectors that their covariances are of.
@@ -51,7 +51,7 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
     """Find which rows and columns of a stated covariance are the wanted components', in order.
 
     A covariance is in the tangent space: one row for an axis, three for a quaternion, see
-    `replay.engine.vectors.tangent`. Args and errors as `match_components`.
+    `fuselog.replay.engine.vectors.tangent`. Args and errors as `match_components`.
     """
     columns = match_components(stated, wanted, where)
     rows_of: list[range] = []

@@ -12,9 +12,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.models.orientation import compose, conjugate
-from recorders.models.planar import wrap_angle
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.models.planar import wrap_angle
 
 Floats = NDArray[np.float64]
 Number = TypeVar("Number")

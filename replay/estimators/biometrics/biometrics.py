@@ -14,17 +14,17 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from threadpoolctl import threadpool_limits
 
-from recorders.errors import BadInput, choices
-from recorders.extras import extra
-from recorders.log import Stream, Topic, make_stream, schemas
-from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
-from recorders.parameters import Parameters
-from replay.engine.api.functions import batch
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Booleans, Floats
-from replay.engine.streams.blocks import Ragged, gather
-from replay.estimators.biometrics.mixture_hmm import Fit, fit, log_likelihood
-from replay.estimators.biometrics.pairs import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.extras import extra
+from fuselog.recorders.log import Stream, Topic, make_stream, schemas
+from fuselog.recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import batch
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.estimators.biometrics.mixture_hmm import Fit, fit, log_likelihood
+from fuselog.replay.estimators.biometrics.pairs import (
     RULES,
     Learner,
     Pairs,

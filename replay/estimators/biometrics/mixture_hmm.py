@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.extras import extra
-from replay.engine.arrays import Floats
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.extras import extra
+from fuselog.replay.engine.arrays import Floats
 
 UNEVEN = 1e-9  # far more than rounding, and far less than scores say
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.models.scores import TOPIC, Matcher
-from replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.scores import TOPIC, Matcher
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 Scorer = Callable[[Floats], Floats]
 

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.models.orientation import require_unit
-from replay.distributions import bingham
-from replay.distributions.bingham import Bingham
-from replay.distributions.bingham_kernels import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.orientation import require_unit
+from fuselog.replay.distributions import bingham
+from fuselog.replay.distributions.bingham import Bingham
+from fuselog.replay.distributions.bingham_kernels import (
     compose,
     framed,
     inverse,
@@ -26,9 +26,9 @@ from replay.distributions.bingham_kernels import (
     turn_columns,
     update,
 )
-from replay.distributions.gaussian_kernels import condition
-from replay.engine.arrays import Floats, Integers
-from replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.distributions.gaussian_kernels import condition
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 
 class Steps(NamedTuple):
@@ -108,7 +108,7 @@ def run_bingham_filter(
         state: the distributions before the first row, batch axis (runs,).
         steps: see there.
         rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
-            the modes, see `replay.engine.vectors.tangent`.
+            the modes, see `fuselog.replay.engine.vectors.tangent`.
 
     Returns:
         The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment

@@ -11,23 +11,23 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat, ValidationError
 
-from recorders.errors import BadInput
-from recorders.log import Schema, schemas
-from recorders.models.directional_noise import DirectionalNoise
-from recorders.models.headings import Correlation, equal_sigmas
-from recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS
-from recorders.parameters import Parameters
-from replay.distributions import bingham
-from replay.distributions.bingham import Bingham, make_bingham
-from replay.distributions.wrapped_normal import WrappedNormal
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Given, Messages
-from replay.engine.api.outputs import Results
-from replay.engine.arrays import Floats, Function
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.streams.measurements import Vectors
-from replay.engine.vectors.components import Components
-from replay.estimators.directional.bingham import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, schemas
+from fuselog.recorders.models.directional_noise import DirectionalNoise
+from fuselog.recorders.models.headings import Correlation, equal_sigmas
+from fuselog.recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import bingham
+from fuselog.replay.distributions.bingham import Bingham, make_bingham
+from fuselog.replay.distributions.wrapped_normal import WrappedNormal
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Given, Messages
+from fuselog.replay.engine.api.outputs import Results
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.streams.measurements import Vectors
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.estimators.directional.bingham import (
     BinghamNoise,
     Gaussian,
     GaussianNoise,
@@ -36,7 +36,7 @@ from replay.estimators.directional.bingham import (
     run_bingham_filter,
     run_kalman_filter,
 )
-from replay.estimators.directional.torus import (
+from fuselog.replay.estimators.directional.torus import (
     HeadingModel,
     make_heading_model,
     run_toroidal_filter,

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.models.headings import turn_together
-from replay.distributions import bingham, wrapped_normal
-from replay.distributions.wrapped_normal import WrappedNormal
-from replay.distributions.wrapped_normal_kernels import UNIFORM
-from replay.engine.arrays import Floats, Integers
-from replay.estimators.directional.bingham import BinghamNoise, Steps
-from replay.estimators.directional.torus import HeadingModel, Motion
+from fuselog.recorders.models.headings import turn_together
+from fuselog.replay.distributions import bingham, wrapped_normal
+from fuselog.replay.distributions.wrapped_normal import WrappedNormal
+from fuselog.replay.distributions.wrapped_normal_kernels import UNIFORM
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.estimators.directional.bingham import BinghamNoise, Steps
+from fuselog.replay.estimators.directional.torus import HeadingModel, Motion
 
 if TYPE_CHECKING:
     from scipy import sparse

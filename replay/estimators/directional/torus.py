@@ -14,16 +14,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
-from recorders.models.headings import turn_together
-from recorders.models.planar import Component, wrap_angle
-from replay.distributions.gaussian_kernels import condition
-from replay.distributions.wrapped_normal import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.headings import turn_together
+from fuselog.recorders.models.planar import Component, wrap_angle
+from fuselog.replay.distributions.gaussian_kernels import condition
+from fuselog.replay.distributions.wrapped_normal import (
     WrappedNormal,
     make_wrapped_normal,
     require_central_weight,
 )
-from replay.distributions.wrapped_normal_kernels import (
+from fuselog.replay.distributions.wrapped_normal_kernels import (
     TURN,
     UNIFORM,
     Mixture,
@@ -32,10 +32,10 @@ from replay.distributions.wrapped_normal_kernels import (
     fit_samples,
     five_samples,
 )
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.run.loops import over_events
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.run.loops import over_events
 
 # A variance (rad^2) of a measurement that moves a Gaussian by less than its rounding.
 _VAGUE = 1e18
@@ -72,7 +72,7 @@ class HeadingInputs(NamedTuple):
     option: float | bool
 
 
-# One of `recorders.models.headings`: two angles, coupling and drifts -> the next two.
+# One of `fuselog.recorders.models.headings`: two angles, coupling and drifts -> the next two.
 Motion = Callable[..., tuple[Component, Component]]
 
 

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.models import acoustic as model
-from recorders.models.acoustic import Medium, Noise
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats
-from replay.estimators.localization.least_squares import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models import acoustic as model
+from fuselog.recorders.models.acoustic import Medium, Noise
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.estimators.localization.least_squares import (
     Bound,
     Linearization,
     Solution,
@@ -25,7 +25,7 @@ from replay.estimators.localization.least_squares import (
     mask_missing,
     solve,
 )
-from replay.estimators.localization.rays import intersect_rays
+from fuselog.replay.estimators.localization.rays import intersect_rays
 
 # Derivatives by azimuth, range and trajectory.
 BY_AZIMUTH = (1.0, 0.0, 0.0)

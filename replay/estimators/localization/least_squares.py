@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 Rows = NDArray[np.intp]
 

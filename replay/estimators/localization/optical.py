@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.models.optical import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.optical import (
     bias_components,
     direction,
     line_of_sight,
@@ -19,9 +19,9 @@ from recorders.models.optical import (
     target_components,
     turning_vector,
 )
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Booleans, Floats
-from replay.estimators.localization.least_squares import (
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.estimators.localization.least_squares import (
     Linearization,
     Solution,
     cramer_rao_bound,
@@ -30,7 +30,7 @@ from replay.estimators.localization.least_squares import (
     solve,
     unobservable_directions,
 )
-from replay.estimators.localization.rays import intersect_rays
+from fuselog.replay.estimators.localization.rays import intersect_rays
 
 # Sensors turn together when their turning vectors differ by less than this part of them.
 SAME_TURN = 1e-6

@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Topic, schemas
-from recorders.models.optical import ANGLES
-from recorders.parameters import Parameters
-from replay.engine.api.functions import batch
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.channels import numbered
-from replay.engine.streams.measurements import check_width
-from replay.estimators.localization.optical import Scene, estimate, parameter_names
-from replay.estimators.localization.solutions import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.models.optical import ANGLES
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import batch
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.channels import numbered
+from fuselog.replay.engine.streams.measurements import check_width
+from fuselog.replay.estimators.localization.optical import Scene, estimate, parameter_names
+from fuselog.replay.estimators.localization.solutions import (
     Batches,
     batches_of,
     positive,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Floats
 
 # Rays closer to parallel than this (smallest eigenvalue of the mean projector) do not meet.
 PARALLEL = 1e-12

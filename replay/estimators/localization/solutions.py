@@ -6,15 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, make_stream, schemas
-from replay.engine.arrays import Booleans, Integers
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.engine.streams.channels import stated
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.results import state_stream
-from replay.engine.vectors.components import components_of
-from replay.estimators.localization.least_squares import SENTENCES, Solution
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, make_stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Integers
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.streams.results import state_stream
+from fuselog.replay.engine.vectors.components import components_of
+from fuselog.replay.estimators.localization.least_squares import SENTENCES, Solution
 
 
 class Batches(NamedTuple):

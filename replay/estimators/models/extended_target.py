@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.log import Stream, schemas
-from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_point
-from recorders.models.planar import Components
-from replay.engine.arrays import Floats
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_point
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 STATES = 4
 

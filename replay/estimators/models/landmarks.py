@@ -11,17 +11,17 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.log import Stream, schemas
-from recorders.models.orientation import heading
-from recorders.models.planar import Components, drive, range_bearing
-from replay.engine.arrays import Floats
-from replay.engine.streams.channels import heading_variance
-from replay.engine.streams.measurements import PLANE
-from replay.engine.vectors.tangent import Kind
-from replay.inference.all_methods import modelled
-from replay.inference.model.model import FIX, POSITION, Control, Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.models.planar import Components, drive, range_bearing
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.channels import heading_variance
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.model.model import FIX, POSITION, Control, Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)

@@ -1,10 +1,10 @@
 """Models moving targets, and attitude biases and clocks of the sensors on aircraft that see them.
 
-The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`recorders.models.optical`), but
+The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`fuselog.recorders.models.optical`), but
 nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's own
 clock, so that a clock that is ahead by c says what the targets were c before its stamp:
     (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clocks are `augmentable`, see `replay.inference.model.augmentation`: `estimate_drift` lets
+Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`: `estimate_drift` lets
 them walk.
 """
 
@@ -12,9 +12,9 @@ from typing import Any
 
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.log import schemas
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.optical import (
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.optical import (
     SENSORS,
     TARGETS,
     azimuth_elevation,
@@ -23,11 +23,11 @@ from recorders.models.optical import (
     moving_target_components,
     rotate,
 )
-from recorders.models.planar import Component, Components
-from replay.engine.streams.measurements import SPACE
-from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.models.planar import Component, Components
+from fuselog.replay.engine.streams.measurements import SPACE
+from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):

@@ -3,8 +3,8 @@
 `ranging-pose` has several tags on a body in the plane, and so its heading; `ranging-position` one tag.
 Velocities are random walks. Radios err by more than white noise: they have a bias, `bias_range_m`, an
 error of each anchor or each pair of anchor and tag that lasts for seconds, and outliers where the line
-of sight is blocked. All three are options, see `replay.inference.model.augmentation` and
-`replay.inference.linear_algebra.inflation`.
+of sight is blocked. All three are options, see `fuselog.replay.inference.model.augmentation` and
+`fuselog.replay.inference.linear_algebra.inflation`.
 """
 
 from collections.abc import Mapping
@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.planar import Components
-from replay.engine.arrays import Floats
-from replay.engine.streams.measurements import SPACE
-from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start, Started
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.measurements import SPACE
+from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start, Started
 
 HEADINGS = 8  # from which a pose is sought
 _NS = 1e-9

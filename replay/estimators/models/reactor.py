@@ -9,12 +9,12 @@ from typing import Any
 
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.log import schemas
-from recorders.models.planar import Components
-from recorders.models.reactor import CONSUMED, PRODUCED, react, total_pressure
-from replay.engine.arrays import Floats
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.reactor import CONSUMED, PRODUCED, react, total_pressure
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):

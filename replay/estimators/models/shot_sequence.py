@@ -3,7 +3,7 @@
 A report has the muzzle blast's direction of arrival, the bullet's direction as the shockwave tells it,
 and the shockwave's lead. All are of the place from which the shot was fired: the sound has travelled
 since. Reports may be wrong, by an echo or a shockwave of another shot: to Gaussian methods as a whole,
-see `replay.inference.linear_algebra.inflation`; to `particles:N` each component by itself.
+see `fuselog.replay.inference.linear_algebra.inflation`; to `particles:N` each component by itself.
 """
 
 from collections.abc import Mapping
@@ -13,18 +13,18 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.models.acoustic import azimuth_range, fired_from
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.planar import Components, wrap_angle
-from replay.engine.arrays import Floats
-from replay.engine.streams.measurements import PLANE
-from replay.estimators.localization.rays import intersect_rays
-from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
-from replay.inference.model.model import Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start, Started
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.acoustic import azimuth_range, fired_from
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.planar import Components, wrap_angle
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.estimators.localization.rays import intersect_rays
+from fuselog.replay.inference.linear_algebra.gaussian import LOG_TWO_PI
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start, Started
 
 _NS = 1e-9
 HALF_TURN = float(np.pi)

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from pydantic import PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.models.planar import Components
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.measurements import SPACE
-from replay.estimators.models.ranging import distance
-from replay.inference.model.model import Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start, Started
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.measurements import SPACE
+from fuselog.replay.estimators.models.ranging import distance
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start, Started
 
 # A source is sought on a grid about the microphones, so many times as large as they are apart, and from
 # the best of its points on.

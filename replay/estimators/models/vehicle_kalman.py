@@ -12,14 +12,14 @@ from typing import Any
 
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.log import schemas
-from recorders.models.planar import Components
-from recorders.models.states import PLANE_MOTION
-from recorders.models.vehicles import noise_moments, turn
-from replay.engine.streams.measurements import PLANE
-from replay.inference.all_methods import modelled
-from replay.inference.model.model import Model, Motion, Sensor, Switching
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.models.vehicles import noise_moments, turn
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.model.model import Model, Motion, Sensor, Switching
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):

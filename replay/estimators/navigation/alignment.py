@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.inertial import EARTH_RATE_RADPS, into_body, into_plane, product, rotation
-from recorders.models.planar import Components, wrap_angle
-from replay.engine.arrays import Floats
-from replay.engine.streams.measurements import SPACE, read_fixes
-from replay.estimators.navigation.samples import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.inertial import EARTH_RATE_RADPS, into_body, into_plane, product, rotation
+from fuselog.recorders.models.planar import Components, wrap_angle
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.measurements import SPACE, read_fixes
+from fuselog.replay.estimators.navigation.samples import (
     NS,
     STANDARD_GRAVITY_MPS2,
     USUAL_SIGMA_M,
@@ -31,9 +31,9 @@ from replay.estimators.navigation.samples import (
     stated_or,
     unsteadiness,
 )
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Started
-from replay.inference.run.first_messages import WIDER
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Started
+from fuselog.replay.inference.run.first_messages import WIDER
 
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
 SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off

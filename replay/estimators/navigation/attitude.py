@@ -13,19 +13,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.models.inertial import into_body, into_plane, product, rotation
-from recorders.models.planar import Components
-from replay.engine.arrays import Booleans, Floats
-from replay.engine.vectors.tangent import Kind
-from replay.estimators.navigation.navigation import UNIT as CARRIED
-from replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
-from replay.estimators.orientation.orientation import ORIENTATION
-from replay.estimators.orientation.triad import triad
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start, Started
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.inertial import into_body, into_plane, product, rotation
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.estimators.navigation.navigation import UNIT as CARRIED
+from fuselog.replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
+from fuselog.replay.estimators.orientation.orientation import ORIENTATION
+from fuselog.replay.estimators.orientation.triad import triad
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start, Started
 
 PERIOD_NS = 1_000_000_000
 BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}

@@ -12,24 +12,24 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, into_plane, strapdown
-from recorders.models.planar import Components
-from recorders.models.states import NAVIGATION
-from replay.engine.arrays import Floats
-from replay.engine.vectors.components import components_of
-from replay.engine.vectors.tangent import Kind
-from replay.estimators.navigation.alignment import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.inertial import cross, into_plane, strapdown
+from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.states import NAVIGATION
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.vectors.components import components_of
+from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.estimators.navigation.alignment import (
     AlignmentParameters,
     align,
     check_prior,
     specific_force,
     turn_rate,
 )
-from replay.estimators.navigation.sensors import carried_sensors
-from replay.estimators.navigation.turning import WITH_HEADING
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.start import Start
+from fuselog.replay.estimators.navigation.sensors import carried_sensors
+from fuselog.replay.estimators.navigation.turning import WITH_HEADING
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.start import Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}

@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.inertial import from_mounting
-from recorders.models.states import NAVIGATION
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.measurements import read_fixes
-from replay.engine.vectors.components import components_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.inertial import from_mounting
+from fuselog.recorders.models.states import NAVIGATION
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.measurements import read_fixes
+from fuselog.replay.engine.vectors.components import components_of
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, into_body, into_plane
-from recorders.models.orientation import heading
-from recorders.models.planar import Components
-from replay.engine.arrays import Floats
-from replay.engine.streams.channels import heading_variance
-from replay.estimators.models.ranging import ANCHORS, RANGE, TAGS, distance
-from replay.estimators.navigation.alignment import turn_rate
-from replay.inference.model.model import Control, Sensor
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.inertial import cross, into_body, into_plane
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.channels import heading_variance
+from fuselog.replay.estimators.models.ranging import ANCHORS, RANGE, TAGS, distance
+from fuselog.replay.estimators.navigation.alignment import turn_rate
+from fuselog.replay.inference.model.model import Control, Sensor
 
 
 def be_headed(state: Components, reference: Any, parameters: Any) -> Components:

@@ -17,9 +17,9 @@ Filter as a Stable Observer, IEEE Transactions on Automatic Control 62(4), 2017.
 
 import numpy as np
 
-from recorders.models.inertial import Vector, cross, into_body, product
-from recorders.models.planar import Component, Components
-from replay.inference.model.model import Correction
+from fuselog.recorders.models.inertial import Vector, cross, into_body, product
+from fuselog.recorders.models.planar import Component, Components
+from fuselog.replay.inference.model.model import Correction
 
 UP = 0.0, 0.0, 1.0
 
@@ -31,7 +31,7 @@ def heading(state: Components) -> Components:
 
 
 def move(state: Components, step: Components, slope: Components) -> Components:
-    """Return the state after an update, see `replay.inference.model.model.Correction`."""
+    """Return the state after an update, see `fuselog.replay.inference.model.model.Correction`."""
     return _moved(state, step, slope, 0.0)
 
 

@@ -16,22 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Topic, schemas
-from recorders.parameters import Parameters
-from replay.distributions import chi2
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Booleans, Floats
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged, run_of_rows
-from replay.engine.streams.channels import given_or_stated, numbered
-from replay.engine.streams.failures import Failure
-from replay.engine.streams.priors import Priors, no_priors, priors_of
-from replay.engine.streams.results import ALL_WELL, failures_by_run, failures_of, states_in
-from replay.estimators.models.landmarks import LANDMARKS, POSE
-from replay.estimators.networks.covariance_intersection import Criterion
-from replay.estimators.networks.encounters import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Block, Ragged, run_of_rows
+from fuselog.replay.engine.streams.channels import given_or_stated, numbered
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.engine.streams.priors import Priors, no_priors, priors_of
+from fuselog.replay.engine.streams.results import ALL_WELL, failures_by_run, failures_of, states_in
+from fuselog.replay.estimators.models.landmarks import LANDMARKS, POSE
+from fuselog.replay.estimators.networks.covariance_intersection import Criterion
+from fuselog.replay.estimators.networks.encounters import (
     RobotEvents,
     RobotInputs,
     RobotMemory,
@@ -42,10 +42,10 @@ from replay.estimators.networks.encounters import (
     cooperate,
     write_pose,
 )
-from replay.inference.kalman.steps import FAILURES
-from replay.inference.linear_algebra.small_matrices import update_memory
-from replay.inference.run.events import Points, points_of
-from replay.inference.run.loops import over_events
+from fuselog.replay.inference.kalman.steps import FAILURES
+from fuselog.replay.inference.linear_algebra.small_matrices import update_memory
+from fuselog.replay.inference.run.events import Points, points_of
+from fuselog.replay.inference.run.loops import over_events
 
 Mode = Literal["alone", "naive", "ci", "joint"]
 
@@ -155,7 +155,7 @@ def _prior(prior: Ragged) -> Priors:
 def advance(
     given: Cooperating, state: CooperativeState, block: Block
 ) -> tuple[CooperativeState, list[Ragged]]:
-    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    """Filter a block; see `fuselog.replay.engine.api.functions.recursive`."""
     (prefixes, settings), mode = given.setup, given.parameters.mode
     robots = copy.deepcopy(state.robots)
     events = _events(block, state, prefixes, mode, settings)

@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats
-from replay.engine.compiling.compile import compile_over_runs
-from replay.estimators.networks.estimates import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.estimators.networks.estimates import (
     Estimate,
     Fused,
     blend,
@@ -25,7 +25,7 @@ from replay.estimators.networks.estimates import (
     one_of,
     transform,
 )
-from replay.estimators.networks.pairwise import fuse_in_turn
+from fuselog.replay.estimators.networks.pairwise import fuse_in_turn
 
 Criterion = Literal["trace", "determinant"]
 ITERATIONS = 10_000

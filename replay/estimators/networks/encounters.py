@@ -4,17 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.planar import drive
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.results import ALL_WELL
-from replay.estimators.models.landmarks import POSE, sight
-from replay.estimators.networks.estimates import blend
-from replay.estimators.networks.pairwise import Stake, sighting_weight
-from replay.inference.kalman.steps import NOT_FINITE, NOT_POSITIVE_DEFINITE, UNKNOWN
-from replay.inference.linear_algebra.gaussian import add_through, copy_gaussian, wrap
-from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.small_matrices import UpdateMemory, update
-from replay.tracing.functions import traced
+from fuselog.recorders.models.planar import drive
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.estimators.models.landmarks import POSE, sight
+from fuselog.replay.estimators.networks.estimates import blend
+from fuselog.replay.estimators.networks.pairwise import Stake, sighting_weight
+from fuselog.replay.inference.kalman.steps import NOT_FINITE, NOT_POSITIVE_DEFINITE, UNKNOWN
+from fuselog.replay.inference.linear_algebra.gaussian import add_through, copy_gaussian, wrap
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
+from fuselog.replay.inference.linear_algebra.small_matrices import UpdateMemory, update
+from fuselog.replay.tracing.functions import traced
 
 
 class RobotStates(NamedTuple):
@@ -93,7 +93,7 @@ class RobotMemory(NamedTuple):
         spread, square: H P H' and H P P H' of both, (2, 2, 2).
         whole: rows by the state of all robots, (2, 3 n).
         product: (3, 3 n).
-        update: see `replay.inference.linear_algebra.small_matrices`.
+        update: see `fuselog.replay.inference.linear_algebra.small_matrices`.
     """
 
     state: Floats

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats
-from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
 SINGULAR = 1e-13

@@ -14,20 +14,20 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.errors import BadInput
-from recorders.log import Topic, schemas
-from recorders.parameters import Parameters
-from replay.distributions import chi2
-from replay.engine.api.functions import batch
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.engine.streams.channels import numbered
-from replay.engine.streams.results import ALL_WELL, failures_of, states_in
-from replay.engine.vectors.components import components_of
-from replay.estimators.networks.covariance_intersection import rule_number
-from replay.estimators.networks.nodes import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.api.functions import batch
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.channels import numbered
+from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, states_in
+from fuselog.replay.engine.vectors.components import components_of
+from fuselog.replay.estimators.networks.covariance_intersection import rule_number
+from fuselog.replay.estimators.networks.nodes import (
     Activities,
     NodeFusion,
     NodeInputs,

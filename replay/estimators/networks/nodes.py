@@ -4,10 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.constant_velocity import noise_moments
-from replay.engine.arrays import Booleans, Floats, Function, Integers
-from replay.estimators.networks.covariance_intersection import FusionMemory, fuse_by, fusion_memory
-from replay.estimators.networks.estimates import (
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
+from fuselog.replay.estimators.networks.covariance_intersection import (
+    FusionMemory,
+    fuse_by,
+    fusion_memory,
+)
+from fuselog.replay.estimators.networks.estimates import (
     Estimate,
     Fused,
     blend,
@@ -15,8 +19,8 @@ from replay.estimators.networks.estimates import (
     inverted,
     one_of,
 )
-from replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
-from replay.inference.run.loops import over_stamps
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
+from fuselog.replay.inference.run.loops import over_stamps
 
 
 class Activities(NamedTuple):

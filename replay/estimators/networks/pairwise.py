@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats
-from replay.estimators.networks.estimates import (
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.estimators.networks.estimates import (
     Estimate,
     Fused,
     blend,
@@ -17,7 +17,7 @@ from replay.estimators.networks.estimates import (
     steps_for,
     transform,
 )
-from replay.inference.linear_algebra.gaussian import multiply
+from fuselog.replay.inference.linear_algebra.gaussian import multiply
 
 SIGHTING_STEPS = 40
 

@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import schemas
-from recorders.models.inertial import cross, into_body, into_plane, product
-from recorders.parameters import Parameters
-from replay.engine.api.functions import batch, each_run
-from replay.engine.api.inputs import Given, Messages, OneRun
-from replay.engine.api.outputs import Estimates, Results
-from replay.engine.arrays import Floats, Integers
-from replay.estimators.orientation.magnetometers import with_magnetometer
-from replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
-from replay.estimators.orientation.resting import of_nine_axes
-from replay.estimators.orientation.triad import triad, unit
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.inertial import cross, into_body, into_plane, product
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import batch, each_run
+from fuselog.replay.engine.api.inputs import Given, Messages, OneRun
+from fuselog.replay.engine.api.outputs import Estimates, Results
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.estimators.orientation.magnetometers import with_magnetometer
+from fuselog.replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
+from fuselog.replay.estimators.orientation.resting import of_nine_axes
+from fuselog.replay.estimators.orientation.triad import triad, unit
 
 HALF = np.sqrt(0.5)
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from replay.distributions.bingham_kernels import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.distributions.bingham_kernels import (
     compose,
     integrate,
     local_moments,
@@ -25,9 +25,9 @@ from replay.distributions.bingham_kernels import (
     turn_columns,
     update,
 )
-from replay.engine.arrays import Floats, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.estimators.orientation.triad import (
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.estimators.orientation.triad import (
     all_finite,
     fill_diagonal,
     fill_isotropic,

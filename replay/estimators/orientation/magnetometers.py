@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import Clock, Topic, schemas
-from replay.engine.arrays import Floats
-from replay.engine.replaying.estimator import Batch, Bound, Estimator, Initialized, Recursive
-from replay.engine.streams.blocks import (
+from fuselog.recorders.log import Clock, Topic, schemas
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Initialized, Recursive
+from fuselog.replay.engine.streams.blocks import (
     Block,
     Events,
     Ragged,

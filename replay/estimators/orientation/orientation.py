@@ -8,15 +8,15 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from recorders.log import schemas
-from recorders.parameters import Parameters
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Given, Messages
-from replay.engine.api.outputs import Results
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.streams.measurements import Vectors
-from replay.engine.vectors.components import Components
-from replay.estimators.orientation.inertial import (
+from fuselog.recorders.log import schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Given, Messages
+from fuselog.replay.engine.api.outputs import Results
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.streams.measurements import Vectors
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.estimators.orientation.inertial import (
     InertialModel,
     InertialSamples,
     OrientationEstimates,
@@ -24,9 +24,9 @@ from replay.estimators.orientation.inertial import (
     run_inertial_filter,
     start_inertial_filter,
 )
-from replay.estimators.orientation.magnetometers import with_magnetometer
-from replay.estimators.orientation.reckoning import run_dead_reckoning, start_reckoning
-from replay.estimators.orientation.resting import LONGEST_S, of_nine_axes, rests_of
+from fuselog.replay.estimators.orientation.magnetometers import with_magnetometer
+from fuselog.replay.estimators.orientation.reckoning import run_dead_reckoning, start_reckoning
+from fuselog.replay.estimators.orientation.resting import LONGEST_S, of_nine_axes, rests_of
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")

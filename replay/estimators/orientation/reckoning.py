@@ -4,16 +4,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.distributions.bingham_kernels import compose
-from replay.engine.arrays import Floats, Integers
-from replay.estimators.orientation.inertial import (
+from fuselog.replay.distributions.bingham_kernels import compose
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.estimators.orientation.inertial import (
     InertialModel,
     InertialSamples,
     OrientationEstimates,
     over_runs,
     prepared,
 )
-from replay.estimators.orientation.triad import all_finite, triad, turn_quaternion
+from fuselog.replay.estimators.orientation.triad import all_finite, triad, turn_quaternion
 
 NS = 1e-9
 

@@ -11,13 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream
-from replay.engine.arrays import Booleans, Floats
-from replay.engine.replaying.estimator import Bound, Estimator, Initialization, Initialized, Recursive
-from replay.engine.streams.blocks import Ragged
-from replay.estimators.orientation.magnetometers import with_magnetometer
-from replay.inference.run.first_messages import Fact, started
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.replaying.estimator import (
+    Bound,
+    Estimator,
+    Initialization,
+    Initialized,
+    Recursive,
+)
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.estimators.orientation.magnetometers import with_magnetometer
+from fuselog.replay.inference.run.first_messages import Fact, started
 
 REST = "rest"  # what `start` finds the samples of the rest under
 LONGEST_S, LEAST_S = 20.0, 1.0  # no more is needed, and less says too little of a bias

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.models.inertial import cross
-from recorders.models.planar import Components
-from replay.distributions.bingham_kernels import Vector
+from fuselog.recorders.models.inertial import cross
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.distributions.bingham_kernels import Vector
 
 
 def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:

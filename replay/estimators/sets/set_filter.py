@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.extras import AtFirstUse
-from recorders.log import Stream, Topic, make_stream, schemas
-from replay.engine.api.functions import batch
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.channels import given_or_stated
-from replay.engine.streams.failures import reason_stream
-from replay.estimators.sets.set_membership import (
+from fuselog.recorders.extras import AtFirstUse
+from fuselog.recorders.log import Stream, Topic, make_stream, schemas
+from fuselog.replay.engine.api.functions import batch
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.channels import given_or_stated
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.estimators.sets.set_membership import (
     SetParameters,
     bearings_in,
     fault_stream,
@@ -36,8 +36,8 @@ from replay.estimators.sets.set_membership import (
     set_metadata,
     set_streams,
 )
-from replay.regions.feasible_sets import excess_rad, to_blame
-from replay.regions.frames import (
+from fuselog.replay.regions.feasible_sets import excess_rad, to_blame
+from fuselog.replay.regions.frames import (
     CONTRADICTS_ITSELF,
     CONTRADICTS_PAST,
     ERRORS,
@@ -51,7 +51,7 @@ from replay.regions.frames import (
     Frame,
     frames_with_bearings,
 )
-from replay.regions.moving_sets import (
+from fuselog.replay.regions.moving_sets import (
     ALL_HEADINGS,
     Headings,
     Motion,
@@ -267,7 +267,7 @@ def _area(parts: Sequence[shapely.Geometry]) -> float:
 
 
 def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
-    """Return a set at every frame of every run; see `replay.engine.api.functions.batch`."""
+    """Return a set at every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
     known, bounds = given.setup
     stated = map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad))
     metadata = {

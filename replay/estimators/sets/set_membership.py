@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, make_stream, schemas
-from recorders.parameters import Parameters
-from replay.engine.api.functions import batch
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged, gather
-from replay.regions.feasible_sets import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import batch
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.regions.feasible_sets import (
     Arena,
     Pairs,
     box,
@@ -26,8 +26,8 @@ from replay.regions.feasible_sets import (
     rings,
     to_blame,
 )
-from replay.regions.frames import Frame, Known, frames
-from replay.regions.pseudo_ellipsoids import Weighting, fit, outline
+from fuselog.replay.regions.frames import Frame, Known, frames
+from fuselog.replay.regions.pseudo_ellipsoids import Weighting, fit, outline
 
 LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
@@ -76,7 +76,7 @@ def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floa
 
 
 def solve(given: Given[SetParameters]) -> list[Ragged]:
-    """Return a set for every frame of every run; see `replay.engine.api.functions.batch`."""
+    """Return a set for every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
     known: Known = given.setup
     prefix, metadata = f"/estimates/{given.name}", set_metadata(given.topics["seen"].name, known)
     solved = []

@@ -15,21 +15,21 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
-from recorders.log.planes import frame_of, in_frame
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.parameters import Parameters
-from replay.distributions import chi2
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.channels import bindings, given_or_stated
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.engine.streams.results import ALL_WELL, failures_of, state_stream
-from replay.engine.vectors.components import Components
-from replay.estimators.tracking.phd_recursion import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, make_stream, schemas
+from fuselog.recorders.log.planes import frame_of, in_frame
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.engine.streams.channels import bindings, given_or_stated
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, state_stream
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.estimators.tracking.phd_recursion import (
     STATES,
     Mixture,
     PhdInputs,
@@ -40,10 +40,10 @@ from replay.estimators.tracking.phd_recursion import (
     extract,
     process,
 )
-from replay.estimators.tracking.scans import by_scan
-from replay.inference.kalman.steps import FAILURES
-from replay.inference.linear_algebra.gaussian import no_innovation
-from replay.inference.run.loops import over_events
+from fuselog.replay.estimators.tracking.scans import by_scan
+from fuselog.replay.inference.kalman.steps import FAILURES
+from fuselog.replay.inference.linear_algebra.gaussian import no_innovation
+from fuselog.replay.inference.run.loops import over_events
 
 Probability = Annotated[float, Field(gt=0, le=1)]
 
@@ -174,7 +174,7 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
 
 
 def advance(given: Filtering, before: Mixture, block: Block) -> tuple[Mixture, list[Ragged]]:
-    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    """Filter a block; see `fuselog.replay.engine.api.functions.recursive`."""
     scans = scans_of(*block.streams.values())
     after, sets = filter_scans(before, scans, given.setup)
     frame = frame_of(given.topics["detection"].metadata)

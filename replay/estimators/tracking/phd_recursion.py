@@ -4,11 +4,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.models.vehicles import noise_moments
-from replay.engine.arrays import Booleans, Floats, Integers, varying
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, UNKNOWN
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.recorders.models.vehicles import noise_moments
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, varying
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, UNKNOWN
+from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
     copy_gaussian,

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Integers, varying
-from replay.inference.association.association import nearest
-from replay.inference.association.clusters import AssociationMemory, Weights
+from fuselog.replay.engine.arrays import Floats, Integers, varying
+from fuselog.replay.inference.association.association import nearest
+from fuselog.replay.inference.association.clusters import AssociationMemory, Weights
 
 LEVELS = 4
 
@@ -96,7 +96,7 @@ class ReportResults(NamedTuple):
 
 @varying(2)
 class ReportMemory(NamedTuple):
-    """Holds what associates the reports of one stamp: see `replay.inference.association.association`.
+    """Holds what associates the reports of one stamp: see `fuselog.replay.inference.association.association`.
 
     Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
     """

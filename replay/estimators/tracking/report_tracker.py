@@ -21,17 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.parameters import Parameters
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Floats
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.estimators.tracking.report_association import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, make_stream, schemas
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.estimators.tracking.report_association import (
     LEVELS,
     ReportInputs,
     ReportMemory,
@@ -41,8 +41,8 @@ from replay.estimators.tracking.report_association import (
     Tracks,
     track,
 )
-from replay.inference.association.clusters import Weights, memory_for
-from replay.inference.run.loops import over_stamps
+from fuselog.replay.inference.association.clusters import Weights, memory_for
+from fuselog.replay.inference.run.loops import over_stamps
 
 FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=LEVELS)]
 
@@ -91,7 +91,7 @@ def start(given: Reporting) -> tuple[Reporting, Tracks]:
 
 
 def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, list[Ragged]]:
-    """Track a block; see `replay.engine.api.functions.recursive`."""
+    """Track a block; see `fuselog.replay.engine.api.functions.recursive`."""
     settings, topic = given.setup, given.topics["reports"].name
     reports = _reports(block, topic, settings)
     tracks = _with_room(before, int(np.diff(reports.offsets).max(initial=0)))

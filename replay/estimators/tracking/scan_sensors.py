@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import schemas
-from recorders.models.planar import Component, Components
-from replay.engine.streams.measurements import PLANE
-from replay.inference.association.scans import ScanSensor
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.planar import Component, Components
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.inference.association.scans import ScanSensor
 
 
 def away(target: Components, origin: Any) -> tuple[Any, Any]:

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, run_of_rows
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.inference.association.scans import Scans, ScanSensor
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, run_of_rows
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.inference.association.scans import Scans, ScanSensor
 
 ORIGIN = "origin"
 

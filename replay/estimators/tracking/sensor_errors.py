@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats
-from replay.engine.vectors.components import Components
-from replay.estimators.tracking.targets import Targets
-from replay.inference.association.scans import ScanSensor
-from replay.inference.association.tracker import Newborn
-from replay.inference.linear_algebra.manifold import is_flat
-from replay.inference.model.model import Model, Motion
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import trial_state
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.estimators.tracking.targets import Targets
+from fuselog.replay.inference.association.scans import ScanSensor
+from fuselog.replay.inference.association.tracker import Newborn
+from fuselog.replay.inference.linear_algebra.manifold import is_flat
+from fuselog.replay.inference.model.model import Model, Motion
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import trial_state
 
 BY_SORT = ("registration", "correlated")
 

@@ -6,23 +6,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
-from recorders.errors import BadInput, choices
-from recorders.log import Topic
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.planar import Components
-from recorders.models.states import PLANE_MOTION
-from recorders.parameters import build
-from recorders.registry import load
-from replay.engine.arrays import Floats
-from replay.engine.streams.channels import stated
-from replay.engine.vectors.tangent import tangent_components
-from replay.inference.association.tracker import Newborn
-from replay.inference.model.model import Model, Motion
-from replay.inference.model.parameters import ModelParameters, number_fields, settings_type
-from replay.inference.model.settings import TracedParameters
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import check_motion, check_switching, switching_of
-from replay.inference.run.first_messages import unknown
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Topic
+from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.association.tracker import Newborn
+from fuselog.replay.inference.model.model import Model, Motion
+from fuselog.replay.inference.model.parameters import ModelParameters, number_fields, settings_type
+from fuselog.replay.inference.model.settings import TracedParameters
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import check_motion, check_switching, switching_of
+from fuselog.replay.inference.run.first_messages import unknown
 
 POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 

@@ -5,18 +5,18 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import make_stream, schemas
-from recorders.log.planes import in_frame
-from replay.engine.arrays import Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.results import InnovationColumns, innovation_stream, named
-from replay.estimators.tracking.scan_sensors import KINDS
-from replay.estimators.tracking.scans import SensorTopics
-from replay.inference.association.outputs import TrackOutputs
-from replay.inference.association.scans import Scans
-from replay.inference.association.tracks import NEVER
-from replay.inference.model.stage import Stage
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.planes import in_frame
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.streams.results import InnovationColumns, innovation_stream, named
+from fuselog.replay.estimators.tracking.scan_sensors import KINDS
+from fuselog.replay.estimators.tracking.scans import SensorTopics
+from fuselog.replay.inference.association.outputs import TrackOutputs
+from fuselog.replay.inference.association.scans import Scans
+from fuselog.replay.inference.association.tracks import NEVER
+from fuselog.replay.inference.model.stage import Stage
 
 UNUSED = (
     "there is no room for more tracks; give --set most_tracks=...",

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.estimators.tracking.targets import Targets
-from replay.inference.association.track_smoothing import smooth_tracks
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.estimators.tracking.targets import Targets
+from fuselog.replay.inference.association.track_smoothing import smooth_tracks
 
 
 def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:

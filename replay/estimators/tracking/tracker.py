@@ -11,9 +11,9 @@
 
 Targets keep their velocity but for white acceleration, or move as any registered model with a position
 says; where it has several modes, each track is an interacting multiple model. Sensors are those that
-state what they are like on the channels of their scans, see `replay.estimators.tracking.scan_sensors`.
+state what they are like on the channels of their scans, see `fuselog.replay.estimators.tracking.scan_sensors`.
 Places begin tracks, bearings only sharpen those that are confirmed.
-`replay.inference.association.tracking` does the work.
+`fuselog.replay.inference.association.tracking` does the work.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,31 +23,31 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from recorders.errors import BadInput
-from recorders.log import Topic, schemas
-from recorders.log.planes import frame_in_words, frame_of
-from recorders.parameters import Parameters
-from replay.distributions import chi2
-from replay.engine.api.functions import Advance, recursive
-from replay.engine.api.inputs import Binding
-from replay.engine.arrays import Floats
-from replay.engine.streams.channels import stated
-from replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
-from replay.estimators.tracking.scans import ORIGIN, SensorTopics
-from replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
-from replay.estimators.tracking.targets import Targets, targets_of
-from replay.estimators.tracking.track_smoother import check_smoothing
-from replay.estimators.tracking.tracker_run import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.log.planes import frame_in_words, frame_of
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.api.functions import Advance, recursive
+from fuselog.replay.engine.api.inputs import Binding
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
+from fuselog.replay.estimators.tracking.scans import ORIGIN, SensorTopics
+from fuselog.replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
+from fuselog.replay.estimators.tracking.targets import Targets, targets_of
+from fuselog.replay.estimators.tracking.track_smoother import check_smoothing
+from fuselog.replay.estimators.tracking.tracker_run import (
     TrackerSetup,
     advance,
     advance_out_of_sequence,
     finish,
     start,
 )
-from replay.inference.association.scanning import measuring
-from replay.inference.association.tracker import Tracker
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.stage import stage_of
+from fuselog.replay.inference.association.scanning import measuring
+from fuselog.replay.inference.association.tracker import Tracker
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.stage import stage_of
 
 # What sets apart the two that go by existence and have the associations of jpda.
 EXISTING: dict[str, dict[str, float]] = {

@@ -5,19 +5,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.api.inputs import Given
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, gather, join, of_runs
-from replay.estimators.tracking.scan_sensors import KINDS
-from replay.estimators.tracking.scans import Fixes, SensorTopics, latest_fixes, scans_of
-from replay.estimators.tracking.targets import Targets
-from replay.estimators.tracking.track_outputs import track_outputs
-from replay.estimators.tracking.track_smoother import smoothed
-from replay.inference.association.outputs import TrackOutputs, of_last
-from replay.inference.association.scans import Scans, in_time, take_scans
-from replay.inference.association.tracker import Tracker
-from replay.inference.association.tracking import track_scans
-from replay.inference.association.tracks import Tracks, no_tracks
+from fuselog.replay.engine.api.inputs import Given
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, join, of_runs
+from fuselog.replay.estimators.tracking.scan_sensors import KINDS
+from fuselog.replay.estimators.tracking.scans import Fixes, SensorTopics, latest_fixes, scans_of
+from fuselog.replay.estimators.tracking.targets import Targets
+from fuselog.replay.estimators.tracking.track_outputs import track_outputs
+from fuselog.replay.estimators.tracking.track_smoother import smoothed
+from fuselog.replay.inference.association.outputs import TrackOutputs, of_last
+from fuselog.replay.inference.association.scans import Scans, in_time, take_scans
+from fuselog.replay.inference.association.tracker import Tracker
+from fuselog.replay.inference.association.tracking import track_scans
+from fuselog.replay.inference.association.tracks import Tracks, no_tracks
 
 
 class TrackerSetup(NamedTuple):
@@ -97,7 +97,7 @@ def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
 
 
 def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[TrackerState, list[Ragged]]:
-    """Track a block; see `replay.engine.api.functions.recursive`."""
+    """Track a block; see `fuselog.replay.engine.api.functions.recursive`."""
     scans, fixes = _scans(state, block, setup)
     tracks, batches = setup.track(state.tracks, scans)
     outputs = _joined([setup.outputs(batch, tracked) for batch, tracked in batches])

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.distributions import chi2
-from replay.engine.arrays import Floats, Integers
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.arrays import Floats, Integers
 
 MISSED = -1
 # Detections farther than this from a vehicle are not tried for it, nor maps that are so improbable.

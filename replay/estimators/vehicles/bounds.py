@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.vehicles import noise_moments
-from replay.engine.arrays import Floats
+from fuselog.recorders.models.vehicles import noise_moments
+from fuselog.replay.engine.arrays import Floats
 
 SETTLED = 2000
 

@@ -15,21 +15,21 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeInt
 
-from recorders.errors import BadInput, choices
-from recorders.log import Topic
-from recorders.models.vehicles import turn
-from recorders.parameters import Parameters
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Floats
-from replay.engine.compiling.compile import compiled
-from replay.engine.streams.blocks import Block, Ragged
-from replay.estimators.vehicles.association import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Topic
+from fuselog.recorders.models.vehicles import turn
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.replay.engine.streams.blocks import Block, Ragged
+from fuselog.replay.estimators.vehicles.association import (
     all_maps,
     log_likelihoods,
     log_permanents,
 )
-from replay.estimators.vehicles.streams import (
+from fuselog.replay.estimators.vehicles.streams import (
     Frames,
     VehiclesState,
     find_vehicles,
@@ -38,8 +38,8 @@ from replay.estimators.vehicles.streams import (
     outputs_of,
     start,
 )
-from replay.estimators.vehicles.updates import Setup, blocks_of, innovations_of
-from replay.estimators.vehicles.vehicles import (
+from fuselog.replay.estimators.vehicles.updates import Setup, blocks_of, innovations_of
+from fuselog.replay.estimators.vehicles.vehicles import (
     STATES,
     Joint,
     normalised,
@@ -52,7 +52,7 @@ from replay.estimators.vehicles.vehicles import (
     update_by_scalar,
     weigh,
 )
-from replay.sampling.resampling import choose_systematically
+from fuselog.replay.sampling.resampling import choose_systematically
 
 KINDS = {
     "set": "states, weighted by the exact likelihood of the unordered pairs (x, y)",
@@ -128,7 +128,7 @@ def _start(given: Given[ParticlesParameters]) -> tuple[tuple[Setup, Method], Clo
 
 
 def _run(settings: tuple[Setup, Method], before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
-    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    """Filter a block; see `fuselog.replay.engine.api.functions.recursive`."""
     (setup, method), cloud = settings, copy.deepcopy(before)
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape

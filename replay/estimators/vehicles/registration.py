@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from replay.distributions import chi2
-from replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 MOST_VEHICLES = 8
 # A fit with so improbable a residual is of other things than the vehicles.

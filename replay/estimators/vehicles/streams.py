@@ -13,26 +13,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
-from recorders.errors import BadInput, choices
-from recorders.log import Topic, schemas
-from recorders.models.states import PLANE_MOTION
-from recorders.parameters import Parameters
-from replay.engine.api.functions import recursive
-from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, run_of_rows
-from replay.engine.streams.channels import numbered, stated
-from replay.engine.streams.failures import Failure, reason_stream
-from replay.engine.streams.measurements import PLANE, read_fixes, read_vectors
-from replay.engine.streams.results import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import recursive
+from fuselog.replay.engine.api.inputs import Binding, Given
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, run_of_rows
+from fuselog.replay.engine.streams.channels import numbered, stated
+from fuselog.replay.engine.streams.failures import Failure, reason_stream
+from fuselog.replay.engine.streams.measurements import PLANE, read_fixes, read_vectors
+from fuselog.replay.engine.streams.results import (
     InnovationColumns,
     failures_by_run,
     innovation_stream,
     state_stream,
 )
-from replay.engine.vectors.components import Components, components_of
-from replay.estimators.vehicles.association import MISSED, Scanning
-from replay.estimators.vehicles.updates import (
+from fuselog.replay.engine.vectors.components import Components, components_of
+from fuselog.replay.estimators.vehicles.association import MISSED, Scanning
+from fuselog.replay.estimators.vehicles.updates import (
     FIXES,
     Associated,
     Setup,
@@ -45,7 +45,7 @@ from replay.estimators.vehicles.updates import (
     update_by_topology,
     where,
 )
-from replay.estimators.vehicles.vehicles import POSE, STATES, Joint, Motion, predict
+from fuselog.replay.estimators.vehicles.vehicles import POSE, STATES, Joint, Motion, predict
 
 POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
 FAILED = "the estimate is no longer finite"
@@ -196,7 +196,7 @@ def start(setup: Setup, given: Given[Any]) -> VehiclesState:
 
 
 def run(setup: Setup, carried: VehiclesState, block: Block) -> tuple[VehiclesState, list[Ragged]]:
-    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    """Filter a block; see `fuselog.replay.engine.api.functions.recursive`."""
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
     before = carried.failed

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Floats
 
 Numbers = NDArray  # real or complex
 

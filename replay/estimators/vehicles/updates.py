@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.estimators.vehicles.association import (
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.estimators.vehicles.association import (
     MISSED,
     Hypotheses,
     Scanning,
@@ -17,15 +17,15 @@ from replay.estimators.vehicles.association import (
     best_maps,
     log_likelihoods,
 )
-from replay.estimators.vehicles.registration import fitted_pose, is_spread, register
-from replay.estimators.vehicles.symmetric_sums import (
+from fuselog.replay.estimators.vehicles.registration import fitted_pose, is_spread, register
+from fuselog.replay.estimators.vehicles.symmetric_sums import (
     power_sums,
     power_sums_at,
     product_sums,
     product_sums_at,
     update_root,
 )
-from replay.estimators.vehicles.vehicles import (
+from fuselog.replay.estimators.vehicles.vehicles import (
     POSE,
     STATES,
     Joint,

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.models.vehicles import into_frame, noise_moments, turn
-from replay.distributions import chi2
-from replay.engine.arrays import Floats, Integers
-from replay.estimators.vehicles.association import Hypotheses
+from fuselog.recorders.models.vehicles import into_frame, noise_moments, turn
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.estimators.vehicles.association import Hypotheses
 
 STATES = 4  # of a vehicle
 POSE = 3  # components of the sensor's pose

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, open_log, read_streams, schemas
-from recorders.log.streams import empty_stream, make_stream
-from recorders.trajectories import read_trajectory
-from replay.engine.vectors.components import Components, stated_components
-from replay.engine.vectors.tangent import tangent_components
-from replay.judging.errors.trajectory_streams import estimates_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, open_log, read_streams, schemas
+from fuselog.recorders.log.streams import empty_stream, make_stream
+from fuselog.recorders.trajectories import read_trajectory
+from fuselog.replay.engine.vectors.components import Components, stated_components
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.judging.errors.trajectory_streams import estimates_of
 
 MAGIC = b"\x89MCAP0"
 KEPT = (schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name)

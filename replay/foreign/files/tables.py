@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from recorders.log import Stream
+from fuselog.recorders.log import Stream
 
 
 def write_tables(folder: Path, streams: Sequence[Stream]) -> None:

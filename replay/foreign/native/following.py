@@ -6,22 +6,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers, varying
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import copied, filled_rows
-from replay.engine.streams.results import ALL_WELL
-from replay.foreign.description import Description
-from replay.foreign.native.calls import INNOVATION, PREDICT, START, STATE, TAKE
-from replay.foreign.native.library import NOTHING, REJECTED, WELL, Addresses, Library
-from replay.foreign.results import Results
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers, varying
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import copied, filled_rows
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.foreign.description import Description
+from fuselog.replay.foreign.native.calls import INNOVATION, PREDICT, START, STATE, TAKE
+from fuselog.replay.foreign.native.library import NOTHING, REJECTED, WELL, Addresses, Library
+from fuselog.replay.foreign.results import Results
+from fuselog.replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     Innovation,
     drop_missing,
     no_innovation,
     whiten,
 )
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, fault_of, filled
+from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations, fault_of, filled
 
 # What fails whatever the filter is; a status s of the filter's own counts on from there.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 VERSION = 1
 HEADER = Path(__file__).with_name("fuselog_filter.h")

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Function, Integers, varying
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Ragged, join
-from replay.engine.streams.results import ALL_WELL
-from replay.foreign.description import Description
-from replay.foreign.native.calls import COPY, DESTROY
-from replay.foreign.native.following import (
+from fuselog.replay.engine.arrays import Function, Integers, varying
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Ragged, join
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.foreign.description import Description
+from fuselog.replay.foreign.native.calls import COPY, DESTROY
+from fuselog.replay.foreign.native.following import (
     NOBODY,
     NOT_COPIED,
     Filters,
@@ -31,11 +31,11 @@ from replay.foreign.native.following import (
     copies_of,
     work_of,
 )
-from replay.foreign.native.library import Library
-from replay.foreign.results import Results
-from replay.inference.linear_algebra.gaussian import Innovation
-from replay.inference.run.out_of_sequence import rewound
-from replay.inference.run.recursion import FilterEvents
+from fuselog.replay.foreign.native.library import Library
+from fuselog.replay.foreign.results import Results
+from fuselog.replay.inference.linear_algebra.gaussian import Innovation
+from fuselog.replay.inference.run.out_of_sequence import rewound
+from fuselog.replay.inference.run.recursion import FilterEvents
 
 
 @varying(1)

@@ -15,19 +15,19 @@ from typing import Any, NamedTuple, TypeVar
 
 import psutil
 
-from recorders.atomic import scratch_folder
-from recorders.errors import BadInput
-from recorders.processes import start_module
-from replay.engine.compiling.compile import core_count
-from replay.engine.streams.blocks import copied
-from replay.engine.streams.failures import Failure
-from replay.foreign.description import Description, ForeignParameters
-from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
-from replay.foreign.native.library import Library
-from replay.foreign.processes.orphans import GUARD, family, kill_family
-from replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
-from replay.foreign.processes.worker import IDLE
-from replay.foreign.results import begun, results
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.processes import start_module
+from fuselog.replay.engine.compiling.compile import core_count
+from fuselog.replay.engine.streams.blocks import copied
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.foreign.description import Description, ForeignParameters
+from fuselog.replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
+from fuselog.replay.foreign.native.library import Library
+from fuselog.replay.foreign.processes.orphans import GUARD, family, kill_family
+from fuselog.replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
+from fuselog.replay.foreign.processes.worker import IDLE
+from fuselog.replay.foreign.results import begun, results
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -109,7 +109,7 @@ class Worker:
     """Represents a process that takes runs through filters of libraries, one after another."""
 
     def __init__(self) -> None:
-        self._process = start_module("replay.foreign.processes.worker", stdout=subprocess.PIPE)
+        self._process = start_module("fuselog.replay.foreign.processes.worker", stdout=subprocess.PIPE)
         GUARD.tell(self._process.pid)
         self.is_over = False
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()

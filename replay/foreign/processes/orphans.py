@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from recorders.processes import start_module
+from fuselog.recorders.processes import start_module
 
 
 def family(process: psutil.Process) -> list[psutil.Process]:

@@ -7,10 +7,10 @@ from contextlib import suppress
 
 import psutil
 
-from recorders.errors import BadInput, printable
-from recorders.processes import users_environment
-from replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
-from replay.foreign.processes.orphans import GUARD
+from fuselog.recorders.errors import BadInput, printable
+from fuselog.recorders.processes import users_environment
+from fuselog.replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
+from fuselog.replay.foreign.processes.orphans import GUARD
 
 TAIL_BYTES = 300  # of what a program says on standard error
 

@@ -26,12 +26,18 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from recorders.errors import BadInput, printable
-from replay.engine.compiling.compile import core_count
-from replay.engine.streams.failures import Failure
-from replay.foreign.description import Description, read_description
-from replay.foreign.native.following import INNOVATION_UNSOUND, OWN, followed, offsets_of, reason_of_code
-from replay.foreign.processes.isolation import (
+from fuselog.recorders.errors import BadInput, printable
+from fuselog.replay.engine.compiling.compile import core_count
+from fuselog.replay.engine.streams.failures import Failure
+from fuselog.replay.foreign.description import Description, read_description
+from fuselog.replay.foreign.native.following import (
+    INNOVATION_UNSOUND,
+    OWN,
+    followed,
+    offsets_of,
+    reason_of_code,
+)
+from fuselog.replay.foreign.processes.isolation import (
     LOOKS_S,
     STARTS_S,
     Ended,
@@ -41,9 +47,9 @@ from replay.foreign.processes.isolation import (
     failure_at,
     in_threads,
 )
-from replay.foreign.processes.process import Program
-from replay.foreign.processes.tasks import RunGiven, sizes_of
-from replay.foreign.results import Results, begun, fill_squares, results
+from fuselog.replay.foreign.processes.process import Program
+from fuselog.replay.foreign.processes.tasks import RunGiven, sizes_of
+from fuselog.replay.foreign.results import Results, begun, fill_squares, results
 
 MOST_BYTES = 16 << 20  # of a frame
 _REPLY, _HEAD = struct.Struct("<IiB"), struct.Struct("<I")

@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import of_runs
-from replay.engine.streams.results import ALL_WELL
-from replay.foreign.description import Description, read_description
-from replay.foreign.native.following import (
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import of_runs
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.foreign.description import Description, read_description
+from fuselog.replay.foreign.native.following import (
     Static,
     filters_of,
     follow_all,
     offsets_of,
 )
-from replay.foreign.native.library import Library
-from replay.foreign.native.out_of_sequence import follow_all_as_arrived
-from replay.foreign.results import Results, Sizes, begun, in_file, results
-from replay.inference.run.recursion import FilterEvents
-from replay.inference.run.timing import select_events
+from fuselog.replay.foreign.native.library import Library
+from fuselog.replay.foreign.native.out_of_sequence import follow_all_as_arrived
+from fuselog.replay.foreign.results import Results, Sizes, begun, in_file, results
+from fuselog.replay.inference.run.recursion import FilterEvents
+from fuselog.replay.inference.run.timing import select_events
 
 LOADING = -1  # the progress of a process that has not begun
 IN_ORDER = -1  # the window of a run whose messages come in the order of their stamps

@@ -11,8 +11,8 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from recorders.errors import BadInput
-from replay.foreign.native.library import Library
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.foreign.native.library import Library
 
 IDLE_S = 5.0  # after so long without work it ends
 IDLE = 86  # the exit code then
@@ -65,7 +65,7 @@ def _describe(task: dict[str, Any]) -> dict[str, Any]:
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
     """Take one run through its filter; see `isolation.follow_apart`."""
-    from replay.foreign.processes.tasks import (
+    from fuselog.replay.foreign.processes.tasks import (
         follow_task,
     )  # NumPy and the compiler, which describing needs not
 

@@ -19,10 +19,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recorders.errors import BadInput, choices
-from replay.engine.arrays import Floats, Function
-from replay.engine.compiling.compile import compiled
-from replay.inference.association.clusters import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.replay.inference.association.clusters import (
     NONE,
     AssociationMemory,
     Weights,

@@ -5,24 +5,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Function
-from replay.inference.association.scanning import (
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.inference.association.scanning import (
     ScanMemory,
     correlating,
 )
-from replay.inference.association.scans import Scans, ScanSensor
-from replay.inference.association.track_management import MANAGEMENTS
-from replay.inference.association.tracker import (
+from fuselog.replay.inference.association.scans import Scans, ScanSensor
+from fuselog.replay.inference.association.track_management import MANAGEMENTS
+from fuselog.replay.inference.association.tracker import (
     Newborn,
     Tracker,
     choosing,
     corner_of,
     place_of,
 )
-from replay.inference.association.tracks import NEVER, Tracks, are_near, drop, expected
-from replay.inference.kalman.predict import nothing
-from replay.inference.linear_algebra.gaussian import copy_gaussian
-from replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.association.tracks import NEVER, Tracks, are_near, drop, expected
+from fuselog.replay.inference.kalman.predict import nothing
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 
 
 class Births(NamedTuple):

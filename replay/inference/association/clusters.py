@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers, varying
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, varying
 
 # Clusters in which both tracks and detections are more than this are left to belief propagation.
 MOST_ENUMERATED = 12

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers, varying
-from replay.inference.association.scanning import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers, varying
+from fuselog.replay.inference.association.scanning import (
     ScanMemory,
 )
-from replay.inference.association.scans import Scans, take_scans
-from replay.inference.association.tracker import believing, moving
-from replay.inference.association.tracks import NEVER, Tracks
-from replay.inference.linear_algebra.gaussian import copy_gaussian
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.association.scans import Scans, take_scans
+from fuselog.replay.inference.association.tracker import believing, moving
+from fuselog.replay.inference.association.tracks import NEVER, Tracks
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
+from fuselog.replay.inference.model.stage import Stage
 
 
 @varying(2)

@@ -20,19 +20,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.models.states import PLANE_MOTION
-from replay.engine.arrays import Booleans, Floats, Function, Integers, varying
-from replay.inference.association.clusters import AssociationMemory, Weights, memory_for
-from replay.inference.association.scans import Scans, ScanSensor
-from replay.inference.association.shared_bias import Pool, pool_of
-from replay.inference.association.tracks import Tracks
-from replay.inference.kalman.steps import Workspace, workspace
-from replay.inference.kalman.update import sensor_derivative
-from replay.inference.linear_algebra.gaussian import Innovation, kalman_step, whiten, wrap
-from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.corrections import correcting, sloping
-from replay.inference.model.model import Model, Sensor
-from replay.inference.model.stage import Stage, traced_sensor
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers, varying
+from fuselog.replay.inference.association.clusters import AssociationMemory, Weights, memory_for
+from fuselog.replay.inference.association.scans import Scans, ScanSensor
+from fuselog.replay.inference.association.shared_bias import Pool, pool_of
+from fuselog.replay.inference.association.tracks import Tracks
+from fuselog.replay.inference.kalman.steps import Workspace, workspace
+from fuselog.replay.inference.kalman.update import sensor_derivative
+from fuselog.replay.inference.linear_algebra.gaussian import Innovation, kalman_step, whiten, wrap
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.stage import Stage, traced_sensor
 
 
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
@@ -40,7 +40,7 @@ class ScanMemory(NamedTuple):
     """Holds what one core works in; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
-        motion: of the motion of tracks, see `replay.inference.kalman.steps.Steps`.
+        motion: of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
         step: of the derivatives of sensors.
         pool: of what all tracks share.
         place: (detections, 2), those of a scan, joined.
@@ -52,7 +52,7 @@ class ScanMemory(NamedTuple):
         detectable: (tracks,), how probable each track's detection is.
         white: (tracks, modes, detections, 2), whitened innovations.
         likelihood: (tracks, modes, detections), of a mode and, in it, a detection; relative to clutter.
-        weights, probability, association: see `replay.inference.association.association`.
+        weights, probability, association: see `fuselog.replay.inference.association.association`.
         is_free: (detections,), outside all gates; left: (detections,), how probably of no track.
         given: (1 + detections,), a track's associations in one mode.
         after: (modes,), how probable each mode of a track is after them.

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Schema
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.vectors.components import Components
+from fuselog.recorders.log import Schema
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.vectors.components import Components
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, varying
-from replay.inference.association.tracks import Tracks
-from replay.inference.linear_algebra.gaussian import invert
+from fuselog.replay.engine.arrays import Booleans, Floats, varying
+from fuselog.replay.inference.association.tracks import Tracks
+from fuselog.replay.inference.linear_algebra.gaussian import invert
 
 
 @varying(0, is_updated=1)

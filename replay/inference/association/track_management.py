@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.association.association import existence_after
-from replay.inference.association.clusters import Weights
-from replay.inference.association.tracks import Tracks
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.association.association import existence_after
+from fuselog.replay.inference.association.clusters import Weights
+from fuselog.replay.inference.association.tracks import Tracks
 
 # A miss says nothing of a young track where the sensor detects less than every second target.
 CHANCE = 0.5
@@ -41,7 +41,7 @@ class Evidence(NamedTuple):
     Attributes:
         detectable: how probable its detection in the gate is, if the target exists.
         probability: (1 + detections,), of no detection and of each, see
-            `replay.inference.association.association`.
+            `fuselog.replay.inference.association.association`.
         weights: of all tracks.
     """
 

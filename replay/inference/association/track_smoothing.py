@@ -1,7 +1,7 @@
 """Smooths tracks backwards: each estimate of a track, given later detections too.
 
 Which detections are a track's stays as the tracker found it; given that, its states are a chain of
-Gaussians that one motion ties together, and `replay.inference.smoothing.backward_pass` goes back over
+Gaussians that one motion ties together, and `fuselog.replay.inference.smoothing.backward_pass` goes back over
 them.
 """
 
@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Integers
-from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import (
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.recursion import Estimates
+from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
     Piece,

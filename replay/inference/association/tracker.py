@@ -2,17 +2,17 @@
 
 from typing import Any, NamedTuple
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.tangent import tangent_components
-from replay.inference.association.scans import ScanSensor
-from replay.inference.association.tracks import Tracks
-from replay.inference.kalman.predict import linear_motion
-from replay.inference.kalman.steps import Gaussian, Steps, gaussian_filter
-from replay.inference.linear_algebra.tuples import range_of
-from replay.inference.model.model import Model
-from replay.inference.model.stage import Stage
-from replay.inference.modes.imm import interacting_steps
-from replay.inference.modes.mixture import ModeBelief
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.association.scans import ScanSensor
+from fuselog.replay.inference.association.tracks import Tracks
+from fuselog.replay.inference.kalman.predict import linear_motion
+from fuselog.replay.inference.kalman.steps import Gaussian, Steps, gaussian_filter
+from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.modes.imm import interacting_steps
+from fuselog.replay.inference.modes.mixture import ModeBelief
 
 
 class Tracker(NamedTuple):
@@ -24,7 +24,7 @@ class Tracker(NamedTuple):
         association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
         names: the parameters that the parts read, in the order of the columns of the settings.
         shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
-            `replay.inference.association.shared_bias`.
+            `fuselog.replay.inference.association.shared_bias`.
     """
 
     stage: Stage

@@ -1,7 +1,7 @@
 """Tracks many targets: predicts, associates, updates, begins and ends tracks scan by scan.
 
 A model's motion moves every track, that of each mode where it has several (an IMM inside); sensors say
-what a scan measures of a track (see `replay.inference.association.scanning`); an association says how
+what a scan measures of a track (see `fuselog.replay.inference.association.scanning`); an association says how
 probable it is that each track has each detection (`association`); what is left over may begin tracks;
 and a management says which tracks are those of targets, and which end (`track_management`).
 """
@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.association.association import ASSOCIATIONS
-from replay.inference.association.births import beginning, births_of, ending
-from replay.inference.association.outputs import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.association.association import ASSOCIATIONS
+from fuselog.replay.inference.association.births import beginning, births_of, ending
+from fuselog.replay.inference.association.outputs import (
     TrackOutputs,
     blank_outputs,
     writing_pairs,
     writing_tracks,
 )
-from replay.inference.association.scanning import (
+from fuselog.replay.inference.association.scanning import (
     ScanMemory,
     comparing,
     join_near,
@@ -33,21 +33,21 @@ from replay.inference.association.scanning import (
     target_of,
     updating,
 )
-from replay.inference.association.scans import BY_SCAN, Scans
-from replay.inference.association.shared_bias import pool_errors
-from replay.inference.association.track_management import MANAGEMENTS, Evidence
-from replay.inference.association.tracker import (
+from fuselog.replay.inference.association.scans import BY_SCAN, Scans
+from fuselog.replay.inference.association.shared_bias import pool_errors
+from fuselog.replay.inference.association.track_management import MANAGEMENTS, Evidence
+from fuselog.replay.inference.association.tracker import (
     Newborn,
     Tracker,
     believing,
     choosing,
     moving,
 )
-from replay.inference.association.tracks import NEVER, Tracks
-from replay.inference.kalman.steps import UNKNOWN, Interval
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.settings import reading_settings
-from replay.inference.run.loops import over_events
+from fuselog.replay.inference.association.tracks import NEVER, Tracks
+from fuselog.replay.inference.kalman.steps import UNKNOWN, Interval
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.run.loops import over_events
 
 
 class ScanInputs(NamedTuple):
@@ -59,7 +59,7 @@ class ScanInputs(NamedTuple):
 
 
 def tracking(tracker: Tracker, read: Function) -> Function:
-    """Make the loop over the scans of one run, for `replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over the scans of one run, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """

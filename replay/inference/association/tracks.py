@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers, varying
-from replay.inference.linear_algebra.gaussian import copy_gaussian
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, varying
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
 
 NEVER = -1
 
@@ -29,7 +29,7 @@ class Tracks(NamedTuple):
         seen_ns: (runs, places), when a sensor that begins tracks saw it last.
         updated_ns: (runs, places, sensors), when each sensor updated it last.
         shared_mean, shared_covariance: (runs, ...), of what all share:
-            `replay.inference.association.shared_bias`.
+            `fuselog.replay.inference.association.shared_bias`.
     """
 
     used: Integers

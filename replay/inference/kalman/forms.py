@@ -1,18 +1,18 @@
 """Puts the extended filter and those of samples together of the parts of one form.
 
 What a filter carries is a mean and what stands for its covariance, see `Form`. Plain filters carry the
-covariance itself; the parts of square-root forms are in `replay.inference.kalman.square_root`.
+covariance itself; the parts of square-root forms are in `fuselog.replay.inference.kalman.square_root`.
 """
 
 from typing import Any, NamedTuple
 
-from replay.engine.arrays import Function
-from replay.inference.kalman.predict import linear_motion
-from replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
-from replay.inference.kalman.steps import Steps, Workspace, gaussian_filter, keeping, workspace
-from replay.inference.kalman.update import kalman_update, linear_sensor
-from replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from replay.inference.model.stage import Stage
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.inference.kalman.predict import linear_motion
+from fuselog.replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
+from fuselog.replay.inference.kalman.steps import Steps, Workspace, gaussian_filter, keeping, workspace
+from fuselog.replay.inference.kalman.update import kalman_update, linear_sensor
+from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from fuselog.replay.inference.model.stage import Stage
 
 
 class Parts(NamedTuple):

@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
     Measurement,
     Workspace,
 )
-from replay.inference.kalman.update import (
+from fuselog.replay.inference.kalman.update import (
     is_unmeasured,
     linear_innovation,
     message_layout,
@@ -21,16 +21,16 @@ from replay.inference.kalman.update import (
     write_numbers,
     writing_innovation,
 )
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.linear_algebra.gaussian import (
     downdate,
     drop_missing,
     kalman_step,
     whiten,
 )
-from replay.inference.linear_algebra.inflation import inflate, inflation
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.corrections import correcting, relinearising, sloping
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.corrections import correcting, relinearising, sloping
+from fuselog.replay.inference.model.stage import Stage
 
 ITERATIONS = 50
 SETTLED = 1e-12  # the largest component of the last step

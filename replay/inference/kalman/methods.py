@@ -13,29 +13,35 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
-from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build
-from replay.engine.arrays import Floats, Function
-from replay.inference.kalman.forms import extended, sampled
-from replay.inference.kalman.iterated_update import iterated_update
-from replay.inference.kalman.predict import linear_motion, motion_noise
-from replay.inference.kalman.square_root import FACTORED
-from replay.inference.kalman.steps import Interval, Measurement, Steps, Workspace, gaussian_filter
-from replay.inference.kalman.update import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import Parameters, build
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.kalman.forms import extended, sampled
+from fuselog.replay.inference.kalman.iterated_update import iterated_update
+from fuselog.replay.inference.kalman.predict import linear_motion, motion_noise
+from fuselog.replay.inference.kalman.square_root import FACTORED
+from fuselog.replay.inference.kalman.steps import (
+    Interval,
+    Measurement,
+    Steps,
+    Workspace,
+    gaussian_filter,
+)
+from fuselog.replay.inference.kalman.update import (
     kalman_update,
     linear_sensor,
     message_layout,
     residual_of,
     sensor_derivative,
 )
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.model import Model
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import trial_parameters
-from replay.inference.model.stage import Stage, traced_sensor
-from replay.inference.model.validation import trial_state
-from replay.sampling import parse_sampling
-from replay.sampling.names import Sampling, Unscented
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import trial_parameters
+from fuselog.replay.inference.model.stage import Stage, traced_sensor
+from fuselog.replay.inference.model.validation import trial_state
+from fuselog.replay.sampling import parse_sampling
+from fuselog.replay.sampling.names import Sampling, Unscented
 
 
 def _as_list(value: object) -> object:
@@ -115,7 +121,7 @@ class Method:
         variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
         made_for: what the method is with these parameters, where they choose among several; raises
             BadInput where they name none.
-        filtering: what goes through a log, where that is no `replay.inference.run.filtering.Filter`.
+        filtering: what goes through a log, where that is no `fuselog.replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
         is_random: whether it draws random numbers, beside those of its samples.
     """

@@ -2,14 +2,18 @@
 
 from typing import Any
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.kalman.steps import Interval, Workspace
-from replay.inference.linear_algebra.gaussian import add_through
-from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
-from replay.inference.linear_algebra.sparse import adding_through, pattern_of, propagating_covariance
-from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
-from replay.inference.model.model import Model, Motion
-from replay.inference.model.stage import Stage
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.kalman.steps import Interval, Workspace
+from fuselog.replay.inference.linear_algebra.gaussian import add_through
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative, known_entries
+from fuselog.replay.inference.linear_algebra.sparse import (
+    adding_through,
+    pattern_of,
+    propagating_covariance,
+)
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.model import Model, Motion
+from fuselog.replay.inference.model.stage import Stage
 
 
 def linear_motion(stage: Stage) -> Function:

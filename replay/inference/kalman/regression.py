@@ -3,7 +3,7 @@
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
 (24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
 vectors, and means are intrinsic: the weighted differences from them sum to zero. Where an angle is
-hardly known, samples are taken nearer to the mean: see `replay.inference.kalman.wide_angles`.
+hardly known, samples are taken nearer to the mean: see `fuselog.replay.inference.kalman.wide_angles`.
 """
 
 from collections.abc import Sequence
@@ -12,24 +12,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, varying
-from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
-from replay.inference.kalman.steps import Interval, Measurement, Workspace
-from replay.inference.kalman.update import message_layout, residual_of, sensor_noise
-from replay.inference.kalman.wide_angles import narrowing, turning, unsuspected_rad, widen
-from replay.inference.linear_algebra.gaussian import cholesky
-from replay.inference.linear_algebra.manifold import (
+from fuselog.replay.engine.arrays import Floats, Function, varying
+from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
+from fuselog.replay.inference.kalman.steps import Interval, Measurement, Workspace
+from fuselog.replay.inference.kalman.update import message_layout, residual_of, sensor_noise
+from fuselog.replay.inference.kalman.wide_angles import narrowing, turning, unsuspected_rad, widen
+from fuselog.replay.inference.linear_algebra.gaussian import cholesky
+from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
     is_flat,
     recentring,
     tangent_size,
 )
-from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
-from replay.inference.linear_algebra.tuples import filling, tuple_of
-from replay.inference.model.model import Motion, Sensor
-from replay.inference.model.stage import Stage
-from replay.sampling.sets import SampleSets
+from fuselog.replay.inference.linear_algebra.moments import (
+    lower_of,
+    moments_of,
+    offset_of,
+    weighted_mean_of,
+)
+from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.model import Motion, Sensor
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.sampling.sets import SampleSets
 
 MEANS = 30  # at most so many steps to an intrinsic mean
 
@@ -39,7 +44,7 @@ class SampleMemory(NamedTuple):
     """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
-        points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
+        points, weights, first, stride: see `fuselog.replay.sampling.sets.SampleSets`.
         unsuspected: the standard deviation up to which angles are no matter, see `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) the samples' tangent vectors from the mean.

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.forms import Parts
-from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
-from replay.inference.kalman.regression import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.forms import Parts
+from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
+from fuselog.replay.inference.kalman.regression import (
     measured_with_noise,
     moved_with_noise,
     no_variances,
     sampling,
 )
-from replay.inference.kalman.steps import (
+from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
@@ -31,7 +31,7 @@ from replay.inference.kalman.steps import (
     Measurement,
     Workspace,
 )
-from replay.inference.kalman.update import (
+from fuselog.replay.inference.kalman.update import (
     is_unmeasured,
     message_layout,
     residual_of,
@@ -40,12 +40,12 @@ from replay.inference.kalman.update import (
     write_numbers,
     writing_innovation,
 )
-from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
-from replay.inference.linear_algebra.gaussian import fill_identity, whiten_by
-from replay.inference.linear_algebra.inflation import inflation
-from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
-from replay.inference.model.corrections import correcting, sloping
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
+from fuselog.replay.inference.linear_algebra.gaussian import fill_identity, whiten_by
+from fuselog.replay.inference.linear_algebra.inflation import inflation
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.stage import Stage
 
 Into = tuple[Floats, Floats]  # rows, and the weights of their columns
 
@@ -165,7 +165,7 @@ def _sampled_motion(stage: Stage, samples: int) -> Function:
 def _updating(
     stage: Stage, number: int, spread: Function, add_noise: Function, samples: int = -1
 ) -> Function:
-    """Make the update by sensor `number`; see `replay.inference.kalman.update.kalman_update`.
+    """Make the update by sensor `number`; see `fuselog.replay.inference.kalman.update.kalman_update`.
 
     A component that is missing counts as one of a noise of its own, which is as predicted.
     """

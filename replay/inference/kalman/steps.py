@@ -1,7 +1,7 @@
 """Defines the steps of a recursive filter, which methods make for one model, and their memory.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
-`linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.
+`linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by moments that the model knows.
 All work in one workspace, and the Kalman update after them is the same (`update.kalman_update`).
 """
 
@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     copy_gaussian,
     no_innovation,
 )
-from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from fuselog.replay.inference.model.stage import Stage
 
 FAILURES = (
     "the covariance is no longer positive definite",
@@ -125,7 +125,7 @@ class Workspace(NamedTuple):
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
         step, turned, slope: (t,), the correction of the state, and along what it bends.
         innovations: one for each sensor.
-        samples: what `replay.inference.kalman.regression` works in, motion first, one for each of
+        samples: what `fuselog.replay.inference.kalman.regression` works in, motion first, one for each of
             `sampled`.
     """
 

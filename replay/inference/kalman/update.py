@@ -4,17 +4,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
     Measurement,
     Workspace,
 )
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     Innovation,
     add_through,
@@ -24,13 +24,13 @@ from replay.inference.linear_algebra.gaussian import (
     whiten,
     wrap,
 )
-from replay.inference.linear_algebra.inflation import inflate, inflation
-from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
-from replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
-from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
-from replay.inference.model.corrections import correcting, sloping
-from replay.inference.model.model import Model, Sensor
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative, known_entries
+from fuselog.replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.stage import Stage
 
 
 class MessageLayout(NamedTuple):

@@ -34,8 +34,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.manifold import manifold_blocks
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
 
 WIDE_RAD = 1.0  # a standard deviation, up to which samples within half a turn are taken as they are
 UNIFORM_RAD = np.pi / np.sqrt(3.0)

@@ -1,14 +1,14 @@
 """Says what a filter can carry for a covariance: the contract of beliefs between methods.
 
 A belief is a mean (n,) and a matrix (t, t) that stands for its covariance P: P itself (`COVARIANCES`),
-or its lower Cholesky factor (`replay.inference.linear_algebra.factors.FACTORS`). A filter's own steps
+or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). A filter's own steps
 predict and update it; all others, such as an IMM or a smoother, know no more of it than its `Form`.
 """
 
 from typing import Any, NamedTuple
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
 
 
 class Form(NamedTuple):
@@ -24,7 +24,7 @@ class Form(NamedTuple):
             whose means are `away` (M, t), and the mixture's `shift` (t,).
         retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. Of the
             matrices before and after a prediction, and what it left in the workspace, it fills `turned`
-            with G', and `before` with P - G D', see `replay.inference.smoothing.backward_pass`.
+            with G', and `before` with P - G D', see `fuselog.replay.inference.smoothing.backward_pass`.
     """
 
     start: Function

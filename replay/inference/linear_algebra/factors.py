@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.covariances import is_positive_definite
-from replay.inference.linear_algebra.covariances import Form
-from replay.inference.linear_algebra.gaussian import multiply
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.covariances import is_positive_definite
+from fuselog.replay.inference.linear_algebra.covariances import Form
+from fuselog.replay.inference.linear_algebra.gaussian import multiply
 
 ROUNDING = 1e-15  # of a variance, for each component that others determine
 NOTHING_LEFT = 1e-28  # a row's square beside what it was: rounding, of a row that others determine

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats
 
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
 

@@ -1,6 +1,6 @@
 """Takes derivatives of a model's functions between the tangent spaces of their arguments and results.
 
-A function is traced (`replay.tracing`), and the exact derivatives of its graph are what a kernel fills
+A function is traced (`fuselog.replay.tracing`), and the exact derivatives of its graph are what a kernel fills
 into the arrays of its workspace.
 """
 
@@ -8,13 +8,13 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from replay.engine.arrays import Function
-from replay.engine.vectors.tangent import WIDTHS
-from replay.inference.linear_algebra.manifold import manifold_blocks, tangent_size
-from replay.inference.linear_algebra.tuples import range_of
-from replay.tracing.functions import Derivative, TracedFunction
-from replay.tracing.graph import Node
-from replay.tracing.traced import Trace
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.vectors.tangent import WIDTHS
+from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks, tangent_size
+from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.tracing.functions import Derivative, TracedFunction
+from fuselog.replay.tracing.graph import Node
+from fuselog.replay.tracing.traced import Trace
 
 # Hamilton's product of the units: e_i e_j = sign * e_k, as rows k of (i, j, sign).
 _PRODUCT = (

@@ -1,6 +1,6 @@
 """Moves and compares states on their manifold: boxplus, boxminus, and the right Jacobian.
 
-Kinds and tangent space as in `replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
+Kinds and tangent space as in `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
 rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i
 angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called boxplus and the
 difference of two states boxminus; Sola, arXiv 1711.02508.
@@ -11,9 +11,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from recorders.models.planar import wrap_angle
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
 
 Quaternion = tuple[float, float, float, float]
 SETTLED = 1e-15  # rad: a mean of rotations that moves by less is found

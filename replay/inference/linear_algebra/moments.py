@@ -6,8 +6,8 @@ of a tuple that changes wherever its name stands, so that such a tuple is gone t
 
 from functools import lru_cache
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.tuples import total
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.tuples import total
 
 Numbers = tuple[float, ...]
 REGISTERS = 32  # of a processor: sums beyond these are kept in memory

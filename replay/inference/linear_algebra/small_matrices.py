@@ -1,6 +1,6 @@
 """Offers linear algebra of a few components to estimators of one's own: scalar loops, in place.
 
-They are called from a compiled `follow` (see `replay.engine.api.functions.recursive`) and make no
+They are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`) and make no
 arrays: what they work in is made there once, before the loop over the messages. Covariances stay
 symmetric. A Kalman filter of x' = F x + w and z = H x + v is
 
@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
     downdate,

@@ -7,8 +7,8 @@ itself where it is known. What is left out are products with zero: sums keep the
 from collections.abc import Mapping
 from typing import Any
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.gaussian import (
     add_through,
     measured_covariance,
     propagate_covariance,

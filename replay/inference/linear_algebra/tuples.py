@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
-from replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Function
 
 
 def range_of(start: int, end: int | None = None) -> tuple[int, ...]:

@@ -3,8 +3,8 @@
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
 has the parameter's value for a mean, and stands beside the log's; between measurements it moves as
-`replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the points of
-a map are added in the same way, see `replay.inference.model.point_errors`.
+`fuselog.replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the points of
+a map are added in the same way, see `fuselog.replay.inference.model.point_errors`.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,22 +14,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput, choices
-from recorders.parameters import field_of
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.priors import gaussians
-from replay.engine.streams.results import gaussian_stream
-from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import field_of
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.priors import gaussians
+from fuselog.replay.engine.streams.results import gaussian_stream
+from fuselog.replay.inference.model.corrections import correcting_more
+from fuselog.replay.inference.model.gauss_markov import (
     GaussMarkov,
     added_variance,
     remaining_share,
     with_gauss_markov_parameters,
 )
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.point_errors import (
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import number_fields, settings_type
+from fuselog.replay.inference.model.point_errors import (
     Errors,
     PointError,
     motion_with_errors,
@@ -37,9 +37,9 @@ from replay.inference.model.point_errors import (
     sensor_with_errors,
     with_point_errors,
 )
-from replay.inference.model.settings import TracedParameters
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import trial_state
+from fuselog.replay.inference.model.settings import TracedParameters
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]
@@ -128,7 +128,7 @@ def check_augmentable(where: str, model: Model) -> None:
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
     """Add parameters and errors to a model's state; the model itself where there are none.
 
-    >>> from replay.estimators.models.landmarks import ROBOT
+    >>> from fuselog.replay.estimators.models.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
     ['x_m', 'y_m', 'heading_rad', 'bias_range_m']
     """

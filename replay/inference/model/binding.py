@@ -8,14 +8,14 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import takewhile
 from typing import NamedTuple
 
-from recorders.errors import BadInput, choices
-from recorders.log import Schema, Topic, schemas
-from recorders.log.planes import FRAME, frame_of, plane_in_words, stated_in
-from replay.engine.arrays import Floats
-from replay.engine.streams.channels import resolved
-from replay.engine.streams.geodetic import GEODETIC, stated_origin
-from replay.engine.streams.results import named
-from replay.inference.model.model import (
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import Schema, Topic, schemas
+from fuselog.recorders.log.planes import FRAME, frame_of, plane_in_words, stated_in
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.channels import resolved
+from fuselog.replay.engine.streams.geodetic import GEODETIC, stated_origin
+from fuselog.replay.engine.streams.results import named
+from fuselog.replay.inference.model.model import (
     Control,
     Model,
     Sensor,
@@ -33,7 +33,7 @@ class Found(NamedTuple):
         truth: the topic that estimates are compared with.
         control: what drives the motion.
         sensors: those that the log has.
-        has_prior: whether the log does; else see `replay.inference.run.initialization`.
+        has_prior: whether the log does; else see `fuselog.replay.inference.run.initialization`.
         fallbacks: topics that take the place of some components of the control.
         origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
         frame: the frame of its own that its positions are in; empty where they are in the log's plane.

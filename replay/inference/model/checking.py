@@ -11,18 +11,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recorders.errors import BadInput
-from recorders.models.planar import wrap_angle
-from recorders.parameters import build
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.tangent import WIDTHS, tangent_components
-from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.manifold import boxminus, boxplus, manifold_blocks, tangent_size
-from replay.inference.linear_algebra.tuples import adding_noise
-from replay.inference.model.augmentation import check_augmentable
-from replay.inference.model.model import Correction, Model, Motion, Sensor
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.validation import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import build
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import WIDTHS, tangent_components
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
+from fuselog.replay.inference.linear_algebra.manifold import (
+    boxminus,
+    boxplus,
+    manifold_blocks,
+    tangent_size,
+)
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise
+from fuselog.replay.inference.model.augmentation import check_augmentable
+from fuselog.replay.inference.model.model import Correction, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import number_fields, settings_type
+from fuselog.replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,
@@ -30,7 +35,7 @@ from replay.inference.model.validation import (
     check_switching,
     switching_of,
 )
-from replay.tracing.functions import arguments_like, place_of, traced
+from fuselog.replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1

@@ -8,20 +8,20 @@ the state to which it leads.
 
 from typing import Any
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from replay.inference.linear_algebra.gaussian import propagate_covariance
-from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.manifold import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
+from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
     by_right_jacobian,
     is_flat,
     tangent_size,
 )
-from replay.inference.linear_algebra.tuples import filling, tuple_of
-from replay.inference.model.model import Correction, Model
-from replay.tracing.functions import traced
+from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.model import Correction, Model
+from fuselog.replay.tracing.functions import traced
 
 Kinds = tuple[str, ...]
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, create_model
 
-from replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class GaussMarkov(NamedTuple):

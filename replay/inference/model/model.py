@@ -1,7 +1,7 @@
 """Defines a model: how a state moves, and what sensors measure of it.
 
 A model is written once, as plain component-first functions: they take tuples of components and return
-tuples, and run on arrays as well. Every method (see `replay.inference.kalman.methods`) estimates the
+tuples, and run on arrays as well. Every method (see `fuselog.replay.inference.kalman.methods`) estimates the
 state of every model that gives what the method needs.
 """
 
@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
 
-from recorders.log import Schema, Stream, schemas
-from replay.engine.arrays import Floats, Function
-from replay.engine.renamed import renamed
-from replay.engine.vectors.components import Components
-from replay.inference.linear_algebra.manifold import tangent_size
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.start import Start
+from fuselog.recorders.log import Schema, Stream, schemas
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.renamed import renamed
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.inference.linear_algebra.manifold import tangent_size
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start
 
 FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
@@ -291,16 +291,16 @@ class Model:
         correct: how an update moves the state where not every component moves by itself.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         augmentable: the parameters that may become part of the state, linear or angles, see
-            `replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
+            `fuselog.replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
         calibration: the parameters that say how sensors are mounted, scaled, biased and delayed, each
             with a useful standard deviation: what is known no better counts as not determined.
         owned: by their names the parameters that single topics have, each with the topic and what it is
-            called there; see `replay.inference.model.own_parameters`.
+            called there; see `fuselog.replay.inference.model.own_parameters`.
 
     A thing on a line, whose range from the origin is measured:
 
     >>> import numpy as np
-    >>> from recorders.log import schemas
+    >>> from fuselog.recorders.log import schemas
     >>> class OnALine(ModelParameters):
     ...     sigma_m: float = 0.1
     >>> def move(state, control, duration_s, parameters):
@@ -317,10 +317,10 @@ class Model:
     >>> model.size, model.kinds
     (2, ('linear', 'linear'))
 
-    `replay.inference.model.checking.check_model` says whether the functions keep to what is declared:
+    `fuselog.replay.inference.model.checking.check_model` says whether the functions keep to what is declared:
 
     >>> from dataclasses import replace
-    >>> from replay.inference.model.checking import check_model
+    >>> from fuselog.replay.inference.model.checking import check_model
     >>> check_model(model)
     on a line: 2 functions at 20 states
     move (...): derivatives by state; angles, jumps and lengths; linear; variances

@@ -13,15 +13,15 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import create_model
 
-from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build, field_of, meanings
-from replay.engine.arrays import Function
-from replay.inference.model.binding import Found
-from replay.inference.model.model import Model, Sensor
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import TracedParameters
-from replay.inference.model.validation import trial_state
-from replay.tracing.reads import pure
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.parameters import Parameters, build, field_of, meanings
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import TracedParameters
+from fuselog.replay.inference.model.validation import trial_state
+from fuselog.replay.tracing.reads import pure
 
 Tables = Mapping[str, Mapping[str, Any]]
 
@@ -192,7 +192,7 @@ class _Own:
 def _reading(function: Function, place: int, fields: Mapping[str, str]) -> Function:
     """Make a function whose parameters, at a place of its arguments, are the topic's own.
 
-    It is seen to do the same again where the given one is; see `replay.tracing.reads`.
+    It is seen to do the same again where the given one is; see `fuselog.replay.tracing.reads`.
     """
     pairs = tuple(fields.items())
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, PositiveFloat
 
-from recorders.parameters import Parameters
+from fuselog.recorders.parameters import Parameters
 
 
 @cache

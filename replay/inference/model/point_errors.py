@@ -14,16 +14,16 @@ from functools import lru_cache
 from itertools import product
 from typing import Any, NamedTuple
 
-from recorders.errors import BadInput
-from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.inference.model.corrections import correcting_more
+from fuselog.replay.inference.model.gauss_markov import (
     added_variance,
     remaining_share,
     with_gauss_markov_parameters,
 )
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.settings import trial_parameters
-from replay.inference.model.validation import trial_state
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.settings import trial_parameters
+from fuselog.replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Topic
-from recorders.log.planes import ORIGIN
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.channels import stated
-from replay.inference.model.binding import Found
-from replay.inference.model.model import Model, Sensor
-from replay.inference.model.parameters import ModelParameters, number_fields, settings_type
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic
+from fuselog.recorders.log.planes import ORIGIN
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters, number_fields, settings_type
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
-from recorders.registry import available
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import number_fields
-from replay.tracing.functions import Argument, Shape, traced
+from fuselog.recorders.registry import available
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.tracing.functions import Argument, Shape, traced
 
 Part = TypeVar("Part")
 

@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from recorders.log import Stream
-from replay.engine.arrays import Floats
-from replay.engine.renamed import renamed
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.renamed import renamed
 
 
 @renamed(suspect="check_prior")

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats, Function
-from replay.engine.vectors.tangent import are_kinds
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.tracing.functions import place_of
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import are_kinds
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.tracing.functions import place_of
 
 
 def check_state(where: str, model: Model) -> None:

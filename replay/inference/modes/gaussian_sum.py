@@ -16,11 +16,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, field_validator
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.results import ALL_WELL
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, manifold_blocks
-from replay.inference.kalman.methods import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, manifold_blocks
+from fuselog.replay.inference.kalman.methods import (
     FILTERS,
     Method,
     RegressionParameters,
@@ -29,14 +29,20 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
-from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
-from replay.inference.linear_algebra.manifold import boxplus
-from replay.inference.model.model import Model
-from replay.inference.model.stage import Stage
-from replay.inference.modes.mixing import MixtureMemory, likeliest_of, mixing, mixture_memory
-from replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
-from replay.inference.run.filtering import FilterState
+from fuselog.replay.inference.kalman.steps import (
+    Gaussian,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Steps,
+)
+from fuselog.replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
+from fuselog.replay.inference.linear_algebra.manifold import boxplus
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.modes.mixing import MixtureMemory, likeliest_of, mixing, mixture_memory
+from fuselog.replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
+from fuselog.replay.inference.run.filtering import FilterState
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
 ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from pydantic import field_validator
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.blocks import Ragged, join
-from replay.inference.kalman.methods import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.blocks import Ragged, join
+from fuselog.replay.inference.kalman.methods import (
     FILTERS,
     Method,
     RegressionParameters,
@@ -32,30 +32,36 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
-from replay.inference.linear_algebra.tuples import filling
-from replay.inference.model.model import Model
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import switching_of
-from replay.inference.modes.mixing import (
+from fuselog.replay.inference.kalman.steps import (
+    Gaussian,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Steps,
+)
+from fuselog.replay.inference.linear_algebra.tuples import filling
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import switching_of
+from fuselog.replay.inference.modes.mixing import (
     InteractingMemory,
     mixing,
     mixing_weights,
     mixture_memory,
     transition_matrix,
 )
-from replay.inference.modes.mixture import (
+from fuselog.replay.inference.modes.mixture import (
     MixtureFilter,
     Mixtures,
     ModeBelief,
     mixture_update,
     predicting,
 )
-from replay.inference.modes.mode_smoothing import smoothing_memory, smoothing_over_runs
-from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import FilterEvents
+from fuselog.replay.inference.modes.mode_smoothing import smoothing_memory, smoothing_over_runs
+from fuselog.replay.inference.run.filtering import FilterState
+from fuselog.replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):

@@ -5,19 +5,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.inference.kalman.steps import InnovationRecord
-from replay.inference.kalman.update import innovation_components
-from replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from replay.inference.linear_algebra.manifold import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.inference.kalman.steps import InnovationRecord
+from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
     by_right_jacobian,
     is_flat,
     tangent_size,
 )
-from replay.inference.linear_algebra.tuples import total
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.tuples import total
+from fuselog.replay.inference.model.stage import Stage
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18

@@ -6,17 +6,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.results import ALL_WELL, named
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
-from replay.inference.kalman.update import innovation_components, writing_innovation
-from replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
-from replay.inference.linear_algebra.tuples import range_of
-from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter
-from replay.inference.run.recursion import Estimates, Innovations
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.results import ALL_WELL, named
+from fuselog.replay.inference.kalman.steps import (
+    Gaussian,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Steps,
+)
+from fuselog.replay.inference.kalman.update import innovation_components, writing_innovation
+from fuselog.replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
+from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.filtering import Filter
+from fuselog.replay.inference.run.recursion import Estimates, Innovations
 
 
 class ModeBelief(NamedTuple):

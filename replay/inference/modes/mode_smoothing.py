@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.modes.mixing import transition_matrix
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.inference.modes.mixing import transition_matrix
 
 
 class SmoothingMemory(NamedTuple):

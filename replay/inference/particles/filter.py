@@ -7,27 +7,27 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, NonNegativeInt, model_validator
 
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Integers
-from replay.engine.compiling.compile import compiled
-from replay.engine.philox import WORDS, fill_normals, run_key
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.results import ALL_WELL, named
-from replay.inference.kalman.methods import Method, MethodParameters, no_steps
-from replay.inference.kalman.steps import (
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.replay.engine.philox import WORDS, fill_normals, run_key
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.streams.results import ALL_WELL, named
+from fuselog.replay.inference.kalman.methods import Method, MethodParameters, no_steps
+from fuselog.replay.inference.kalman.steps import (
     Steps,
     workspace,
 )
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
-from replay.inference.linear_algebra.manifold import boxplus
-from replay.inference.model.model import Model, Sensor
-from replay.inference.model.settings import trial_parameters
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import trial_state
-from replay.inference.particles.particles import (
+from fuselog.replay.inference.linear_algebra.manifold import boxplus
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.settings import trial_parameters
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import trial_state
+from fuselog.replay.inference.particles.particles import (
     Cloud,
     Clouds,
     ParticleMemory,
@@ -36,11 +36,11 @@ from replay.inference.particles.particles import (
     resampling,
     summing_up,
 )
-from replay.inference.particles.progressive import kernel_of, renewing
-from replay.inference.particles.update import weighing
-from replay.inference.run.filtering import Filter, FilterState
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
-from replay.inference.run.timing import join_events, select_events
+from fuselog.replay.inference.particles.progressive import kernel_of, renewing
+from fuselog.replay.inference.particles.update import weighing
+from fuselog.replay.inference.run.filtering import Filter, FilterState
+from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from fuselog.replay.inference.run.timing import join_events, select_events
 
 MOST_PARTICLES = 1_000_000
 

@@ -11,21 +11,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.philox import Words, fill_normals, philox, unit
-from replay.inference.kalman.predict import nothing
-from replay.inference.kalman.regression import settling
-from replay.inference.kalman.steps import Gaussian, Interval, Workspace
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.philox import Words, fill_normals, philox, unit
+from fuselog.replay.inference.kalman.predict import nothing
+from fuselog.replay.inference.kalman.regression import settling
+from fuselog.replay.inference.kalman.steps import Gaussian, Interval, Workspace
+from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     semidefinite_cholesky,
 )
-from replay.inference.linear_algebra.manifold import boxminus, boxplus
-from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
-from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
-from replay.inference.model.model import Model
-from replay.inference.model.stage import Stage
-from replay.sampling.resampling import choose_systematically
+from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
+from fuselog.replay.inference.linear_algebra.moments import (
+    lower_of,
+    moments_of,
+    offset_of,
+    weighted_mean_of,
+)
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.sampling.resampling import choose_systematically
 
 
 class Cloud(NamedTuple):

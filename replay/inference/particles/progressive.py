@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.philox import WORDS, fill_normals
-from replay.inference.kalman.regression import settling
-from replay.inference.linear_algebra.gaussian import semidefinite_cholesky
-from replay.inference.linear_algebra.manifold import boxminus, boxplus
-from replay.inference.linear_algebra.moments import moments_of
-from replay.inference.model.model import Model
-from replay.inference.particles.particles import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.philox import WORDS, fill_normals
+from fuselog.replay.inference.kalman.regression import settling
+from fuselog.replay.inference.linear_algebra.gaussian import semidefinite_cholesky
+from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
+from fuselog.replay.inference.linear_algebra.moments import moments_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.particles.particles import (
     Cloud,
     Kernel,
     ParticleMemory,

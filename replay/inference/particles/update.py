@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import (
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.steps import (
     NOT_EXPLAINED,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
     Measurement,
 )
-from replay.inference.kalman.update import (
+from fuselog.replay.inference.kalman.update import (
     is_unmeasured,
     message_layout,
     residual_of,
@@ -21,19 +21,19 @@ from replay.inference.kalman.update import (
     write_numbers,
     writing_innovation,
 )
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     cholesky,
     drop_missing,
     whiten,
     wrap,
 )
-from replay.inference.linear_algebra.inflation import inflation
-from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.tuples import filling, tuple_of
-from replay.inference.model.stage import Stage
-from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory, reweigh
-from replay.inference.particles.progressive import taking_in_parts
+from fuselog.replay.inference.linear_algebra.inflation import inflation
+from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
+from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory, reweigh
+from fuselog.replay.inference.particles.progressive import taking_in_parts
 
 
 def weighing(stage: Stage, number: int, *, progressive: bool) -> Function:

@@ -8,12 +8,12 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
-from recorders.log import Stream
-from replay.engine.arrays import Floats
-from replay.engine.streams.results import gaussian_stream, named
-from replay.engine.vectors.tangent import tangent_components
-from replay.inference.model.model import Model
-from replay.inference.run.first_messages import unknown
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.results import gaussian_stream, named
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.run.first_messages import unknown
 
 BROAD_M = 1000.0  # a position's standard deviation about its first message
 # By a sensor that measures the state: what it measures, and by its first message the state's mean (n,)

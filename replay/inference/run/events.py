@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, ragged_rows, run_of_rows
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.geodetic import GEODETIC, in_plane
-from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
-from replay.inference.kalman.update import message_layout
-from replay.inference.model.binding import Found
-from replay.inference.model.model import Control, Map, Sensor
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import complaint_of, reading_settings
-from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
-from replay.inference.run.timing import last_of_stamps, select_events, share_stamps, where_wanted
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, ragged_rows, run_of_rows
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane
+from fuselog.replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
+from fuselog.replay.inference.kalman.update import message_layout
+from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.model import Control, Map, Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import complaint_of, reading_settings
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
+from fuselog.replay.inference.run.timing import last_of_stamps, select_events, share_stamps, where_wanted
 
 
 @dataclass(frozen=True, eq=False)

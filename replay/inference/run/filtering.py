@@ -7,27 +7,27 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from recorders.log import Topic, schemas
-from recorders.log.planes import in_frame
-from recorders.log.streams import computed_stream
-from replay.distributions import chi2
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.compiling.notices import done_once
-from replay.engine.compiling.scratch import Scratch
-from replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
-from replay.engine.streams.geodetic import origins_of
-from replay.engine.streams.priors import gaussians
-from replay.engine.streams.results import ALL_WELL, failures_of, named, rows_of, wrapped
-from replay.inference.kalman.methods import Method
-from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
-from replay.inference.kalman.update import innovation_components
-from replay.inference.linear_algebra.covariances import Form
-from replay.inference.model.binding import Found
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import placed_settings, reading_settings
-from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import (
+from fuselog.recorders.log import Topic, schemas
+from fuselog.recorders.log.planes import in_frame
+from fuselog.recorders.log.streams import computed_stream
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.compiling.notices import done_once
+from fuselog.replay.engine.compiling.scratch import Scratch
+from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
+from fuselog.replay.engine.streams.geodetic import origins_of
+from fuselog.replay.engine.streams.priors import gaussians
+from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, named, rows_of, wrapped
+from fuselog.replay.inference.kalman.methods import Method
+from fuselog.replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
+from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.linear_algebra.covariances import Form
+from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import placed_settings, reading_settings
+from fuselog.replay.inference.model.stage import Stage, title_of
+from fuselog.replay.inference.run.events import (
     Context,
     data_columns,
     events_of,
@@ -35,8 +35,8 @@ from replay.inference.run.events import (
     passed_over,
     points_of,
 )
-from replay.inference.run.out_of_sequence import issued
-from replay.inference.run.recursion import (
+from fuselog.replay.inference.run.out_of_sequence import issued
+from fuselog.replay.inference.run.recursion import (
     Estimates,
     FilterEvents,
     Innovations,
@@ -48,8 +48,8 @@ from replay.inference.run.recursion import (
     recorded_innovations,
     recursion,
 )
-from replay.inference.run.samples import sample_sets, seeded_generators
-from replay.inference.run.timing import (
+from fuselog.replay.inference.run.samples import sample_sets, seeded_generators
+from fuselog.replay.inference.run.timing import (
     add_output_times,
     compensate_delays,
     delays_of,
@@ -60,7 +60,7 @@ from replay.inference.run.timing import (
     output_times,
     select_events,
 )
-from replay.sampling.samplers import Sampler
+from fuselog.replay.sampling.samplers import Sampler
 
 
 class FilterState(NamedTuple):

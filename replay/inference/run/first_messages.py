@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import Clock, Stream, schemas
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import reason_stream
-from replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
-from replay.inference.model.stage import Stage
-from replay.inference.model.start import Start
+from fuselog.recorders.log import Clock, Stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.start import Start
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Function, Integers
-from replay.inference.kalman.update import innovation_components
-from replay.inference.model.stage import Stage
-from replay.inference.run.events import data_columns
-from replay.inference.run.recursion import (
+from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
+from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.events import data_columns
+from fuselog.replay.inference.run.recursion import (
     NOTHING,
     FilterEvents,
     RecursionState,

@@ -12,22 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream, Topic, make_stream, schemas
-from recorders.parameters import meanings
-from replay.engine.arrays import Floats
-from replay.engine.replaying.estimator import Initialization, Initialized
-from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
-from replay.engine.streams.geodetic import in_plane, origins_of
-from replay.engine.streams.results import gaussian_stream, named
-from replay.inference.model.binding import Found, measures_state
-from replay.inference.model.model import Sensor
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import complaint_of, reading_settings
-from replay.inference.model.stage import Stage
-from replay.inference.run.broad_start import Reference, broad_priors
-from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
-from replay.inference.run.first_messages import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream, Topic, make_stream, schemas
+from fuselog.recorders.parameters import meanings
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.replaying.estimator import Initialization, Initialized
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
+from fuselog.replay.engine.streams.geodetic import in_plane, origins_of
+from fuselog.replay.engine.streams.results import gaussian_stream, named
+from fuselog.replay.inference.model.binding import Found, measures_state
+from fuselog.replay.inference.model.model import Sensor
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import complaint_of, reading_settings
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.broad_start import Reference, broad_priors
+from fuselog.replay.inference.run.events import Context, data_columns, filter_events, sensor_table
+from fuselog.replay.inference.run.first_messages import (
     Begun,
     Fact,
     first_of_runs,
@@ -37,8 +37,8 @@ from replay.inference.run.first_messages import (
     state_by_message,
     unknown,
 )
-from replay.inference.run.recursion import CONTROL, FilterEvents
-from replay.inference.run.timing import compensate_delays, delays_of
+from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
+from fuselog.replay.inference.run.timing import compensate_delays, delays_of
 
 FOREVER_NS = np.iinfo(np.int64).max
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is

@@ -6,8 +6,8 @@ What events are differs: messages, scans of detections, activities of nodes. All
 
 from typing import Any
 
-from replay.engine.arrays import Function
-from replay.engine.streams.results import ALL_WELL
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.streams.results import ALL_WELL
 
 
 def over_events(process: Function, record: Function, *, fails: bool = True) -> Function:

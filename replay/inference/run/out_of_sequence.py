@@ -13,20 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
-from replay.engine.streams.results import ALL_WELL, failures_of
-from replay.inference.kalman.methods import Method
-from replay.inference.kalman.steps import FAILURES, Steps
-from replay.inference.kalman.update import innovation_components
-from replay.inference.model.model import Model
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import filter_events, passed_over
-from replay.inference.run.history import (
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
+from fuselog.replay.engine.streams.results import ALL_WELL, failures_of
+from fuselog.replay.inference.kalman.methods import Method
+from fuselog.replay.inference.kalman.steps import FAILURES, Steps
+from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.stage import Stage, title_of
+from fuselog.replay.inference.run.events import filter_events, passed_over
+from fuselog.replay.inference.run.history import (
     History,
     KeptMessages,
     Structure,
@@ -35,8 +35,8 @@ from replay.inference.run.history import (
     no_history,
     structure_of,
 )
-from replay.inference.run.loops import over_events
-from replay.inference.run.recursion import (
+from fuselog.replay.inference.run.loops import over_events
+from fuselog.replay.inference.run.recursion import (
     CONTROL,
     FilterEvents,
     Innovations,
@@ -47,7 +47,7 @@ from replay.inference.run.recursion import (
     processing,
     writing_estimates,
 )
-from replay.sampling.sets import sets_by_runs
+from fuselog.replay.sampling.sets import sets_by_runs
 
 # The loop
 

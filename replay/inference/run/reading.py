@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import Stream
-from replay.engine.arrays import Floats, Function
-from replay.engine.replaying.estimator import Reading
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
-from replay.inference.model.binding import Found
-from replay.inference.model.model import Control, Sensor
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.settings import TracedParameters, reading_settings
-from replay.inference.model.stage import Stage
-from replay.inference.model.validation import trial_state
-from replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.replaying.estimator import Reading
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
+from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.model import Control, Sensor
+from fuselog.replay.inference.model.parameters import number_fields, settings_type
+from fuselog.replay.inference.model.settings import TracedParameters, reading_settings
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import trial_state
+from fuselog.replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
 
 STEP = 1e-3  # of parameters and controls, by which their effects are compared
 

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import schemas
-from recorders.log.streams import computed_stream
-from replay.engine.streams.blocks import Ragged, filled_rows
-from replay.engine.streams.results import ALL_WELL, named, rows_of
-from replay.inference.kalman.steps import (
+from fuselog.recorders.log import schemas
+from fuselog.recorders.log.streams import computed_stream
+from fuselog.replay.engine.streams.blocks import Ragged, filled_rows
+from fuselog.replay.engine.streams.results import ALL_WELL, named, rows_of
+from fuselog.replay.inference.kalman.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
@@ -29,10 +29,10 @@ from replay.inference.kalman.steps import (
     Measurement,
     Steps,
 )
-from replay.inference.linear_algebra.tuples import range_of
-from replay.inference.model.model import Model
-from replay.inference.model.stage import Stage
-from replay.inference.run.loops import over_events
+from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.loops import over_events
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -296,7 +296,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """Make the loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over the events of one run, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
 

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from replay.engine.arrays import Integers
-from replay.inference.run.recursion import (
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.inference.run.recursion import (
     FilterEvents,
 )
-from replay.sampling.samplers import Sampler
-from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
+from fuselog.replay.sampling.samplers import Sampler
+from fuselog.replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
 
 def seeded_generators(

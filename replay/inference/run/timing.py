@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import last_of_equals, ragged_rows, run_of_rows
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.blocks import last_of_equals, ragged_rows, run_of_rows
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 
 EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.inference.kalman.predict import motion_derivative, motion_noise
-from replay.inference.kalman.steps import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise
+from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
@@ -30,15 +30,20 @@ from replay.inference.kalman.steps import (
     gaussian_filter,
     workspace,
 )
-from replay.inference.kalman.update import message_layout, sensor_derivative, whitening
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.kalman.update import message_layout, sensor_derivative, whitening
+from fuselog.replay.inference.linear_algebra.gaussian import (
     propagate_covariance,
     scalar_update,
 )
-from replay.inference.linear_algebra.manifold import boxminus, boxplus, by_right_jacobian, is_flat
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.stage import Stage
-from replay.inference.smoothing.backward_pass import (
+from fuselog.replay.inference.linear_algebra.manifold import (
+    boxminus,
+    boxplus,
+    by_right_jacobian,
+    is_flat,
+)
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.smoothing.backward_pass import (
     Chain,
     ForwardMemory,
     smoothing_steps,

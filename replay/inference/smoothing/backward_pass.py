@@ -8,7 +8,7 @@ prediction (m-, P-) and D, the covariance of the state before with the state aft
 
 with the derivative's D for extended filters and that of the samples for the others. Several predictions
 between two nodes are one such step: their G multiply. Where the state is no vector, (+) and (-) and the
-tangent spaces of the covariances are those of `replay.inference.model.corrections`.
+tangent spaces of the covariances are those of `fuselog.replay.inference.model.corrections`.
 
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
@@ -18,20 +18,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
+from fuselog.replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
     fill_identity,
     multiply,
     propagate_covariance,
 )
-from replay.inference.linear_algebra.manifold import tangent_size
-from replay.inference.model.corrections import Kinds, comparing, correcting, sloping
-from replay.inference.model.model import Correction
-from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import Estimates
+from fuselog.replay.inference.linear_algebra.manifold import tangent_size
+from fuselog.replay.inference.model.corrections import Kinds, comparing, correcting, sloping
+from fuselog.replay.inference.model.model import Correction
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.recursion import Estimates
 
 FOREVER_NS = np.iinfo(np.int64).max
 
@@ -45,7 +45,7 @@ class Chain(NamedTuple):
     Attributes:
         mean, covariance: the filter's, (runs, n) and (runs, t, t).
         predicted, slope: (runs, n) the last prediction, before it was corrected, and (runs, t) its
-            tangent, see `replay.inference.model.model.Correction`.
+            tangent, see `fuselog.replay.inference.model.model.Correction`.
         gain, rest: (runs, t, t) G and P - G D' of the predictions since the last node.
         predictions: (runs,) how many these are.
     """

@@ -3,7 +3,7 @@
 At every node, a stamp that has an estimate, stands what the extended Kalman filter would have that
 linearises at the truth, of the filter (`bound`) or of the smoother (`bound:smoother`): the covariance
 along this one trajectory. It needs no inverse of the process noise, which may be singular. Beside it go
-the steps themselves, of which `replay.judging.consistency.bounds` makes the bound over an ensemble.
+the steps themselves, of which `fuselog.replay.judging.consistency.bounds` makes the bound over an ensemble.
 
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """
@@ -16,19 +16,19 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
-from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.results import named
-from replay.engine.vectors.components import match_components
-from replay.engine.vectors.tangent import truth_at
-from replay.inference.kalman.methods import FILTERS, Method, MethodParameters
-from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
-from replay.inference.run.filtering import Filter, FilterState
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
-from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, make_stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.results import named
+from fuselog.replay.engine.vectors.components import match_components
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.inference.kalman.methods import FILTERS, Method, MethodParameters
+from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
+from fuselog.replay.inference.run.filtering import Filter, FilterState
+from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
+from fuselog.replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
 
 
 class BoundParameters(MethodParameters):

@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.inference.kalman.predict import motion_derivative, motion_noise
-from replay.inference.kalman.steps import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise
+from fuselog.replay.inference.kalman.steps import (
     NO_TRUTH,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -17,8 +17,8 @@ from replay.inference.kalman.steps import (
     Workspace,
     workspace,
 )
-from replay.inference.kalman.update import linear_sensor, sensor_noise
-from replay.inference.linear_algebra.gaussian import (
+from fuselog.replay.inference.kalman.update import linear_sensor, sensor_noise
+from fuselog.replay.inference.linear_algebra.gaussian import (
     cholesky,
     downdate,
     drop_missing,
@@ -28,8 +28,8 @@ from replay.inference.linear_algebra.gaussian import (
     propagate_covariance,
     whiten,
 )
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.stage import Stage
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.stage import Stage
 
 
 class TrueTrajectory(NamedTuple):

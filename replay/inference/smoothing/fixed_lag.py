@@ -8,11 +8,11 @@ lag has. Where the means of a manifold have a part in the steps they do not comp
 from functools import lru_cache
 from typing import NamedTuple
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
-from replay.inference.linear_algebra.manifold import boxminus, boxplus
-from replay.inference.smoothing.backward_pass import BackMemory, Nodes, Piece, Smoothed, compose
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
+from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
+from fuselog.replay.inference.smoothing.backward_pass import BackMemory, Nodes, Piece, Smoothed, compose
 
 
 class Window(NamedTuple):

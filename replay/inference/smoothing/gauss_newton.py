@@ -4,8 +4,8 @@ What is minimised, over the state at the prior's time and at every stamp after i
 
     1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
 
-A pass is an affine filter about the latest trajectory (`replay.inference.smoothing.affine`) and the way
-back over it (`replay.inference.smoothing.backward_pass`). Where a step would raise the cost it is taken
+A pass is an affine filter about the latest trajectory (`fuselog.replay.inference.smoothing.affine`) and the way
+back over it (`fuselog.replay.inference.smoothing.backward_pass`). Where a step would raise the cost it is taken
 again, damped (Levenberg and Marquardt): every state is measured as it stands, with the start's variances
 over the damping.
 
@@ -17,23 +17,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import Gaussian, Steps
-from replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.recursion import (
+from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.kalman.steps import Gaussian, Steps
+from fuselog.replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
+from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.stage import Stage, title_of
+from fuselog.replay.inference.run.recursion import (
     Innovations,
     RecursionState,
     RunInputs,
     RunResults,
     recursion,
 )
-from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
-from replay.inference.smoothing.backward_pass import (
+from fuselog.replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
+from fuselog.replay.inference.smoothing.backward_pass import (
     ForwardMemory,
     Later,
     Piece,

@@ -1,7 +1,7 @@
 """Finds the most probable states of a whole run, given all measurements: the iterated smoother.
 
 It keeps the events of a run, smooths them once as the extended smoother does, and from there searches
-the trajectory of the least cost; see `replay.inference.smoothing.gauss_newton`.
+the trajectory of the least cost; see `fuselog.replay.inference.smoothing.gauss_newton`.
 """
 
 from collections.abc import Sequence
@@ -13,20 +13,26 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Ragged, copied, ragged_rows, run_of_rows
-from replay.inference.kalman.methods import FILTERS, Method
-from replay.inference.kalman.steps import Gaussian, Steps
-from replay.inference.model.stage import Stage
-from replay.inference.run.events import data_columns
-from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, RunInputs, no_results
-from replay.inference.run.timing import join_events, last_of_stamps, output_times, select_events
-from replay.inference.smoothing import smoothers
-from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
-from replay.inference.smoothing.backward_pass import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged, copied, ragged_rows, run_of_rows
+from fuselog.replay.inference.kalman.methods import FILTERS, Method
+from fuselog.replay.inference.kalman.steps import Gaussian, Steps
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.events import data_columns
+from fuselog.replay.inference.run.filtering import FilterState
+from fuselog.replay.inference.run.recursion import (
+    NOTHING,
+    Estimates,
+    FilterEvents,
+    RunInputs,
+    no_results,
+)
+from fuselog.replay.inference.run.timing import join_events, last_of_stamps, output_times, select_events
+from fuselog.replay.inference.smoothing import smoothers
+from fuselog.replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
+from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
     Piece,
@@ -35,8 +41,8 @@ from replay.inference.smoothing.backward_pass import (
     no_later,
     smoothing_steps,
 )
-from replay.inference.smoothing.gauss_newton import Ended, Plan, SearchState, searching
-from replay.inference.smoothing.smoothers import Smoother, SmootherParameters
+from fuselog.replay.inference.smoothing.gauss_newton import Ended, Plan, SearchState, searching
+from fuselog.replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
 class IteratedParameters(SmootherParameters):

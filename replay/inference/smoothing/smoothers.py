@@ -1,8 +1,8 @@
 """Runs smoothers: filters that keep their nodes and pass back over them, at the end or at a lag.
 
 The steps that a filter leaves, and the way back over them, are in
-`replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
-`replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps, each
+`fuselog.replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
+`fuselog.replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps, each
 estimate of a fixed lag comes back over the whole of it.
 """
 
@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Integers
-from replay.engine.streams.blocks import Ragged, by_runs, copied, run_of_rows
-from replay.inference.kalman.methods import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.streams.blocks import Ragged, by_runs, copied, run_of_rows
+from fuselog.replay.inference.kalman.methods import (
     FILTERS,
     Method,
     RegressionParameters,
@@ -28,13 +28,13 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Steps
-from replay.inference.linear_algebra.manifold import is_flat
-from replay.inference.model.model import Model
-from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, FilterState
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
-from replay.inference.smoothing.backward_pass import (
+from fuselog.replay.inference.kalman.steps import Steps
+from fuselog.replay.inference.linear_algebra.manifold import is_flat
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.run.filtering import Filter, FilterState
+from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
     Nodes,
@@ -45,7 +45,7 @@ from replay.inference.smoothing.backward_pass import (
     no_later,
     smoothing_steps,
 )
-from replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
+from fuselog.replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file

@@ -16,14 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import schemas
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.vectors.tangent import tangent_components
-from replay.judging.errors.evaluation import BOUND as BOUND_OF
-from replay.judging.metrics.measuring import Metric, Output
-from replay.judging.metrics.metrics import squares_by_name
-from replay.judging.metrics.sums import BinnedSums
+from fuselog.recorders.log import schemas
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.judging.errors.evaluation import BOUND as BOUND_OF
+from fuselog.replay.judging.metrics.measuring import Metric, Output
+from fuselog.replay.judging.metrics.metrics import squares_by_name
+from fuselog.replay.judging.metrics.sums import BinnedSums
 
 SINGULAR = "the process noise is singular"
 UNALIKE = "the runs have other stamps"

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.blocks import Ragged
 
 LOST = 1e-12  # a pivot below has lost its digits
 # Of a block so many are looked at, evenly: one of EACH, but at least FEWEST.

@@ -1,13 +1,13 @@
 """Compares errors with the covariance promised: by component, ellipses, dilution of precision.
 
-NEES itself is `replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
+NEES itself is `fuselog.replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
 Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from replay.distributions import chi2
+from fuselog.replay.distributions import chi2
 
 Array = NDArray[np.float64]
 CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.models.inertial import into_body
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.inertial import into_body
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

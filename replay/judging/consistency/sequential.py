@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

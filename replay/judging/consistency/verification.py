@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.log import Stream, schemas
-from recorders.log.streams import concatenate
-from replay.judging.metrics.measuring import Metric, Output
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.streams import concatenate
+from fuselog.replay.judging.metrics.measuring import Metric, Output
 
 Floats = NDArray[np.float64]
 FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)  # also called false match rates (FMR), as FNMR is 1 - GAR

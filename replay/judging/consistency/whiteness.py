@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from replay.distributions import chi2
+from fuselog.recorders.log import Stream
+from fuselog.replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 LAGS = 20

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream
-from recorders.trajectories import Trajectory
-from replay.engine.streams.planes import HEADING, VECTORS, Movement, moved_states
-from replay.engine.streams.sources import LogSource
-from replay.engine.vectors.components import in_body_axes, stated_components
-from replay.judging.errors.planes import ALIGNED
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream
+from fuselog.recorders.trajectories import Trajectory
+from fuselog.replay.engine.streams.planes import HEADING, VECTORS, Movement, moved_states
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.engine.vectors.components import in_body_axes, stated_components
+from fuselog.replay.judging.errors.planes import ALIGNED
 
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.judging.errors.evaluation import Errors, Floats, errors_at
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
 
 SHARE = 0.5  # of the mean squared error, from which on a constant makes the most of it
 HALVED = 0.5  # NEES without the constant, as a share of NEES with it

@@ -2,7 +2,7 @@
 
 An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
 truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space
-(see `replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
+(see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
 Applications to Tracking and Navigation, 5.4.
 """
 
@@ -13,23 +13,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.log.planes import Origin
-from recorders.models.orientation import heading
-from replay.distributions import chi2
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.engine.streams.planes import into_plane_of
-from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.models.orientation import heading
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.planes import into_plane_of
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.vectors.components import (
     Components,
     in_body_axes,
     match_components,
     match_tangent,
     stated_components,
 )
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.engine.vectors.tangent import (
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.tangent import (
     WIDTHS,
     are_kinds,
     difference,
@@ -37,8 +37,8 @@ from replay.engine.vectors.tangent import (
     tangent_components,
     truth_at,
 )
-from replay.judging.errors.planes import ALIGNED, FirstFixes, planes_of, unlike
-from replay.judging.errors.truths import Truths
+from fuselog.replay.judging.errors.planes import ALIGNED, FirstFixes, planes_of, unlike
+from fuselog.replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]
 POSITION, HEADING = ("x_m", "y_m", "z_m"), "heading_rad"

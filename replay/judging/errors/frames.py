@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from recorders.log import Topic, schemas, topics_of
-from recorders.log.planes import BODY, FRAME, body_of, frame_in_words, frame_of
-from recorders.models.vehicles import into_frame
-from replay.engine.arrays import Floats, Integers
-from replay.engine.vectors.components import Components, match_components
-from replay.engine.vectors.tangent import truth_at
-from replay.judging.errors.truths import Truths
+from fuselog.recorders.log import Topic, schemas, topics_of
+from fuselog.recorders.log.planes import BODY, FRAME, body_of, frame_in_words, frame_of
+from fuselog.recorders.models.vehicles import into_frame
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.vectors.components import Components, match_components
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.judging.errors.truths import Truths
 
 POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 

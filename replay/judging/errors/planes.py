@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from recorders.log import Stream, schemas
-from recorders.log.planes import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import (
     FRAME,
     Origin,
     frame_in_words,
@@ -14,9 +14,9 @@ from recorders.log.planes import (
     plane_in_words,
     stated_in,
 )
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.geodetic import origins_of
-from replay.engine.streams.sources import Source
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.geodetic import origins_of
+from fuselog.replay.engine.streams.sources import Source
 
 ALIGNED = "aligned"  # in the metadata of estimates that are in the truth's frame, whatever theirs was
 # By estimator and case, as in topics: the first fixes that are the origins of every run's plane.

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.trajectories import Trajectory
-from replay.judging.errors.alignment import Align, rotation_error_rad
+from fuselog.recorders.trajectories import Trajectory
+from fuselog.replay.judging.errors.alignment import Align, rotation_error_rad
 
 Floats = NDArray[np.float64]
 # Orientations within it never turn; a path or an estimate that turns by more shows that they are none.

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput, choices
-from recorders.trajectories import Trajectory
-from replay.engine.vectors.tangent import states_at
-from replay.judging.errors.alignment import Align, Alignment, aligned, alignment_of
-from replay.judging.errors.pose_doubts import UNTURNED, doubts_of_alignment, lacks_rotations
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.trajectories import Trajectory
+from fuselog.replay.engine.vectors.tangent import states_at
+from fuselog.replay.judging.errors.alignment import Align, Alignment, aligned, alignment_of
+from fuselog.replay.judging.errors.pose_doubts import UNTURNED, doubts_of_alignment, lacks_rotations
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

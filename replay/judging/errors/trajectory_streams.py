@@ -3,14 +3,14 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.trajectories import Trajectory
-from replay.engine.streams.planes import HEADING
-from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import manifold_blocks, tangent_components
-from replay.judging.errors.evaluation import POSITION
-from replay.judging.errors.trajectories import POSE_KINDS
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.trajectories import Trajectory
+from fuselog.replay.engine.streams.planes import HEADING
+from fuselog.replay.engine.vectors.components import stated_components
+from fuselog.replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from fuselog.replay.judging.errors.evaluation import POSITION
+from fuselog.replay.judging.errors.trajectories import POSE_KINDS
 
 
 def trajectory_of(stream: Stream) -> Trajectory | None:

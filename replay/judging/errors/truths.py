@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas, topics_of
-from recorders.log.streams import concatenate
-from replay.engine.streams.sources import Source
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.recorders.log.streams import concatenate
+from fuselog.replay.engine.streams.sources import Source
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import Ragged
-from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.vectors.components import stated_components
+from fuselog.replay.engine.vectors.tangent import tangent_components
 
 FEWEST = 10  # estimates of a run, of which fewer may not have met a measurement yet
 MOVED = 1e-9  # standard deviations, and a share of the variance

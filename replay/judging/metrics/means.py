@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from recorders.log import Stream, schemas
-from replay.engine.arrays import Floats
-from replay.engine.replaying.late import OLDER
-from replay.engine.streams.failures import sentences_of
-from replay.judging.metrics.measuring import Output
-from replay.judging.metrics.sums import BinnedSums
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.replaying.late import OLDER
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.metrics.sums import BinnedSums
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from recorders.registry import available, foreign_code, load
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import Errors, Innovations
+from fuselog.recorders.registry import available, foreign_code, load
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import Errors, Innovations
 
 
 class Output(NamedTuple):
@@ -89,7 +89,7 @@ def metric_of_sums(
     Returns:
         The metric, for registration under a name.
 
-    >>> from replay.judging.errors.evaluation import Errors
+    >>> from fuselog.replay.judging.errors.evaluation import Errors
     >>> def counted(errors):
     ...     return {"near": int((abs(errors.error) < 1).all(axis=1).sum()), "all": len(errors.error)}
     >>> near = metric_of_sums(

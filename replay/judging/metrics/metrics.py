@@ -8,11 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recorders.log import schemas
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.judging.errors.evaluation import POSITION, Errors, Floats, Innovations, chi_square_interval
-from replay.judging.metrics.measuring import Metric, Output, Sums, metric_of_sums
-from replay.judging.metrics.sums import BinnedSums
+from fuselog.recorders.log import schemas
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.judging.errors.evaluation import (
+    POSITION,
+    Errors,
+    Floats,
+    Innovations,
+    chi_square_interval,
+)
+from fuselog.replay.judging.metrics.measuring import Metric, Output, Sums, metric_of_sums
+from fuselog.replay.judging.metrics.sums import BinnedSums
 
 
 def squares(errors: Errors) -> Sums:

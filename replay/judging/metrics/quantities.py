@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.judging.errors.constant import ConstantSums
-from replay.judging.errors.evaluation import Errors, Floats, Innovations
-from replay.judging.metrics.sums import BinnedSums, Integers
+from fuselog.replay.judging.errors.constant import ConstantSums
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, Innovations
+from fuselog.replay.judging.metrics.sums import BinnedSums, Integers
 
 
 @dataclass

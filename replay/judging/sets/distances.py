@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

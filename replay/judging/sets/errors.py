@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas, topics_of
-from recorders.log.planes import frame_of
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import Components
-from replay.judging.errors.evaluation import POSITION, reference, split_topic
-from replay.judging.errors.frames import not_comparable, seen_in
-from replay.judging.errors.truths import Truths
-from replay.judging.metrics.measuring import Sums, metric_of_sums
-from replay.judging.sets.distances import gospa, ospa
-from replay.judging.sets.regions import Regions
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.recorders.log.planes import frame_of
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.judging.errors.evaluation import POSITION, reference, split_topic
+from fuselog.replay.judging.errors.frames import not_comparable, seen_in
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.metrics.measuring import Sums, metric_of_sums
+from fuselog.replay.judging.sets.distances import gospa, ospa
+from fuselog.replay.judging.sets.regions import Regions
 
 Floats = NDArray[np.float64]
 CUTOFF_M = 10.0

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from replay.engine.streams.blocks import Ragged, run_of_rows
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.regions import areas_of, inside, places_at, rings_of
-from replay.regions.feasible_sets import excess_rad
-from replay.regions.frames import Known, frames
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.regions import areas_of, inside, places_at, rings_of
+from fuselog.replay.regions.feasible_sets import excess_rad
+from fuselog.replay.regions.frames import Known, frames
 
 Floats = NDArray[np.float64]
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.models.planar import wrap_angle
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.engine.vectors.components import Components
-from replay.judging.errors.evaluation import reference
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.evaluation import JudgedSets, judge_sets, premises_hold
-from replay.regions.frames import NOT_CUT, STATED, Bearings, Bounds, Known, frames_with_bearings
-from replay.regions.moving_sets import Odometry, odometry_of, relative_pose
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.judging.errors.evaluation import reference
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.evaluation import JudgedSets, judge_sets, premises_hold
+from fuselog.replay.regions.frames import NOT_CUT, STATED, Bearings, Bounds, Known, frames_with_bearings
+from fuselog.replay.regions.moving_sets import Odometry, odometry_of, relative_pose
 
 Booleans = NDArray[np.bool_]
 Floats = NDArray[np.float64]

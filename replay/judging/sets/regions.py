@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import Ragged
-from replay.engine.vectors.components import Components
-from replay.judging.errors.evaluation import reference, split_topic
-from replay.judging.errors.truths import Truths
-from replay.regions.feasible_sets import signed_area
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.judging.errors.evaluation import reference, split_topic
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.regions.feasible_sets import signed_area
 
 PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 NONE = -1
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.optimize import linear_sum_assignment, linprog
 
-from recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import Stream, Topic, schemas, topics_of
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.engine.streams.sources import Source
-from replay.judging.sets.distances import gospa, gospa_pairs
-from replay.judging.tracks.clear_mot import NONE, clear_mot, switches_and_breaks
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, Topic, schemas, topics_of
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.sets.distances import gospa, gospa_pairs
+from fuselog.replay.judging.tracks.clear_mot import NONE, clear_mot, switches_and_breaks
 
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
@@ -249,7 +249,10 @@ def figures_of_whole_tracks(
         truths: (targets, k, 2), in m, NaN where a target is not there.
         unreferenced_m: see `Judged`.
     """
-    from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
+    from fuselog.replay.judging.tracks.distances import (  # their assignments take long to import
+        hota,
+        idf1,
+    )
 
     near, others = near_tracks(tracks, truths)
     is_partial = bool(np.isfinite(unreferenced_m))

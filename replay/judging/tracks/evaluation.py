@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Stream, schemas
-from recorders.log.planes import frame_of
-from replay.engine.arrays import Floats, Integers
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import split_topic
-from replay.judging.errors.frames import not_comparable, seen_in
-from replay.judging.errors.truths import Truths
-from replay.judging.metrics.measuring import Metric
-from replay.judging.tracks.clear_mot import NONE
-from replay.judging.tracks.errors import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import frame_of
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.frames import not_comparable, seen_in
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.metrics.measuring import Metric
+from fuselog.replay.judging.tracks.clear_mot import NONE
+from fuselog.replay.judging.tracks.errors import (
     BURN_IN_S,
     PERIOD_S,
     VELOCITY,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import schemas
-from replay.judging.metrics.measuring import Metric, Output
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import schemas
+from fuselog.replay.judging.metrics.measuring import Metric, Output
 
 if TYPE_CHECKING:
     import pandas as pd

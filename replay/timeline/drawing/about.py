@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import PALETTE, Canvas
-from replay.timeline.drawing.plane import draw_lines, draw_scans, plane_view
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import PALETTE, Canvas
+from fuselog.replay.timeline.drawing.plane import draw_lines, draw_scans, plane_view
 
 # A ray without a range is so long, and a circle has so many corners.
 RAY_M = 1.0

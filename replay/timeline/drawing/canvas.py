@@ -16,10 +16,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Schema, Stream, schemas, topics_of
-from replay.engine.streams.sources import Source
-from replay.judging.errors.evaluation import Errors, Floats, split_topic
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Schema, Stream, schemas, topics_of
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, split_topic
 
 Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]

@@ -9,10 +9,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import MUTED, Canvas, Colour
-from replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
-from replay.timeline.sinks import open_recording
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import MUTED, Canvas, Colour
+from fuselog.replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
+from fuselog.replay.timeline.sinks import open_recording
 
 
 class CurvePanel(NamedTuple):

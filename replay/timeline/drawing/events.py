@@ -7,10 +7,18 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from replay.engine.replaying.usage import CONTROLS
-from replay.engine.streams.failures import sentences_of
-from replay.timeline.drawing.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.replaying.usage import CONTROLS
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.timeline.drawing.canvas import (
+    Canvas,
+    Scene,
+    Times,
+    entity_path,
+    escaped,
+    gap_limit_ns,
+    thin,
+)
 
 NOT_SENSED = frozenset(
     schema.full_name

@@ -10,10 +10,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import Canvas, Colour, escaped, thin
-from replay.timeline.drawing.plane import TRAIL_S, trail_of
+from fuselog.recorders.log import Stream
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import Canvas, Colour, escaped, thin
+from fuselog.replay.timeline.drawing.plane import TRAIL_S, trail_of
 
 # Fixes up to these standard deviations in m: an ambiguity that is fixed, one that floats, code alone.
 QUALITIES: tuple[tuple[float, Colour], ...] = (

@@ -13,11 +13,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.log import schemas
-from replay.distributions import chi2
-from replay.engine.streams.measurements import PLANE
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import schemas
+from fuselog.replay.distributions import chi2
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     WIDTH,
     Board,

@@ -13,10 +13,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import schemas
-from replay.engine.streams.blocks import gather
-from replay.judging.errors.evaluation import Errors, Floats, chi_square_interval, innovations_of
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import schemas
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, chi_square_interval, innovations_of
+from fuselog.replay.timeline.drawing.canvas import (
     DRAWN_ROWS,
     MUTED,
     PALETTE,

@@ -7,12 +7,12 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
-from recorders.log.impossible import Rejections
-from replay.engine.streams.failures import join_streams
-from replay.engine.streams.sources import Source, is_sensed
-from replay.judging.errors.evaluation import PER_ROW, Errors, Floats, errors_at
-from replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
+from fuselog.recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
+from fuselog.recorders.log.impossible import Rejections
+from fuselog.replay.engine.streams.failures import join_streams
+from fuselog.replay.engine.streams.sources import Source, is_sensed
+from fuselog.replay.judging.errors.evaluation import PER_ROW, Errors, Floats, errors_at
+from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 
 Times = NDArray[np.int64]
 # So many messages of a topic are kept; what is drawn of them is less, see `canvas.DRAWN_ROWS`.

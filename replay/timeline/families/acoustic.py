@@ -5,15 +5,15 @@ from typing import NamedTuple
 import numpy as np
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from recorders.models.acoustic import Medium, sensor_components
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.channels import numbered
-from replay.estimators.localization.acoustic_streams import gather_detections
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
-from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.acoustic import Medium, sensor_components
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.channels import numbered
+from fuselog.replay.estimators.localization.acoustic_streams import gather_detections
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_ellipses,
@@ -24,7 +24,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import draw_quality
+from fuselog.replay.timeline.drawing.plots import draw_quality
 
 CASE = "shooter"
 MUZZLE_BLAST = (150, 150, 150, 160)

@@ -10,14 +10,14 @@ import rerun.blueprint as rrb
 from matplotlib.colors import hsv_to_rgb
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from replay.engine.streams.blocks import gather
-from replay.judging.metrics.measuring import Output
-from replay.judging.tracks.tracks import live_counts, reports_of, track_tables
-from replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, thin
-from replay.timeline.drawing.geodetic import are_near, degrees_of, map_view, usual
-from replay.timeline.drawing.plane import ROOT, plane_view, turn_up
-from replay.timeline.drawing.plots import LINE, plot_view
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.tracks.tracks import live_counts, reports_of, track_tables
+from fuselog.replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, thin
+from fuselog.replay.timeline.drawing.geodetic import are_near, degrees_of, map_view, usual
+from fuselog.replay.timeline.drawing.plane import ROOT, plane_view, turn_up
+from fuselog.replay.timeline.drawing.plots import LINE, plot_view
 
 REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
 TRAIL_S = 300.0

@@ -6,11 +6,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from recorders.models.scores import TOPIC, matchers_of
-from replay.estimators.biometrics.pairs import subsets_of
-from replay.judging.consistency.verification import Floats, Fused, fused_of, roc
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.scores import TOPIC, matchers_of
+from fuselog.replay.estimators.biometrics.pairs import subsets_of
+from fuselog.replay.judging.consistency.verification import Floats, Fused, fused_of, roc
+from fuselog.replay.timeline.drawing.canvas import (
     PALETTE,
     WRONG,
     Canvas,
@@ -21,9 +21,9 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     escaped,
 )
-from replay.timeline.drawing.curves import CurvePanel, curve_view
-from replay.timeline.drawing.plane import stroke_of, with_legend
-from replay.timeline.drawing.plots import LINE, POINTS, below_legend, plot_view
+from fuselog.replay.timeline.drawing.curves import CurvePanel, curve_view
+from fuselog.replay.timeline.drawing.plane import stroke_of, with_legend
+from fuselog.replay.timeline.drawing.plots import LINE, POINTS, below_legend, plot_view
 
 GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
 BINS = 60

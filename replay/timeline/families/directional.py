@@ -12,13 +12,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.components import ImageFormat
 
-from recorders.log import Stream, schemas
-from replay.distributions import bingham, wrapped_normal
-from replay.distributions.wrapped_normal import WrappedNormal
-from replay.estimators.directional.grid import torus_grid
-from replay.judging.consistency.disturbances import COMPONENTS, disturbances
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.distributions import bingham, wrapped_normal
+from fuselog.replay.distributions.wrapped_normal import WrappedNormal
+from fuselog.replay.estimators.directional.grid import torus_grid
+from fuselog.replay.judging.consistency.disturbances import COMPONENTS, disturbances
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     WIDTH,
     Board,
@@ -33,9 +33,9 @@ from replay.timeline.drawing.canvas import (
     escaped,
     thin,
 )
-from replay.timeline.drawing.events import Happened, above_events, draw_events
-from replay.timeline.drawing.plane import GRID, Stroke, with_legend
-from replay.timeline.drawing.plots import draw_quality
+from fuselog.replay.timeline.drawing.events import Happened, above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import GRID, Stroke, with_legend
+from fuselog.replay.timeline.drawing.plots import draw_quality
 
 QUATERNION = COMPONENTS[:4]
 # Pictures and outlines are large: fewer of them than of numbers.

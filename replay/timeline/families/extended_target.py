@@ -3,11 +3,11 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas, topics_of
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import WRONG, Canvas, Scene, Timeline, beside
-from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import (
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import WRONG, Canvas, Scene, Timeline, beside
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     TRUE,
     Stroke,
@@ -18,7 +18,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import draw_components, draw_quality
+from fuselog.replay.timeline.drawing.plots import draw_components, draw_quality
 
 TARGET = ("half_x_m", "half_y_m", "x_m", "y_m")
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])

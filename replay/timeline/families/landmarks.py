@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas, topics_of
-from replay.engine.streams.measurements import PLANE, covariances_of
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import (
     WRONG,
     Canvas,
     Colour,
@@ -23,8 +23,8 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     thin,
 )
-from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import (
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     TRUE,
     Stroke,
@@ -42,8 +42,8 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import draw_quality
-from replay.timeline.families.sets import draw_sets
+from fuselog.replay.timeline.drawing.plots import draw_quality
+from fuselog.replay.timeline.families.sets import draw_sets
 
 HEADING = "heading_rad"
 # An arrow is so long, as a share of the scene.

@@ -4,9 +4,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from replay.timeline.drawing.canvas import MUTED, WRONG, Canvas, Scene, Timeline
-from replay.timeline.drawing.plane import ROOT, Stroke, ellipses, plane_view, turn_up
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.timeline.drawing.canvas import MUTED, WRONG, Canvas, Scene, Timeline
+from fuselog.replay.timeline.drawing.plane import ROOT, Stroke, ellipses, plane_view, turn_up
 
 PIXELS = 14.0  # the radius of a sample that has all the weight
 

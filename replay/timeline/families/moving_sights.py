@@ -11,10 +11,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from recorders.models.optical import direction
-from replay.engine.arrays import Floats
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.optical import direction
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     WRONG,
     Canvas,
@@ -26,8 +26,8 @@ from replay.timeline.drawing.canvas import (
     nice,
     thin,
 )
-from replay.timeline.drawing.plane import with_legend
-from replay.timeline.families.optical import BEYOND, SENSOR, draw_rays, ellipsoids
+from fuselog.replay.timeline.drawing.plane import with_legend
+from fuselog.replay.timeline.families.optical import BEYOND, SENSOR, draw_rays, ellipsoids
 
 AXES = "xyz"
 # How far a close-up reaches, in sizes of the smallest median error, and where its eye is.

@@ -12,12 +12,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import Stream, schemas
-from replay.engine.arrays import Floats
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.geodetic import in_plane, origins_of
-from replay.engine.vectors.tangent import tangent_components
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.geodetic import in_plane, origins_of
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.timeline.drawing.canvas import (
     MUTED,
     PALETTE,
     TRUTH,
@@ -34,9 +34,9 @@ from replay.timeline.drawing.canvas import (
     thin,
     thin_curve,
 )
-from replay.timeline.drawing.geodetic import POOR, QUALITIES, by_deviation
-from replay.timeline.drawing.plane import with_legend
-from replay.timeline.drawing.plots import LINE, SIGMAS, draw_curve, plot_view, shown_unit
+from fuselog.replay.timeline.drawing.geodetic import POOR, QUALITIES, by_deviation
+from fuselog.replay.timeline.drawing.plane import with_legend
+from fuselog.replay.timeline.drawing.plots import LINE, SIGMAS, draw_curve, plot_view, shown_unit
 
 PLACE = ("x_m", "y_m", "z_m")
 ORIENTATION = tuple(f"orientation_{part}" for part in "wxyz")

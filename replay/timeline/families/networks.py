@@ -11,9 +11,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from replay.judging.errors.evaluation import Errors, split_topic
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.judging.errors.evaluation import Errors, split_topic
+from fuselog.replay.timeline.drawing.canvas import (
     MUTED,
     TRUTH,
     WRONG,
@@ -24,8 +24,8 @@ from replay.timeline.drawing.canvas import (
     escaped,
     thin,
 )
-from replay.timeline.drawing.events import above_events, draw_events, events_view, stamped
-from replay.timeline.drawing.plane import (
+from fuselog.replay.timeline.drawing.events import above_events, draw_events, events_view, stamped
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_dots,
@@ -39,7 +39,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import draw_errors, draw_nees, in_strips
+from fuselog.replay.timeline.drawing.plots import draw_errors, draw_nees, in_strips
 
 GRAPH = f"{ROOT}/graph"
 PLACE = ("x_m", "y_m")

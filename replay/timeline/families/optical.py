@@ -13,11 +13,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.models.optical import bias_components, direction
-from replay.distributions import chi2
-from replay.judging.errors.evaluation import Floats
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.optical import bias_components, direction
+from fuselog.replay.distributions import chi2
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     WRONG,
     Canvas,
@@ -28,9 +28,9 @@ from replay.timeline.drawing.canvas import (
     beside,
     nice,
 )
-from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import with_legend
-from replay.timeline.drawing.plots import draw_quality
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import with_legend
+from fuselog.replay.timeline.drawing.plots import draw_quality
 
 ROOT = "space"
 SENSOR: Colour = (240, 228, 66)

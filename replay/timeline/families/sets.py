@@ -9,10 +9,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.log import schemas
-from replay.judging.errors.evaluation import Floats
-from replay.judging.sets.regions import areas_of, rings_of
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import schemas
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.judging.sets.regions import areas_of, rings_of
+from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     Canvas,
     Scene,
@@ -22,8 +22,8 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     nice,
 )
-from replay.timeline.drawing.events import above_events, draw_events
-from replay.timeline.drawing.plane import (
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_dots,
@@ -33,7 +33,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import draw_curve, plot_view
+from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
 
 FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
 # The map shows what this share of the sets does not reach beyond.

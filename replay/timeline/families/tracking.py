@@ -18,18 +18,24 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.log.planes import frame_of
-from replay.engine.arrays import Integers
-from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
-from replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
-from replay.judging.errors.evaluation import Floats
-from replay.judging.tracks.clear_mot import NONE
-from replay.judging.tracks.errors import TrackErrors, instants_of, target_topics, track_errors, tracks_at
-from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
-from replay.timeline.drawing.events import Happened, above_events, draw_events
-from replay.timeline.drawing.plane import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import frame_of
+from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
+from fuselog.replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.judging.tracks.clear_mot import NONE
+from fuselog.replay.judging.tracks.errors import (
+    TrackErrors,
+    instants_of,
+    target_topics,
+    track_errors,
+    tracks_at,
+)
+from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
+from fuselog.replay.timeline.drawing.events import Happened, above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_lines,
@@ -40,8 +46,8 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import LINE, POINTS, below_legend, draw_curve, plot_view
-from replay.timeline.families.ais import track_colours
+from fuselog.replay.timeline.drawing.plots import LINE, POINTS, below_legend, draw_curve, plot_view
+from fuselog.replay.timeline.families.ais import track_colours
 
 # How far rays of bearings are drawn.
 RAY_M = 300.0
@@ -185,7 +191,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
     """Take each chain of near detections of a scan as its mean, by its first one.
 
     How near is stated on the channel of the scans; see
-    `replay.inference.association.scanning.join_near`.
+    `fuselog.replay.inference.association.scanning.join_near`.
     """
     row, place = rows_of(scan, seen), read_vectors(seen, "position_m", PLANE)
     order = np.argsort(row, kind="stable")

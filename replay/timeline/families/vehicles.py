@@ -14,15 +14,15 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from recorders.log import Stream, schemas
-from recorders.models.vehicles import out_of_frame
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
-from replay.judging.errors.evaluation import Floats
-from replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.errors import CUTOFF_M, set_errors
-from replay.timeline.drawing.canvas import (
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.vehicles import out_of_frame
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.errors import CUTOFF_M, set_errors
+from fuselog.replay.timeline.drawing.canvas import (
     MUTED,
     TRUTH,
     Board,
@@ -32,9 +32,9 @@ from replay.timeline.drawing.canvas import (
     Timeline,
     Times,
 )
-from replay.timeline.drawing.events import draw_events
-from replay.timeline.drawing.geodetic import degrees_of, draw_fixes, map_view
-from replay.timeline.drawing.plane import (
+from fuselog.replay.timeline.drawing.events import draw_events
+from fuselog.replay.timeline.drawing.geodetic import degrees_of, draw_fixes, map_view
+from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     TRUE,
     clouds_of,
@@ -51,7 +51,7 @@ from replay.timeline.drawing.plane import (
     turn_up,
     with_legend,
 )
-from replay.timeline.drawing.plots import (
+from fuselog.replay.timeline.drawing.plots import (
     draw_curve,
     draw_effective,
     draw_modes,

@@ -1,7 +1,7 @@
 """Frozen reference: dead reckoning corrected by the Bingham filter, one loop over all runs.
 
 As it was before filters were made from models (issue 13), to be timed against and for nothing else. What
-a Bingham distribution is predicted and updated by is taken from `replay.distributions`.
+a Bingham distribution is predicted and updated by is taken from `fuselog.replay.distributions`.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.distributions.bingham_kernels import (
+from fuselog.replay.distributions.bingham_kernels import (
     compose,
     compose_columns,
     integrate,
@@ -21,7 +21,7 @@ from replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
-from replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 _NS = 1e-9
 

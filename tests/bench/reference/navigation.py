@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.log import Stream
-from recorders.models.inertial import earth_rate, gravity
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.inertial import earth_rate, gravity
 
 Floats = NDArray[np.float64]
 

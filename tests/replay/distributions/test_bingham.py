@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.special import i0e, i1e
 
-from recorders.errors import BadInput
-from recorders.models.directional_noise import saddlepoint
-from recorders.models.orientation import compose as compose_points
-from recorders.models.orientation import conjugate, left_matrix
-from replay.distributions import bingham, bingham_kernels
-from replay.distributions.bingham import Bingham, make_bingham
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.directional_noise import saddlepoint
+from fuselog.recorders.models.orientation import compose as compose_points
+from fuselog.recorders.models.orientation import conjugate, left_matrix
+from fuselog.replay.distributions import bingham, bingham_kernels
+from fuselog.replay.distributions.bingham import Bingham, make_bingham
 
 IDENTITY = np.eye(4)
 # the paper's noise has its modes at the identity: (55), (62)

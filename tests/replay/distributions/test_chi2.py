@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2 as reference
 
-from replay.distributions import chi2
+from fuselog.replay.distributions import chi2
 
 DEGREES = np.array([0.5, 1, 2, 3, 4.37, 9, 30, 100, 999, 17492, 1e6])[:, None]
 

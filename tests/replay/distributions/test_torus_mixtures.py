@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import vonmises
 
-from recorders.errors import BadInput
-from recorders.models.planar import wrap_angle
-from replay.distributions import wrapped_normal
-from replay.distributions.torus_mixtures import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.distributions import wrapped_normal
+from fuselog.replay.distributions.torus_mixtures import (
     VonMisesMixture,
     WrappedMixture,
     fit_von_mises_mixture,
     fit_wrapped_mixture,
 )
-from replay.distributions.wrapped_normal import WrappedNormal
-from replay.estimators.directional.grid import torus_grid
+from fuselog.replay.distributions.wrapped_normal import WrappedNormal
+from fuselog.replay.estimators.directional.grid import torus_grid
 
 WEIGHTS, MEANS = np.array([0.3, 0.7]), np.array([[3.0, 2.0], [-1.0, 3.1]])
 COVARIANCES = np.array([[[0.5, 0.2], [0.2, 0.3]], [[0.1, -0.05], [-0.05, 0.2]]])

@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from replay.distributions import wrapped_normal, wrapped_normal_kernels
-from replay.distributions.wrapped_normal import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.distributions import wrapped_normal, wrapped_normal_kernels
+from fuselog.replay.distributions.wrapped_normal import (
     CircularMoments,
     Samples,
     WrappedNormal,
     make_wrapped_normal,
 )
-from replay.estimators.directional.grid import torus_grid
+from fuselog.replay.estimators.directional.grid import torus_grid
 
 SIGMA = np.array([0.8, 1.3])
 

@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.importers.ros.files import ros1_file
-from recorders.importers.ulog import loops as ulog_loops
-from recorders.log import loops
-from replay.engine.compiling.cache import cache_folder, in_turn
-from replay.engine.compiling.compile import compile_over_runs, compiled
-from replay.engine.compiling.kernel_cache import load
-from replay.engine.compiling.kernels import native
-from replay.engine.compiling.kernels.native import Kernel
-from replay.engine.compiling.through_numba import loop_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.files import ros1_file
+from fuselog.recorders.importers.ulog import loops as ulog_loops
+from fuselog.recorders.log import loops
+from fuselog.replay.engine.compiling.cache import cache_folder, in_turn
+from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
+from fuselog.replay.engine.compiling.kernel_cache import load
+from fuselog.replay.engine.compiling.kernels import native
+from fuselog.replay.engine.compiling.kernels.native import Kernel
+from fuselog.replay.engine.compiling.through_numba import loop_of
 from tests.replay.engine.processes import printed
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
@@ -52,14 +52,14 @@ MODULE = """
     columns = Columns(np.arange(3.0), np.zeros(3))
 """
 BY_NUMBA = f"""{MODULE}
-    from replay.engine.compiling.through_numba import loop_of
+    from fuselog.replay.engine.compiling.through_numba import loop_of
 
     loop = loop_of(kernel(model))
     loop.of((columns,))(0, 3)
     print(*columns.found, "cached" if loop._loop.stats.cache_hits else "compiled")
 """
 OURS = f"""{MODULE}
-    from replay.engine.compiling.kernels import native
+    from fuselog.replay.engine.compiling.kernels import native
 
     made, make = [], native._made
     native._made = lambda *given: made.append(given) or make(*given)
@@ -93,7 +93,7 @@ def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp
 HOLDER = """
     import sys
     from pathlib import Path
-    from replay.engine.compiling.cache import cache_folder, in_turn
+    from fuselog.replay.engine.compiling.cache import cache_folder, in_turn
 
     with in_turn(Path(sys.argv[1])):
         print("held", flush=True)
@@ -129,7 +129,7 @@ def test_nobody_waits_long_for_a_kernel_and_not_at_all_for_the_killed(
     path = kernels / "kernel.bin"
     holder = started(HOLDER, path)
     assert holder.stdout.readline() == "held\n"
-    monkeypatch.setattr("replay.engine.compiling.cache._TURN_S", 0.1)
+    monkeypatch.setattr("fuselog.replay.engine.compiling.cache._TURN_S", 0.1)
     with in_turn(path) as waited:
         assert waited
     holder.kill()
@@ -172,7 +172,7 @@ def test_a_new_process_finds_numbas_kernel_and_a_changed_one_is_compiled_anew(tm
 CALLED_FROM_PYTHON = """
     import numpy as np
     from model import moved
-    from replay.engine.compiling.compile import compiled
+    from fuselog.replay.engine.compiling.compile import compiled
 
     @compiled
     def kernel(given, found):
@@ -296,7 +296,7 @@ def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
     """A whole file that cannot be loaded all the same."""
     assert not by_numba()
     with monkeypatch.context() as broken:
-        broken.setattr("replay.engine.compiling.kernel_cache.pickle.loads", lambda _: 1 / 0)
+        broken.setattr("fuselog.replay.engine.compiling.kernel_cache.pickle.loads", lambda _: 1 / 0)
         assert not by_numba()
     assert by_numba()
 
@@ -545,7 +545,9 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
         compile_over_runs(kernel_of(lambda value: value))
     with pytest.raises(BadInput, match=r"uses 'scale', a ndarray, .* pass it as an argument"):
         compile_over_runs(kernel_of(scaled_by(np.ones(3))))
-    with pytest.raises(BadInput, match=r"the module recorders.log.loops: import what it needs by"):
+    with pytest.raises(
+        BadInput, match=r"the module fuselog.recorders.log.loops: import what it needs by"
+    ):
         compile_over_runs(through_a_module)
     with pytest.raises(BadInput, match="kernel 'one' does not compile: No implementation of function"):
         compile_over_runs(kernel_of(twice))(1, "text")
@@ -554,7 +556,7 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
 FORKED = """
     import os
     import numpy as np
-    from replay.engine.compiling.compile import compile_over_runs
+    from fuselog.replay.engine.compiling.compile import compile_over_runs
 
     def one(run, found, memory):
         memory[0] = run

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from recorders.errors import BadInput
-from replay.engine.compiling.compile import compile_over_runs, compiled
-from replay.inference.association.association import marginals
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
+from fuselog.replay.inference.association.association import marginals
 
 
 def total(values: np.ndarray, factor: float) -> float:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.engine.vectors.components import match_components, match_tangent
-from replay.engine.vectors.tangent import Kind
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.vectors.components import match_components, match_tangent
+from fuselog.replay.engine.vectors.tangent import Kind
 
 PLANE: dict[str, Kind] = {"x_m": "linear", "vx_mps": "linear", "y_m": "linear", "vy_mps": "linear"}
 BODY: dict[str, Kind] = {

@@ -11,15 +11,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
-from recorders.recording import Recording, record_run
-from replay.engine.replaying.estimator import Bound, Recursive, bind
-from replay.engine.replaying.replaying import Report, collect, replay
-from replay.engine.streams.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
-from replay.engine.streams.ensembles import Ensemble
-from replay.engine.streams.results import state_stream
-from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
+from fuselog.recorders.recording import Recording, record_run
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
+from fuselog.replay.engine.replaying.replaying import Report, collect, replay
+from fuselog.replay.engine.streams.blocks import (
+    Block,
+    Ragged,
+    filled_rows,
+    gather,
+    merge_events,
+    ragged_rows,
+)
+from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.results import state_stream
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 

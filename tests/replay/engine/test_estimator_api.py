@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.parameters import Parameters
-from recorders.recording import Recording
-from replay.engine.api.functions import batch, each_run, recursive
-from replay.engine.api.inputs import Floats, Given, Integers, Messages
-from replay.engine.api.outputs import Estimates, Results, Solution
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.api.functions import batch, each_run, recursive
+from fuselog.replay.engine.api.inputs import Floats, Given, Integers, Messages
+from fuselog.replay.engine.api.outputs import Estimates, Results, Solution
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 STREAMS = {"heading": schemas.BEARING}
 STATIC = {"prior": schemas.GAUSSIAN_ESTIMATE}

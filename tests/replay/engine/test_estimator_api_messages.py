@@ -10,22 +10,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
-from recorders.models.planar import wrap_angle
-from recorders.parameters import Parameters
-from recorders.recording import Recording
-from replay.engine.api.functions import batch, each_run, recursive
-from replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
-from replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
-from replay.engine.compiling import notices
-from replay.engine.compiling.compile import compile_over_runs, compiled
-from replay.engine.compiling.kernel_cache import load
-from replay.engine.replaying.estimator import Estimator
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.linear_algebra.small_matrices import predict, solve, update, update_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.api.functions import batch, each_run, recursive
+from fuselog.replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
+from fuselog.replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
+from fuselog.replay.engine.compiling import notices
+from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
+from fuselog.replay.engine.compiling.kernel_cache import load
+from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.linear_algebra.small_matrices import predict, solve, update, update_memory
 
 DETOUR = Schema(
     "Detour",
@@ -391,7 +391,7 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.compiling.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("fuselog.replay.engine.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     for _ in range(2):
         load.cache_clear()

@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from pipeline.runs import ensemble
-from pipeline.runs.ensemble import Part
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
-from recorders.parameters import Parameters
-from recorders.recording import Recording
-from replay.engine.api.functions import batch, each_run, recursive
-from replay.engine.api.inputs import Floats, Given, Integers, Messages
-from replay.engine.api.outputs import Estimates, Results
-from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Batch, Estimator, Recursive
-from replay.engine.replaying.replaying import Report, collect, replay
-from replay.engine.replaying.soundness import find_unsound
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.failures import Failure, failure_stream, sentences_of
-from replay.engine.streams.results import failures_of
-from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import Output
-from replay.judging.metrics.metrics import COVERAGE
+from fuselog.pipeline.runs import ensemble
+from fuselog.pipeline.runs.ensemble import Part
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
+from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.api.functions import batch, each_run, recursive
+from fuselog.replay.engine.api.inputs import Floats, Given, Integers, Messages
+from fuselog.replay.engine.api.outputs import Estimates, Results
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.replaying.estimator import Batch, Estimator, Recursive
+from fuselog.replay.engine.replaying.replaying import Report, collect, replay
+from fuselog.replay.engine.replaying.soundness import find_unsound
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.failures import Failure, failure_stream, sentences_of
+from fuselog.replay.engine.streams.results import failures_of
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.metrics.metrics import COVERAGE
 
 STEP_NS = 10**8
 COUNT = 200

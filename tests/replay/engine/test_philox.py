@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from replay.engine.compiling.compile import compiled
-from replay.engine.philox import fill_normals, philox, run_key
+from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.replay.engine.philox import fill_normals, philox, run_key
 
 normals = compiled(fill_normals, allocates=False)
 

@@ -5,15 +5,15 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.log import make_stream, schemas
-from recorders.log.planes import Origin
-from recorders.models.geodesy import (
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.models.geodesy import (
     earth_centred,
     into_tangent_plane,
     out_of_tangent_plane,
     tangent_axes,
 )
-from replay.engine.streams.planes import into_plane_of
+from fuselog.replay.engine.streams.planes import into_plane_of
 
 HERE, THERE = Origin(60.0, 10.0, 50.0), Origin(60.3, 10.9, 250.0)
 STAMPS = np.arange(3)

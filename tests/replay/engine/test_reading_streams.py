@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.metrics.measuring import Output
-from replay.judging.metrics.metrics import COVERAGE
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.metrics.metrics import COVERAGE
 
 VEHICLES = {"duration_s": 20.0}
 

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 import fuselog as fl
-from recorders.log import schemas
-from replay.estimators.models.landmarks import ROBOT
+from fuselog.recorders.log import schemas
+from fuselog.replay.estimators.models.landmarks import ROBOT
 
 
 def nothing(*_: Any) -> None:

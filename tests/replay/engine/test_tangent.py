@@ -4,23 +4,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import memory_source
-from replay.engine.vectors.covariances import is_positive_definite, normalized_error_squared
-from replay.engine.vectors.tangent import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.engine.vectors.covariances import is_positive_definite, normalized_error_squared
+from fuselog.replay.engine.vectors.tangent import (
     are_kinds,
     between,
     difference,
     named_now,
     tangent_components,
 )
-from replay.judging.errors.evaluation import errors_of, truth_at
-from replay.judging.errors.truths import Truths
-from replay.judging.metrics.metrics import ACCURACY
+from fuselog.replay.judging.errors.evaluation import errors_of, truth_at
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.metrics.metrics import ACCURACY
 
 QUATERNION = ["quaternion"] * 4
 

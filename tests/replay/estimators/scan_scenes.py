@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 FIELD_M = 200.0
 VARIANCE_M2 = 0.5

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from recorders.errors import BadInput
-from recorders.models import acoustic as model
-from recorders.models.acoustic import Medium, Noise
-from recorders.models.planar import wrap_angle
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.estimators.localization import acoustic
-from replay.estimators.localization.acoustic import Detections, Mode, Setting
-from replay.estimators.localization.least_squares import Solution, Status, information_root
-from replay.judging.consistency.consistency import ellipse_area
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models import acoustic as model
+from fuselog.recorders.models.acoustic import Medium, Noise
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.estimators.localization import acoustic
+from fuselog.replay.estimators.localization.acoustic import Detections, Mode, Setting
+from fuselog.replay.estimators.localization.least_squares import Solution, Status, information_root
+from fuselog.replay.judging.consistency.consistency import ellipse_area
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 pytestmark = pytest.mark.paper
 

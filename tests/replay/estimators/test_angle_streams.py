@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.localization import optical
-from replay.estimators.localization.optical import Scene
-from replay.judging.errors.evaluation import errors_of
-from replay.judging.errors.truths import Truths
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.localization import optical
+from fuselog.replay.estimators.localization.optical import Scene
+from fuselog.replay.judging.errors.evaluation import errors_of
+from fuselog.replay.judging.errors.truths import Truths
 
 
 def source(scenario: str, run: int = 0, **parameters: object) -> MemorySource:

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.orientation import axis_angle_between, conjugate, rotate
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.navigation.attitude import ATTITUDE
-from replay.inference.model.model import Model
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.orientation import axis_angle_between, conjugate, rotate
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.navigation.attitude import ATTITUDE
+from fuselog.replay.inference.model.model import Model
 from tests.replay.inference.replays import outputs
 
 RATE_HZ, SECONDS = 25.0, 30

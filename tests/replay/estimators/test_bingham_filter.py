@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.models.directional_noise import sample_projected_gaussian
-from recorders.models.orientation import axis_angle_between, compose, left_matrix
-from replay.distributions import bingham
-from replay.distributions.bingham import Bingham, make_bingham
-from replay.estimators.directional.bingham import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.directional_noise import sample_projected_gaussian
+from fuselog.recorders.models.orientation import axis_angle_between, compose, left_matrix
+from fuselog.replay.distributions import bingham
+from fuselog.replay.distributions.bingham import Bingham, make_bingham
+from fuselog.replay.estimators.directional.bingham import (
     BinghamNoise,
     Gaussian,
     GaussianNoise,
@@ -20,7 +20,7 @@ from replay.estimators.directional.bingham import (
     run_bingham_filter,
     run_kalman_filter,
 )
-from replay.estimators.directional.grid import run_axis_grid_filter
+from fuselog.replay.estimators.directional.grid import run_axis_grid_filter
 
 pytestmark = pytest.mark.paper
 

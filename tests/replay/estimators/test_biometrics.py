@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 from sklearn.mixture import GaussianMixture
 
-from pipeline.runs.experiment import load_experiment
-from pipeline.runs.recorded import replay_ensemble
-from pipeline.studies.biometrics.biometrics import PAPER_FUSED, SINGLE
-from recorders.errors import BadInput
-from recorders.recording import import_run, record_run
-from replay.engine.streams.sources import memory_source
-from replay.estimators.biometrics.biometrics import ClassifierParameters, learn_classifier
-from replay.estimators.biometrics.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
-from replay.estimators.biometrics.pairs import (
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.runs.recorded import replay_ensemble
+from fuselog.pipeline.studies.biometrics.biometrics import PAPER_FUSED, SINGLE
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import import_run, record_run
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.estimators.biometrics.biometrics import ClassifierParameters, learn_classifier
+from fuselog.replay.estimators.biometrics.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
+from fuselog.replay.estimators.biometrics.pairs import (
     RULES,
     all_pairs,
     cross_validate,
@@ -23,7 +23,7 @@ from replay.estimators.biometrics.pairs import (
     trimmed_pairs,
     user_folds,
 )
-from replay.judging.consistency.verification import (
+from fuselog.replay.judging.consistency.verification import (
     Fused,
     _rates,
     bootstrap_users,
@@ -34,7 +34,7 @@ from replay.judging.consistency.verification import (
     roc,
     verification_rate,
 )
-from replay.judging.metrics.measuring import find_metrics, measure
+from fuselog.replay.judging.metrics.measuring import find_metrics, measure
 from tests.replay.engine.processes import printed
 
 pytestmark = pytest.mark.paper
@@ -179,8 +179,8 @@ def test_whole_numbers_halfway_between_two_means_do_not_hang_on_rounding():
 LEARNT_WITH = """
 import numpy as np
 from threadpoolctl import threadpool_info
-from recorders.models.scores import Comparisons, Matcher
-from replay.estimators.biometrics import biometrics
+from fuselog.recorders.models.scores import Comparisons, Matcher
+from fuselog.replay.estimators.biometrics import biometrics
 
 def threads(vectors, *_):
     print(*(each["num_threads"] for each in threadpool_info() if each["user_api"] == "openmp"))

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 COUNT, STEP_NS = 40, 10_000_000
 # after the last sample, by ahrs 0.4.0 from the same start (its north is x for Madgwick: turned to y)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.planar import range_bearing
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
+from fuselog.pipeline.runs.recorded import replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.models.planar import range_bearing
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
 from tests.bench.reference.landmarks import range_bearing_jacobian
 from tests.replay.estimators.test_covariance_intersection import fuse_sighting
 

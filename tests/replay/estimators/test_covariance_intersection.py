@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from replay.estimators.networks.covariance_intersection import RULES, fuse
-from replay.estimators.networks.nodes import observe
-from replay.estimators.networks.pairwise import Stake, sighting_weight
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.networks.covariance_intersection import RULES, fuse
+from fuselog.replay.estimators.networks.nodes import observe
+from fuselog.replay.estimators.networks.pairwise import Stake, sighting_weight
 
 PAIR = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
 THREE = np.array([np.diag([1.0, 4.0]), np.diag([4.0, 1.0]), [[2.0, 1.5], [1.5, 2.0]]])

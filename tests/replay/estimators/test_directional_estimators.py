@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.recording import record_run
-from replay.engine.streams.sources import memory_source
-from replay.judging.metrics.metrics import CONSISTENCY
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.metrics.metrics import CONSISTENCY
 
 FILTERS = {
     "axis": {"bingham-axis": {}, "kalman-axis": {}},

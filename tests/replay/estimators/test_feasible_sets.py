@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from recorders.models.relative_bearing import relative_bearing
-from replay.regions.feasible_sets import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.relative_bearing import relative_bearing
+from fuselog.replay.regions.feasible_sets import (
     Arena,
     area,
     box,
@@ -22,7 +22,7 @@ from replay.regions.feasible_sets import (
     signed_area,
     to_blame,
 )
-from replay.regions.pseudo_ellipsoids import (
+from fuselog.replay.regions.pseudo_ellipsoids import (
     PseudoEllipsoid,
     fit,
     fuse,

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.recorded import judge, replay_in_memory
-from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams import channels
-from replay.engine.streams.blocks import gather
-from replay.estimators.tracking.gaussian_mixture_phd import (
+from fuselog.pipeline.runs.recorded import judge, replay_in_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Topic, make_stream, schemas
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams import channels
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
     no_components,
     scans_of,
     settings_of,
 )
-from replay.estimators.tracking.phd_recursion import Scans
-from replay.estimators.vehicles.streams import scanning_of
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.errors import set_errors
+from fuselog.replay.estimators.tracking.phd_recursion import Scans
+from fuselog.replay.estimators.vehicles.streams import scanning_of
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.errors import set_errors
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source
 
 STATED = {"variance_m2": "0.5", "detection_probability": "0.9", "clutter_per_m2": "1e-3"}

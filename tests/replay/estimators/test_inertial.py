@@ -8,14 +8,14 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
-from recorders.errors import BadInput
-from recorders.log import RunMetadata
-from recorders.models.orientation import axis_angle_between
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.estimators.orientation.inertial import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.models.orientation import axis_angle_between
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.estimators.orientation.inertial import (
     InertialModel,
     InertialSamples,
     OrientationEstimates,

@@ -10,18 +10,23 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2, t
 
-from recorders.errors import BadInput
-from recorders.log import Clock, Stream, schemas
-from recorders.recording import Recording, record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.errors.evaluation import Errors, chi_square_interval, errors_of, innovations_of
-from replay.judging.errors.truths import Truths
-from replay.judging.metrics.metrics import INNOVATION
-from replay.sampling.samplers import unscented
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream, schemas
+from fuselog.recorders.recording import Recording, record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.errors.evaluation import (
+    Errors,
+    chi_square_interval,
+    errors_of,
+    innovations_of,
+)
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.metrics.metrics import INNOVATION
+from fuselog.replay.sampling.samplers import unscented
 
 Floats = NDArray[np.float64]
 

@@ -6,22 +6,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import record_ensemble
-from recorders.errors import BadInput
-from recorders.log import LogWriter, open_log
-from recorders.models.planar import range_bearing
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import LogSource, MemorySource
-from replay.estimators.models.extended_target import EXTENDED_TARGET, measure
-from replay.estimators.models.reactor import REACTOR
-from replay.inference.all_methods import METHODS
-from replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
-from replay.inference.kalman.steps import Gaussian, Interval, Measurement
-from replay.inference.linear_algebra.gaussian import no_innovation
-from replay.inference.model.stage import stage_of
-from replay.sampling import Samples, parse_sampling
-from replay.sampling.sets import SampleSets
+from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import LogWriter, open_log
+from fuselog.recorders.models.planar import range_bearing
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.estimators.models.extended_target import EXTENDED_TARGET, measure
+from fuselog.replay.estimators.models.reactor import REACTOR
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
+from fuselog.replay.inference.kalman.steps import Gaussian, Interval, Measurement
+from fuselog.replay.inference.linear_algebra.gaussian import no_innovation
+from fuselog.replay.inference.model.stage import stage_of
+from fuselog.replay.sampling import Samples, parse_sampling
+from fuselog.replay.sampling.sets import SampleSets
 
 PARAMETERS = {"batch-reactor": {}, "extended-target": {}, "landmarks": {"duration_s": 5.0}}
 SAMPLINGS = ["ukf", "gf-25", "rukf-12", "s2kf-50", "s2kf-100:symmetric", "s2kf-25:rotation=3"]

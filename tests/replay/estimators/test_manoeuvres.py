@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.models.vehicle_kalman import VEHICLE
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.models.vehicle_kalman import VEHICLE
 from tests.replay.inference.replays import outputs
 
 RUNS = 200

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from fuselog import make_stream, schemas
-from pipeline.runs.recorded import record_ensemble, replay_in_memory
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.models.optical import bias_components
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.models.moving_optical import move, sight
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_in_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.optical import bias_components
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.models.moving_optical import move, sight
 
 SIDE_BY_SIDE = [(-10e3, 5e3, 0.0), (0.0, 5e3, 0.0), (10e3, 5e3, 0.0)]
 MANOEUVRE = {"weave_m": [0.0, 0.0, 1000.0]}

@@ -14,20 +14,20 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.log.planes import Origin
-from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
-from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording, import_run, record_run
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.geodetic import in_plane, origins_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import difference
-from replay.estimators.navigation.alignment import align
-from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
-from replay.estimators.navigation.turning import move, move_back
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.recording import Recording, import_run, record_run
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.geodetic import in_plane, origins_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.estimators.navigation.alignment import align
+from fuselog.replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
+from fuselog.replay.estimators.navigation.turning import move, move_back
 from tests.replay.inference.replays import outputs
 
 # --- the mathematics -------------------------------------------------------------------------------

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.parameters import build
-from recorders.recording import Recording, record_run
-from replay.engine.replaying.estimator import find_estimator
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import difference
-from replay.estimators.navigation.alignment import align
-from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import build
+from fuselog.recorders.recording import Recording, record_run
+from fuselog.replay.engine.replaying.estimator import find_estimator
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.estimators.navigation.alignment import align
+from fuselog.replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_imm import twins
 

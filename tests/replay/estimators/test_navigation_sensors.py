@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from recorders.log import make_stream, schemas
-from recorders.recording import record_run
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import difference
-from replay.estimators.navigation import sensors
-from replay.estimators.navigation.alignment import specific_force
-from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.estimators.navigation import sensors
+from fuselog.replay.estimators.navigation.alignment import specific_force
+from fuselog.replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
 from tests.replay.inference.replays import outputs
 
 TURNED = Rotation.from_euler("ZYX", [2.0, 0.3, -0.4])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.runs.experiment import load_experiment
-from recorders.recording import import_run
-from replay.engine.streams.sources import memory_source
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.sources import memory_source
 
 pytestmark = pytest.mark.paper
 

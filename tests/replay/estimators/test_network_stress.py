@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from replay.estimators.networks.estimates import Estimate
-from replay.estimators.networks.nodes import agrees, divergence
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.networks.estimates import Estimate
+from fuselog.replay.estimators.networks.nodes import agrees, divergence
 
 RULE = {"kind": "network:ci-trace"}
 

@@ -6,14 +6,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.estimators.networks.covariance_intersection import RULES
-from replay.estimators.networks.networks import ALONE, CENTRALISED, TRAP, Rule
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.estimators.networks.covariance_intersection import RULES
+from fuselog.replay.estimators.networks.networks import ALONE, CENTRALISED, TRAP, Rule
 
 pytestmark = pytest.mark.paper
 

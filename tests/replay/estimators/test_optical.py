@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from recorders.errors import BadInput
-from recorders.models.planar import wrap_angle
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.estimators.localization import optical
-from replay.estimators.localization.least_squares import Status, cramer_rao_bound, solve
-from replay.estimators.localization.optical import Scene
-from replay.judging.errors.evaluation import chi_square_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.estimators.localization import optical
+from fuselog.replay.estimators.localization.least_squares import Status, cramer_rao_bound, solve
+from fuselog.replay.estimators.localization.optical import Scene
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 pytestmark = pytest.mark.paper
 

@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.recording import import_run, record_run
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.models.ranging import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.recording import import_run, record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.models.ranging import (
     RANGING_POSE,
     RANGING_POSITION,
     PoseRangingParameters,
@@ -23,10 +23,10 @@ from replay.estimators.models.ranging import (
     see,
     see_by_tag,
 )
-from replay.inference.linear_algebra.inflation import inflation
-from replay.inference.model.augmentation import augmented
-from replay.inference.model.checking import check_model
-from replay.inference.model.point_errors import PointError
+from fuselog.replay.inference.linear_algebra.inflation import inflation
+from fuselog.replay.inference.model.augmentation import augmented
+from fuselog.replay.inference.model.checking import check_model
+from fuselog.replay.inference.model.point_errors import PointError
 from tests.replay.inference.replays import bound, outputs
 
 # --- the models ------------------------------------------------------------------------------------

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.recorded import replay_in_memory
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Block, gather, merge_events
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.tracking.report_association import ReportSettings, is_held
-from replay.judging.metrics.measuring import Output, find_metrics, measure
-from replay.judging.tracks.tracks import kept, live_counts, track_table
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Block, gather, merge_events
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.tracking.report_association import ReportSettings, is_held
+from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure
+from fuselog.replay.judging.tracks.tracks import kept, live_counts, track_table
 
 TOPIC = "/estimates/report-tracker/track"
 

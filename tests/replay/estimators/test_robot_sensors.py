@@ -7,15 +7,21 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from pipeline.runs.initial_states import start_from
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.planar import drive, wrap_angle
-from recorders.recording import Recording
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.models.landmarks import RECKONING, ROBOT, LocalizationParameters, align, antenna
+from fuselog.pipeline.runs.initial_states import start_from
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.planar import drive, wrap_angle
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.models.landmarks import (
+    RECKONING,
+    ROBOT,
+    LocalizationParameters,
+    align,
+    antenna,
+)
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]

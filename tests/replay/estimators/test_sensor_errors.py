@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.engine.arrays import Floats
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats
 from tests.replay.estimators.test_tracker import RADAR, SECOND, SIMULATION_EPOCH_NS, log, replay, sensor
 
 CLEAR = {**RADAR, "clutter_per_m2": "1e-30", "gate_probability": "0.999999999"}

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import MemorySource
-from replay.judging.sets.filter_evaluation import judge_filter
-from replay.regions.frames import CONTRADICTS_ITSELF, CONTRADICTS_PAST, FRAME_WRONG, PAST_WRONG
-from replay.regions.moving_sets import (
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.sets.filter_evaluation import judge_filter
+from fuselog.replay.regions.frames import CONTRADICTS_ITSELF, CONTRADICTS_PAST, FRAME_WRONG, PAST_WRONG
+from fuselog.replay.regions.moving_sets import (
     Headings,
     Motion,
     all_headings_of,

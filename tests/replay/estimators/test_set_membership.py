@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, open_log, schemas, write_log
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.sources import LogSource, memory_source
-from replay.engine.vectors.tangent import truth_at
-from replay.judging.sets.evaluation import judge_sets
-from replay.regions.feasible_sets import arena_around, box, exact_set, excess_rad, rings
-from replay.regions.frames import Known, frames
-from replay.regions.pseudo_ellipsoids import fit, room
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, open_log, schemas, write_log
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.sources import LogSource, memory_source
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.judging.sets.evaluation import judge_sets
+from fuselog.replay.regions.feasible_sets import arena_around, box, exact_set, excess_rad, rings
+from fuselog.replay.regions.frames import Known, frames
+from fuselog.replay.regions.pseudo_ellipsoids import fit, room
 
 pytestmark = pytest.mark.paper
 

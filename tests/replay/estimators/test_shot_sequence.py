@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.models.acoustic import Medium, Noise, clear_side, hear
-from recorders.recording import record_run
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.models import shot_sequence
-from replay.estimators.models.shot_sequence import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.acoustic import Medium, Noise, clear_side, hear
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.models import shot_sequence
+from fuselog.replay.estimators.models.shot_sequence import (
     MOVING_SHOOTER,
     MovingShooterParameters,
     find_shooter,

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.recording import record_run
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.models.sound_source import SOUND_SOURCE, SoundSourceParameters, find_source
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.models.sound_source import (
+    SOUND_SOURCE,
+    SoundSourceParameters,
+    find_source,
+)
 from tests.replay.inference.replays import outputs
 
 SPEED = 343.0

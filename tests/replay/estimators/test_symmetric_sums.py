@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from replay.estimators.vehicles.symmetric_sums import (
+from fuselog.replay.estimators.vehicles.symmetric_sums import (
     power_sums,
     power_sums_at,
     product_sums,
@@ -12,7 +12,7 @@ from replay.estimators.vehicles.symmetric_sums import (
     raw_power_sums,
     update_root,
 )
-from replay.estimators.vehicles.vehicles import topology, topology_moments
+from fuselog.replay.estimators.vehicles.vehicles import topology, topology_moments
 
 P = np.array([-3.0, -1.0, 0.0, 2.0, 4.0])
 SIGMA = np.sqrt(0.5)

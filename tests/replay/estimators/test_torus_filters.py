@@ -5,13 +5,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.models.headings import turn_on, turn_together
-from recorders.models.planar import wrap_angle
-from replay.distributions import wrapped_normal
-from replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
-from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
-from replay.estimators.directional.torus import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.headings import turn_on, turn_together
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.distributions import wrapped_normal
+from fuselog.replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
+from fuselog.replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from fuselog.replay.estimators.directional.torus import (
     HeadingModel,
     make_heading_model,
     run_toroidal_filter,

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.estimators.tracking.targets import TARGET
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.estimators.tracking.targets import TARGET
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, replay, replay_late, sensor
 from tests.replay.inference.replays import outputs
 

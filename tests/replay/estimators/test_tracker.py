@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.runs.recorded import replay_in_memory
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
-from replay.engine.replaying import replaying
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.late import parse_late
-from replay.engine.replaying.replaying import collect
-from replay.engine.streams.measurements import PLANE
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.tracking.scan_sensors import place_clutter, polar_clutter
-from replay.estimators.tracking.scans import detected_places
-from replay.inference.association.association import existence_after, marginals
-from replay.inference.model.parameters import settings_type
-from replay.judging.tracks.errors import instants_of, track_errors, track_figures, tracks_at
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
+from fuselog.replay.engine.replaying import replaying
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.late import parse_late
+from fuselog.replay.engine.replaying.replaying import collect
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.tracking.scan_sensors import place_clutter, polar_clutter
+from fuselog.replay.estimators.tracking.scans import detected_places
+from fuselog.replay.inference.association.association import existence_after, marginals
+from fuselog.replay.inference.model.parameters import settings_type
+from fuselog.replay.judging.tracks.errors import instants_of, track_errors, track_figures, tracks_at
 from tests.replay.estimators import scan_scenes
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2
 

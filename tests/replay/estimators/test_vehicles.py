@@ -10,13 +10,13 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.stats import chi2, multivariate_normal
 
-from pipeline.runs.recorded import record_ensemble, replay_in_memory
-from pipeline.studies.vehicles.cases import Scores, scores_of
-from recorders.errors import BadInput
-from recorders.log import Clock
-from recorders.models.vehicles import into_frame, noise_moments
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.vehicles.association import (
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_in_memory
+from fuselog.pipeline.studies.vehicles.cases import Scores, scores_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock
+from fuselog.recorders.models.vehicles import into_frame, noise_moments
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.vehicles.association import (
     GATE_PROBABILITY,
     Scanning,
     all_maps,
@@ -24,14 +24,18 @@ from replay.estimators.vehicles.association import (
     log_likelihoods,
     log_permanents,
 )
-from replay.estimators.vehicles.bounds import bounds, exact_total_error, follow_axis
-from replay.estimators.vehicles.particles import _moved
-from replay.estimators.vehicles.registration import register
-from replay.estimators.vehicles.vehicles import Joint, Motion, collapse, position_rows
-from replay.judging.errors.evaluation import errors_of
-from replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error, total_error
-from replay.judging.errors.truths import Truths
-from replay.judging.sets.distances import gospa
+from fuselog.replay.estimators.vehicles.bounds import bounds, exact_total_error, follow_axis
+from fuselog.replay.estimators.vehicles.particles import _moved
+from fuselog.replay.estimators.vehicles.registration import register
+from fuselog.replay.estimators.vehicles.vehicles import Joint, Motion, collapse, position_rows
+from fuselog.replay.judging.errors.evaluation import errors_of
+from fuselog.replay.judging.errors.label_errors import (
+    assigned_squared_error,
+    fixed_squared_error,
+    total_error,
+)
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.sets.distances import gospa
 
 pytestmark = pytest.mark.paper
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-import replay.foreign.native
-from replay.foreign.processes import orphans
+import fuselog.replay.foreign.native
+from fuselog.replay.foreign.processes import orphans
 
 HEADER = Path(replay.foreign.native.__file__).parent
 COMPILERS = {".c": ("cc", "-std=c99"), ".cpp": ("c++", "-std=c++17")}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.command_line.process import main
+from fuselog.pipeline.command_line.process import main
 from tests.docs.test_worked_pages import blocks_of
 from tests.replay.foreign.conftest import EXAMPLES, Compile
 

@@ -8,9 +8,9 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput
-from pipeline.checking.golden import golden_of
-from pipeline.checking.stored import write
-from pipeline.command_line.process import main
+from fuselog.pipeline.checking.golden import golden_of
+from fuselog.pipeline.checking.stored import write
+from fuselog.pipeline.command_line.process import main
 from tests.replay.foreign.conftest import EXAMPLES, Compile
 
 MINE = "lib:./robot_ekf.so"

@@ -8,10 +8,10 @@ import psutil
 import pytest
 
 import fuselog as fl
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.foreign.processes.isolation import Ended, Workers
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.foreign.processes.isolation import Ended, Workers
 from tests.replay.foreign.conftest import MISBEHAVING, Compile
 
 COMMANDS = (float(-each) for each in range(1, 10))
@@ -82,7 +82,7 @@ def test_a_program_ends_when_we_are_killed() -> None:
         f"print(child.pid, flush=True); {deaf}"
     )
     ours = (
-        "import sys, time; from replay.foreign.processes.process import Program; "
+        "import sys, time; from fuselog.replay.foreign.processes.process import Program; "
         f"program = Program([sys.executable, '-c', {starts!r}]); "
         "print(program.process.pid, int(program.process.stdout.readline()), flush=True); time.sleep(600)"
     )

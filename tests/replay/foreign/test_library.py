@@ -8,13 +8,13 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput
-from pipeline.runs.recorded import replay_in_memory
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.foreign.naming import Allowed, allowed
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.foreign.naming import Allowed, allowed
 from tests.goldens.recipes import RECIPES, first_log
 from tests.replay.foreign.conftest import EXAMPLES, MISBEHAVING, Compile
 

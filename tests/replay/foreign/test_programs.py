@@ -14,17 +14,17 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput
-from recorders.log import RunMetadata, make_stream, schemas, write_log
-from recorders.log.opening import Topic
-from recorders.processes import safe_spawning
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import configure
-from replay.engine.streams.sources import memory_source
-from replay.engine.vectors.tangent import tangent_components
-from replay.foreign.description import TopicRead
-from replay.foreign.files.estimates import read_estimates
-from replay.foreign.naming import Allowed
-from replay.foreign.processes.process import Program
+from fuselog.recorders.log import RunMetadata, make_stream, schemas, write_log
+from fuselog.recorders.log.opening import Topic
+from fuselog.recorders.processes import safe_spawning
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import configure
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.foreign.description import TopicRead
+from fuselog.replay.foreign.files.estimates import read_estimates
+from fuselog.replay.foreign.naming import Allowed
+from fuselog.replay.foreign.processes.process import Program
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 

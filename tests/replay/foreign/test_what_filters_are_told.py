@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.replay.foreign.conftest import Compile
 from tests.replay.foreign.test_programs import program, python
 

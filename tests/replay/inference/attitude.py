@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.orientation import compose, conjugate, rotate
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.orientation import compose, conjugate, rotate
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {

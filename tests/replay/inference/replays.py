@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from recorders.parameters import build
-from replay.engine.replaying.estimator import Bound
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Source
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import bind_model, combined
-from replay.inference.model.model import Model
+from fuselog.recorders.parameters import build
+from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import bind_model, combined
+from fuselog.replay.inference.model.model import Model
 
 
 def bound(model: Model, method: str, sources: Sequence[Source], **values: Any) -> list[Bound]:

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 EPOCH_NS = 10**9

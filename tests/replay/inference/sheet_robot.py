@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.planar import drive, wrap_angle
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.planar import drive, wrap_angle
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 EPOCH_NS = 10**9
 STEP_S = 0.1

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from recorders.errors import BadInput
-from replay.inference.association.association import existence_after, marginals
-from replay.inference.association.births import ending
-from replay.inference.association.clusters import MOST_ENUMERATED
-from replay.inference.association.scans import Scans, in_time
-from replay.inference.association.shared_bias import pool_errors, pool_of
-from replay.inference.association.track_management import MANAGEMENTS
-from replay.inference.association.tracks import no_tracks
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.inference.association.association import existence_after, marginals
+from fuselog.replay.inference.association.births import ending
+from fuselog.replay.inference.association.clusters import MOST_ENUMERATED
+from fuselog.replay.inference.association.scans import Scans, in_time
+from fuselog.replay.inference.association.shared_bias import pool_errors, pool_of
+from fuselog.replay.inference.association.track_management import MANAGEMENTS
+from fuselog.replay.inference.association.tracks import no_tracks
 
 PLACES = np.array([[0.0, 0.0], [4.0, 1.0], [9.0, -1.0]])
 COVARIANCES = np.array([[[1, 0], [0, 2]], [[2, 0.5], [0.5, 1]], [[1.5, 0], [0, 1.5]]]) + np.array(

@@ -9,17 +9,17 @@ from numpy.testing import assert_allclose, assert_equal
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.planar import range_bearing
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
-from replay.estimators.models.landmarks import RECKONING, ROBOT
-from replay.inference.model.augmentation import augmented
-from replay.inference.model.checking import check_model
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.models.planar import range_bearing
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.estimators.models.landmarks import RECKONING, ROBOT
+from fuselog.replay.inference.model.augmentation import augmented
+from fuselog.replay.inference.model.checking import check_model
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import (

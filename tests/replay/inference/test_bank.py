@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.results import ALL_WELL
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import difference
-from replay.inference.all_methods import modelled
-from replay.inference.kalman.steps import InnovationRecord, Measurement, Steps, workspace
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.stage import Stage
-from replay.inference.modes.gaussian_sum import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.kalman.steps import InnovationRecord, Measurement, Steps, workspace
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.modes.gaussian_sum import (
     AGREED,
     GaussianSumBelief,
     gaussian_sum_steps,
@@ -206,7 +206,7 @@ def test_members_agree_by_the_squared_distance_of_their_means(share: float):
 
 
 def test_what_has_no_angle_is_refused():
-    from replay.estimators.models.ranging import RANGING_POSITION
+    from fuselog.replay.estimators.models.ranging import RANGING_POSITION
 
     with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, across which"):
         modelled(RANGING_POSITION, "bank:ekf")

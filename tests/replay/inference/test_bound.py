@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.output.summary import error_charts
-from pipeline.runs.ensemble import Part, replay_parts
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.smoothing.bound import back_memory, smooth
-from replay.judging.consistency.bounds import Bounds, Output
+from fuselog.pipeline.output.summary import error_charts
+from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.smoothing.bound import back_memory, smooth
+from fuselog.replay.judging.consistency.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_cells import NEAR_LINEAR, SCENARIOS

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.runs.recorded import record_ensemble, replay_ensemble
-from replay.engine.streams.sources import MemorySource
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import registered_models
-from replay.judging.errors.evaluation import Errors
+from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.judging.errors.evaluation import Errors
 from tests.replay.inference.wheel import make_wheel
 
 RUNS = 30

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.inference.estimators import registered_models
-from replay.inference.model.checking import check_model
-from replay.inference.model.model import Correction, Model, Motion
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.model.checking import check_model
+from fuselog.replay.inference.model.model import Correction, Model, Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

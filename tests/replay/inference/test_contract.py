@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.parameters import build
-from recorders.recording import Recording, record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference import estimators
-from replay.inference.all_methods import METHODS
-from replay.inference.model.binding import _common
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage, stage_of
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.parameters import build
+from fuselog.recorders.recording import Recording, record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference import estimators
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.model.binding import _common
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.stage import Stage, stage_of
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

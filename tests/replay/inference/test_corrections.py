@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from replay.estimators.navigation.navigation import INERTIAL
-from replay.estimators.navigation.turning import heading, move, move_back
-from replay.inference.linear_algebra.manifold import boxminus
-from replay.inference.model.augmentation import augmented
-from replay.inference.model.corrections import comparing, correcting, relinearising, sloping
+from fuselog.replay.estimators.navigation.navigation import INERTIAL
+from fuselog.replay.estimators.navigation.turning import heading, move, move_back
+from fuselog.replay.inference.linear_algebra.manifold import boxminus
+from fuselog.replay.inference.model.augmentation import augmented
+from fuselog.replay.inference.model.corrections import comparing, correcting, relinearising, sloping
 
 MODEL = augmented(INERTIAL, ("lever_x_m",))
 N, T = MODEL.size, MODEL.tangent

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import Recursive
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.replaying.estimator import Recursive
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")

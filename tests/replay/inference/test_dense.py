@@ -12,12 +12,12 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import outputs
 
 Floats = NDArray[np.float64]

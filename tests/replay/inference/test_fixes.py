@@ -8,18 +8,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.geodesy import earth_centred, out_of_tangent_plane
-from recorders.recording import Recording
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.geodetic import in_plane
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.binding import topics_of
-from replay.inference.model.model import Model, Motion
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.geodesy import earth_centred, out_of_tangent_plane
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.geodetic import in_plane
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.binding import topics_of
+from fuselog.replay.inference.model.model import Model, Motion
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]

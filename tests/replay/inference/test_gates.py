@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from replay.inference.run import filtering
+from fuselog.replay.inference.run import filtering
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, source
 

@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
-from recorders.log import schemas
-from replay.engine.streams.results import ALL_WELL
-from replay.inference.all_methods import METHODS
-from replay.inference.kalman.steps import (
+from fuselog.recorders.log import schemas
+from fuselog.replay.engine.streams.results import ALL_WELL
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.kalman.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -25,16 +25,16 @@ from replay.inference.kalman.steps import (
     Workspace,
     workspace,
 )
-from replay.inference.kalman.update import kalman_update
-from replay.inference.linear_algebra.gaussian import cholesky
-from replay.inference.linear_algebra.manifold import boxminus, boxplus, recentring
-from replay.inference.linear_algebra.sparse import pattern_of, propagating_covariance
-from replay.inference.model.model import Control, Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.model.stage import Stage, stage_of
-from replay.inference.run.recursion import fault_of
-from replay.sampling.samplers import unscented
-from replay.sampling.sets import SampleSets
+from fuselog.replay.inference.kalman.update import kalman_update
+from fuselog.replay.inference.linear_algebra.gaussian import cholesky
+from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus, recentring
+from fuselog.replay.inference.linear_algebra.sparse import pattern_of, propagating_covariance
+from fuselog.replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.stage import Stage, stage_of
+from fuselog.replay.inference.run.recursion import fault_of
+from fuselog.replay.sampling.samplers import unscented
+from fuselog.replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)

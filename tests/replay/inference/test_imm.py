@@ -11,18 +11,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import rotation_vector
-from replay.inference.all_methods import METHODS
-from replay.inference.model.model import Model, Motion, Sensor, Switching
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.modes.mixing import MixtureMemory, mixing, transition_matrix
-from replay.inference.run import filtering
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.model.model import Model, Motion, Sensor, Switching
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.modes.mixing import MixtureMemory, mixing, transition_matrix
+from fuselog.replay.inference.run import filtering
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

@@ -10,16 +10,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
-from pipeline.runs.recorded import replay_ensemble
-from recorders.errors import BadInput
-from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import rotation_vector
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import modelled_by
-from replay.inference.model.model import Motion
-from replay.inference.smoothing.affine import robust
+from fuselog.pipeline.runs.recorded import replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import modelled_by
+from fuselog.replay.inference.model.model import Motion
+from fuselog.replay.inference.smoothing.affine import robust
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from replay.engine.replaying.estimator import Batch, Recursive
-from replay.engine.replaying.late import parse_late, taking_late
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import MemorySource
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.replay.engine.replaying.estimator import Batch, Recursive
+from fuselog.replay.engine.replaying.late import parse_late, taking_late
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import bound
 from tests.replay.inference.test_imm import SWITCHING_A

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.estimators.localization.least_squares import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.estimators.localization.least_squares import (
     SENTENCES,
     Linearization,
     Status,

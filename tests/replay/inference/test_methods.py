@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.models.orientation import compose, conjugate
-from replay.engine.vectors.tangent import rotation_vector
-from replay.inference.kalman.regression import regression, sample_memory
-from replay.inference.linear_algebra.manifold import by_right_jacobian
-from replay.sampling.sets import SampleSets
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.kalman.regression import regression, sample_memory
+from fuselog.replay.inference.linear_algebra.manifold import by_right_jacobian
+from fuselog.replay.sampling.sets import SampleSets
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.api.observability import observability
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.recording import Recording
-from replay.engine.streams.measurements import PLANE
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.smoothing.iterated import IteratedSmoother
+from fuselog.pipeline.api.observability import observability
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.smoothing.iterated import IteratedSmoother
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.test_smoothers import LEVEL, levels
 

@@ -14,22 +14,22 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.log import schemas
-from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording
-from replay.engine.philox import fill_normals, philox, unit
-from replay.engine.replaying.estimator import bind
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import memory_source
-from replay.engine.vectors.tangent import rotation_vector
-from replay.inference.all_methods import METHODS
-from replay.inference.estimators import of_any_model
-from replay.inference.model.model import Motion
-from replay.inference.particles.filter import BOOTSTRAP
-from replay.judging.metrics.measuring import Output
-from replay.judging.metrics.metrics import PARTICLES
-from replay.sampling.resampling import choose_systematically
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.philox import fill_normals, philox, unit
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.estimators import of_any_model
+from fuselog.replay.inference.model.model import Motion
+from fuselog.replay.inference.particles.filter import BOOTSTRAP
+from fuselog.replay.judging.metrics.measuring import Output
+from fuselog.replay.judging.metrics.metrics import PARTICLES
+from fuselog.replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs
@@ -185,7 +185,7 @@ def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Fl
 def test_every_step_is_that_of_a_plain_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same random numbers: missing components, equal stamps, angles, resampling."""
     key = np.array([1, 2], np.uint64)
-    monkeypatch.setattr("replay.inference.particles.filter.run_key", lambda *_: key)
+    monkeypatch.setattr("fuselog.replay.inference.particles.filter.run_key", lambda *_: key)
     told = vehicle_a.simulate(7)[0][:34]
     assert sum(np.isnan(each[3]).any() for each in told) > 2
     means, covariances, effective, likelihoods, resamplings = plain(told, 60, key)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.errors import BadInput
-from replay.inference.kalman.steps import Gaussian
-from replay.inference.particles.particles import Cloud
-from replay.inference.particles.progressive import kernel_of, renewing
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.inference.kalman.steps import Gaussian
+from fuselog.replay.inference.particles.particles import Cloud
+from fuselog.replay.inference.particles.progressive import kernel_of, renewing
 from tests.replay.inference import scalar
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR

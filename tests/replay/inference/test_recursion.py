@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
-from recorders.recording import Recording
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.inference.run.recursion import no_results
-from replay.inference.run.timing import add_output_times, output_times
+from fuselog.recorders.log import LogWriter, Stream, make_stream, open_log, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from fuselog.replay.inference.run.recursion import no_results
+from fuselog.replay.inference.run.timing import add_output_times, output_times
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, VALUE

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.recorded import replay_ensemble
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import rotation_vector
-from replay.inference.linear_algebra.gaussian import solve_semidefinite
-from replay.inference.linear_algebra.manifold import by_right_jacobian
-from replay.inference.model.model import Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
-from replay.inference.smoothing import smoothers
+from fuselog.pipeline.runs.recorded import replay_ensemble
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.orientation import compose, conjugate
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.linear_algebra.gaussian import solve_semidefinite
+from fuselog.replay.inference.linear_algebra.manifold import by_right_jacobian
+from fuselog.replay.inference.model.model import Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.smoothing import smoothers
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

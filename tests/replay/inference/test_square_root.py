@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.linear_algebra.factors import fill_root, orthogonalise
-from replay.inference.model.model import Model, Motion, Sensor, Switching
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.linear_algebra.factors import fill_root, orthogonalise
+from fuselog.replay.inference.model.model import Model, Motion, Sensor, Switching
+from fuselog.replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 import fuselog as fl
-from replay.inference.all_methods import METHODS
-from replay.inference.model.stage import title_of
-from replay.inference.run import filtering
+from fuselog.replay.inference.all_methods import METHODS
+from fuselog.replay.inference.model.stage import title_of
+from fuselog.replay.inference.run import filtering
 from tests.replay.inference.vehicle_a import VEHICLE_A
 
 
@@ -20,7 +20,7 @@ def test_a_long_first_use_is_told_with_method_and_model(
 ) -> None:
     """While it happens and when it is done, and not again."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.compiling.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("fuselog.replay.engine.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     log = fl.record("landmarks", duration_s=1.0)
     for _ in range(2):

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Field, Schema, make_stream, schemas
-from recorders.log.run import RunMetadata
-from recorders.models.planar import range_bearing
-from recorders.recording import Recording
-from replay.engine.streams.measurements import PLANE
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, Motion, Sensor
-from replay.inference.model.parameters import ModelParameters
+from fuselog.recorders.log import Field, Schema, make_stream, schemas
+from fuselog.recorders.log.run import RunMetadata
+from fuselog.recorders.models.planar import range_bearing
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 MEAN = np.array([0.0, 0.0, 0.0, 1.0, 0.2])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from recorders.log import schemas
-from replay.engine.streams.blocks import gather
-from replay.judging.consistency.conditioning import Conditioning, conditioning_of, least_pivots
+from fuselog.recorders.log import schemas
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.judging.consistency.conditioning import Conditioning, conditioning_of, least_pivots
 
 VECTOR = schemas.VECTOR_MEASUREMENT
 

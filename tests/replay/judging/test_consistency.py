@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.judging.consistency.consistency import (
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.judging.consistency.consistency import (
     component_error_squared,
     dilution_of_precision,
     ellipse_area,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.comparing.candidates import Candidate, of_replay
-from replay.judging.errors.differences import paired_difference, target_of
+from fuselog.pipeline.comparing.candidates import Candidate, of_replay
+from fuselog.replay.judging.errors.differences import paired_difference, target_of
 
 PAIRS, RUNS = 200, 50
 CALLED = ("better", "worse", "higher", "lower")

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from recorders.log import make_stream, schemas
-from recorders.models.orientation import conjugate, rotate
-from replay.judging.consistency.disturbances import COMPONENTS, disturbances
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.orientation import conjugate, rotate
+from fuselog.replay.judging.consistency.disturbances import COMPONENTS, disturbances
 
 TIME_S = np.arange(0.0, 30.0, 0.1)
 FIELD_UT = np.array([0.0, 18.0, -40.0])

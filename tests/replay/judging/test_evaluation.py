@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recorders.errors import BadInput
-from recorders.log import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import (
     RunMetadata,
     Stream,
     make_stream,
@@ -22,24 +22,24 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.streams import empty_stream
-from recorders.recording import Recording
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.priors import priors_of
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.engine.vectors.tangent import truth_at
-from replay.judging.errors.alignment import Alignment, aligned_estimates
-from replay.judging.errors.evaluation import (
+from fuselog.recorders.log.streams import empty_stream
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.priors import priors_of
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.judging.errors.alignment import Alignment, aligned_estimates
+from fuselog.replay.judging.errors.evaluation import (
     chi_square_interval,
     components_without_truth,
     errors_of,
     innovations_of,
 )
-from replay.judging.errors.truths import Truths
-from replay.judging.judge import Judge
-from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
-from replay.judging.tables import error_table
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
+from fuselog.replay.judging.tables import error_table
 
 SECOND = 1_000_000_000
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}

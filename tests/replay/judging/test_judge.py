@@ -10,19 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.log import Clock, Schema, Stream, make_stream, schemas
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import Report, collect, replay
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.diagnostics import Diagnostics
-from replay.judging.errors.constant import _inverse
-from replay.judging.errors.evaluation import chi_square_interval, rmse_interval
-from replay.judging.errors.truths import Truths
-from replay.judging.judge import Judge
-from replay.judging.metrics.sums import BinnedSums
+from fuselog.recorders.log import Clock, Schema, Stream, make_stream, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import Report, collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.diagnostics import Diagnostics
+from fuselog.replay.judging.errors.constant import _inverse
+from fuselog.replay.judging.errors.evaluation import chi_square_interval, rmse_interval
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.sums import BinnedSums
 
 GAP_S = 0.2
 

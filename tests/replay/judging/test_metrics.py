@@ -5,12 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from replay.engine.streams.blocks import Ragged
-from replay.judging.errors.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
-from replay.judging.metrics.measuring import Output, find_metrics, measure, metric_of_sums
-from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, FAILURES, INNOVATION, LIKELIHOOD
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.judging.errors.evaluation import (
+    Errors,
+    Innovations,
+    chi_square_interval,
+    rmse_interval,
+)
+from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure, metric_of_sums
+from fuselog.replay.judging.metrics.metrics import (
+    ACCURACY,
+    CONSISTENCY,
+    FAILURES,
+    INNOVATION,
+    LIKELIHOOD,
+)
 
 
 def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.judging.consistency.sequential import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.judging.consistency.sequential import (
     Rates,
     decide,
     first_alarm,

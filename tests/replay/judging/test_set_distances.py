@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from recorders.errors import BadInput
-from replay.judging.sets.distances import gospa, gospa_pairs, ospa
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.judging.sets.distances import gospa, gospa_pairs, ospa
 
 THREE = [(0, 0), (10, 0), (0, 10)]
 EMPTY = np.empty((0, 2))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.recording import Recording
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.errors.truths import Truths
-from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import measure
-from replay.judging.sets.errors import SETS, set_errors
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.metrics.measuring import measure
+from fuselog.replay.judging.sets.errors import SETS, set_errors
 
 SECOND = 1_000_000_000
 PLANE = {"components": "x_m,speed_mps,y_m", "kinds": "linear,linear,linear"}

@@ -5,10 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.judging.sets.distances import gospa, gospa_pairs
-from replay.judging.tracks.distances import THRESHOLDS, hota, idf1, trajectory_gospa
-from replay.judging.tracks.errors import TracksAt, figures_of_whole_tracks, track_errors, track_figures
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.judging.sets.distances import gospa, gospa_pairs
+from fuselog.replay.judging.tracks.distances import THRESHOLDS, hota, idf1, trajectory_gospa
+from fuselog.replay.judging.tracks.errors import (
+    TracksAt,
+    figures_of_whole_tracks,
+    track_errors,
+    track_figures,
+)
 from tests.replay.judging import track_peers
 
 NO = (np.nan, np.nan)

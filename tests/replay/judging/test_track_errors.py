@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.recording import import_run
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.judging.judge import Judge
-from replay.judging.tracks.errors import (
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
+from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.tracks.errors import (
     SOME_ARE_KNOWN,
     UNREFERENCED_M,
     TracksAt,

@@ -12,20 +12,20 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.trajectories import Trajectory, read_trajectory
-from replay.engine.vectors.covariances import normalized_error_squared
-from replay.engine.vectors.tangent import difference
-from replay.judging.errors.alignment import Alignment, aligned, aligned_estimates, alignment_of
-from replay.judging.errors.trajectories import (
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.trajectories import Trajectory, read_trajectory
+from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.tangent import difference
+from fuselog.replay.judging.errors.alignment import Alignment, aligned, aligned_estimates, alignment_of
+from fuselog.replay.judging.errors.trajectories import (
     Comparison,
     compare,
     estimated_offset_s,
     statistics,
     trajectory_metrics,
 )
-from replay.judging.errors.trajectory_streams import trajectory_of
+from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 
 SECOND = 1_000_000_000
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from recorders.log import Stream, make_stream, schemas
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.judging.consistency.whiteness import whitened, whiteness
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from tests.replay.inference.sheet_robot import of_sigmas, recorded
 
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from replay.sampling import lcd_distance
-from replay.sampling.distance import B_MAX, lcd_distance_and_gradient
-from replay.sampling.samplers import rotated, unscented
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling import lcd_distance
+from fuselog.replay.sampling.distance import B_MAX, lcd_distance_and_gradient
+from fuselog.replay.sampling.samplers import rotated, unscented
 
 
 def printed_distance(points, weights):

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
-from replay.sampling import lcd_distance, lcd_samples, moment_corrected
-from replay.sampling.distance import lcd_distance_and_gradient
-from replay.sampling.lcd import check_count
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling import lcd_distance, lcd_samples, moment_corrected
+from fuselog.replay.sampling.distance import lcd_distance_and_gradient
+from fuselog.replay.sampling.lcd import check_count
 
 pytestmark = pytest.mark.paper
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorders.errors import BadInput
-from replay.sampling import SetName, cached_set
-from replay.sampling.cache import SHIPPED, cache_folder, compute_set, read_set, write_sets
-from replay.sampling.ship import COMMON
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling import SetName, cached_set
+from fuselog.replay.sampling.cache import SHIPPED, cache_folder, compute_set, read_set, write_sets
+from fuselog.replay.sampling.ship import COMMON
 
 SMALL = SetName(2, 4, seed=11)
 

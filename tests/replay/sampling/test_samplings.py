@@ -6,9 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from recorders.errors import BadInput
-from replay.sampling import lcd_distance, parse_sampling
-from replay.sampling.samplers import Samples, axis_points, randomised_unscented, rotated, unscented
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.sampling import lcd_distance, parse_sampling
+from fuselog.replay.sampling.samplers import (
+    Samples,
+    axis_points,
+    randomised_unscented,
+    rotated,
+    unscented,
+)
 
 NAMES = ["ukf", "ukf:kappa=-0.5", "gf-2", "gf-25", "rukf-3", "s2kf-25", "s2kf-50:symmetric:rotation=4"]
 

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.models.scores import Matcher, score_stream
-from recorders.recording import Recording
-from replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.models.scores import Matcher, score_stream
+from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.replay.timeline.making import logged_late
 
 SECOND = 10**9

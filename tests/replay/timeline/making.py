@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recorders.log import Stream, make_stream, schemas
-from recorders.recording import record_run
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.sources import MemorySource, memory_source
-from replay.engine.vectors.tangent import tangent_components
-from replay.judging.errors.evaluation import Errors, Floats
-from replay.judging.judge import Judge
-from replay.timeline.show import show
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.judging.errors.evaluation import Errors, Floats
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.show import show
 from tests.replay.timeline.reading import Picture, Titles, Wanted, check_clocks, picture_of, quality
 
 ESTIMATORS = ("one", "two")

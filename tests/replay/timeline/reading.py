@@ -15,9 +15,9 @@ import rerun.chunk as rc
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recorders.log import Stream
-from replay.judging.errors.evaluation import Errors, Floats, chi_square_interval
-from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
+from fuselog.recorders.log import Stream
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, chi_square_interval
+from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
 from tests.replay.timeline.test_timeline import Columns, read, told
 
 # Kinds of containers, as Rerun numbers them, and the view that names colours.

@@ -8,10 +8,10 @@ import pytest
 from matplotlib.colors import rgb_to_hsv
 from scipy.stats import chi2
 
-from recorders.log import make_stream, schemas
-from replay.timeline.drawing.canvas import PALETTE, WRONG
-from replay.timeline.families.ais import track_colours
-from replay.timeline.show import Drawing
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.timeline.drawing.canvas import PALETTE, WRONG
+from fuselog.replay.timeline.families.ais import track_colours
+from fuselog.replay.timeline.show import Drawing
 from tests.replay.timeline.made_runs import SECOND, own, samples, scores, sets, vessels
 from tests.replay.timeline.making import ESTIMATORS, columns, drawn, of_both, record
 from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
@@ -186,7 +186,7 @@ def test_two_stand_side_by_side_above_how_much_farther_off_the_second_is(tmp_pat
 def test_where_a_thinned_estimate_begins_it_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("replay.timeline.drawing.events.thin", lambda times: times[::2])
+    monkeypatch.setattr("fuselog.replay.timeline.drawing.events.thin", lambda times: times[::2])
     source = record("landmarks", duration_s=2.0, landmarks=3)
     run = drawn(tmp_path, source, of_both(source, "robot1"))
     for name, stream, _ in run.estimates("robot1"):
@@ -200,7 +200,7 @@ def test_nothing_is_lost_where_a_block_ends_or_a_number_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Blocks of three messages, many of which share a stamp; one of two components may be missing."""
-    monkeypatch.setattr("replay.timeline.drawing.thinning.BLOCK_MESSAGES", 3)
+    monkeypatch.setattr("fuselog.replay.timeline.drawing.thinning.BLOCK_MESSAGES", 3)
     stamps = SECOND * np.repeat(np.arange(1, 9), [1, 2, 4, 1, 3, 5, 1, 2])
     value = np.stack([np.arange(19.0), -np.arange(19.0)], axis=1)
     value[4::5, 0] = np.nan

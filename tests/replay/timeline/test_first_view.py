@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from recorders.recording import Simulator, record_run
-from recorders.registry import available, load
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.judging.judge import Judge
-from replay.timeline.show import show
+from fuselog.recorders.recording import Simulator, record_run
+from fuselog.recorders.registry import available, load
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.show import show
 from tests.replay.timeline.reading import check_first_view, picture_of
 
 

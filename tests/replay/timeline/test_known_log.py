@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
-from replay.judging.judge import Judge
-from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
-from replay.timeline.show import Drawing
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
+from fuselog.replay.timeline.show import Drawing
 from tests.replay.timeline.test_timeline import Columns, read, told
 
 SECOND = 10**9

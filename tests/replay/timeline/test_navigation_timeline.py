@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.states import NAVIGATION, state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import memory_source
-from replay.timeline.drawing.canvas import PALETTE
-from replay.timeline.drawing.geodetic import POOR, QUALITIES
-from replay.timeline.show import show
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.recorders.models.states import NAVIGATION, state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.timeline.drawing.canvas import PALETTE
+from fuselog.replay.timeline.drawing.geodetic import POOR, QUALITIES
+from fuselog.replay.timeline.show import show
 from tests.replay.timeline.reading import Picture, Wanted, check_views, compare, picture_of
 from tests.replay.timeline.test_timeline import told
 

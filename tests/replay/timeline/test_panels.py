@@ -7,14 +7,14 @@ import pytest
 import rerun.blueprint as rrb
 import rerun.chunk as rc
 
-from recorders.log import RunMetadata, Stream, make_stream, schemas
-from recorders.models.states import state_metadata
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import chi_square_interval
-from replay.judging.judge import Judge
-from replay.timeline.drawing.plots import in_strips
-from replay.timeline.show import show
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.models.states import state_metadata
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.drawing.plots import in_strips
+from fuselog.replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read, told, views
 
 SECONDS = np.arange(50)

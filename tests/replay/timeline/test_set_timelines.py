@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from recorders.log import schemas
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.sources import memory_source
-from replay.judging.judge import Judge
-from replay.judging.sets.regions import areas_of, rings_of
-from replay.timeline.families.networks import ARRIVED, LOST
-from replay.timeline.show import show
+from fuselog.recorders.log import schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.judging.sets.regions import areas_of, rings_of
+from fuselog.replay.timeline.families.networks import ARRIVED, LOST
+from fuselog.replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read, told
 
 

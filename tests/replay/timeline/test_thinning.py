@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from pipeline.runs.ensemble import Part, replay_parts
-from recorders.log import make_stream, open_log, schemas, write_log
-from recorders.recording import record_run
-from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource
-from replay.judging.errors.evaluation import errors_at
-from replay.judging.judge import Judge
-from replay.timeline import show
-from replay.timeline.drawing import thinning
-from replay.timeline.drawing.canvas import thin_curve
-from replay.timeline.drawing.thinning import thinned_stream
-from replay.timeline.show import Drawing
-from replay.timeline.sinks import open_recording
-from replay.timeline.viewer import listen
+from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.recorders.log import make_stream, open_log, schemas, write_log
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.errors.evaluation import errors_at
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline import show
+from fuselog.replay.timeline.drawing import thinning
+from fuselog.replay.timeline.drawing.canvas import thin_curve
+from fuselog.replay.timeline.drawing.thinning import thinned_stream
+from fuselog.replay.timeline.show import Drawing
+from fuselog.replay.timeline.sinks import open_recording
+from fuselog.replay.timeline.viewer import listen
 from tests.replay.timeline.making import of_both, record
 from tests.replay.timeline.test_timeline import read
 
@@ -134,7 +134,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A log of several blocks: errors and their plots are there while blocks are still to come."""
-    monkeypatch.setattr("replay.timeline.show.LIVE_MESSAGES", 250)
+    monkeypatch.setattr("fuselog.replay.timeline.show.LIVE_MESSAGES", 250)
     log, live = tmp_path / "log.mcap", tmp_path / "live.rrd"
     recording, run = record_run("landmarks", {"duration_s": 750.0}, 3, 0)
     write_log(log, recording.streams, run)

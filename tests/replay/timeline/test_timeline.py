@@ -23,23 +23,23 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 from scipy.stats import chi2
 
-from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, open_log, schemas
-from recorders.recording import record_run
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect
-from replay.engine.replaying.replaying import replay as replayed
-from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.measurements import PLANE, covariances_of
-from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.judging.errors.evaluation import Errors, chi_square_interval
-from replay.judging.judge import Judge
-from replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
-from replay.timeline.drawing.plane import ellipses
-from replay.timeline.families.landmarks import GATED
-from replay.timeline.show import Drawing, show
-from replay.timeline.sinks import open_recording
-from replay.timeline.viewer import Listener, listen, screenshot, view
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import RunMetadata, Stream, make_stream, open_log, schemas
+from fuselog.recorders.recording import record_run
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect
+from fuselog.replay.engine.replaying.replaying import replay as replayed
+from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from fuselog.replay.judging.errors.evaluation import Errors, chi_square_interval
+from fuselog.replay.judging.judge import Judge
+from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
+from fuselog.replay.timeline.drawing.plane import ellipses
+from fuselog.replay.timeline.families.landmarks import GATED
+from fuselog.replay.timeline.show import Drawing, show
+from fuselog.replay.timeline.sinks import open_recording
+from fuselog.replay.timeline.viewer import Listener, listen, screenshot, view
 
 SENSOR = {"rate_hz": 5.0, "outlier_probability": 0.05, "outages_per_minute": 9.0, "outage_s": 2.0}
 RUN = 1
@@ -710,7 +710,7 @@ def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
 def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:
     """Nobody is left to end it: it notices that the pipe from its parent has closed."""
     program = (
-        "import sys, time; from pathlib import Path; from replay.timeline.viewer import listen\n"
+        "import sys, time; from pathlib import Path; from fuselog.replay.timeline.viewer import listen\n"
         "with listen(Path(sys.argv[1]), '--headless') as listener:\n"
         "    print(listener.url, flush=True); time.sleep(60)"
     )

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from recorders.log import make_stream, schemas
-from recorders.models.states import state_metadata
-from recorders.recording import SIMULATION_EPOCH_NS
-from replay.engine.replaying.estimator import bind
-from replay.engine.replaying.replaying import collect, replay
-from replay.judging.tracks.errors import instants_of, track_errors, tracks_at
-from replay.timeline.families.tracking import RAY_M
-from replay.timeline.show import show
+from fuselog.recorders.log import make_stream, schemas
+from fuselog.recorders.models.states import state_metadata
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS
+from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.judging.tracks.errors import instants_of, track_errors, tracks_at
+from fuselog.replay.timeline.families.tracking import RAY_M
+from fuselog.replay.timeline.show import show
 from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, sensor
 from tests.replay.timeline.making import PLANE, block, columns, ellipses, logged_late, path, unit
 from tests.replay.timeline.reading import Wanted, check_clocks, check_views, compare, picture_of

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats
-from replay.engine.compiling.compile import compile_over_runs
-from replay.tracing.functions import Derivative, TracedFunction
-from replay.tracing.graph import Node
-from replay.tracing.traced import Trace
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.tracing.functions import Derivative, TracedFunction
+from fuselog.replay.tracing.graph import Node
+from fuselog.replay.tracing.traced import Trace
 
 
 def linearised(function: Callable[[Any], Any], variables: int) -> Derivative:

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.models import acoustic, optical
-from replay.engine.arrays import Floats
-from replay.tracing import traced
-from replay.tracing.functions import Derivative
+from fuselog.recorders.models import acoustic, optical
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.tracing import traced
+from fuselog.replay.tracing.functions import Derivative
 from tests.bench.reference.landmarks import drive_jacobians, range_bearing_jacobian
 from tests.replay.tracing.calls import by_compiler, by_python, linearised
 
@@ -371,7 +371,7 @@ MODELS = [
 ]
 NOISE, MEDIUM = acoustic.Noise(0.02, 0.03, 0.001, 1.0), acoustic.Medium()
 MODULES = {name for call, _, _ in MODELS for name in re.findall(r"(\w+)\.\w+\(", call)}
-NAMES = {name: import_module(f"recorders.models.{name}") for name in MODULES}
+NAMES = {name: import_module(f"fuselog.recorders.models.{name}") for name in MODULES}
 
 
 @cache

@@ -8,12 +8,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from replay.inference.estimators import registered_models
-from replay.inference.formulas import formulas_by_function
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.validation import trial_state
-from replay.tracing.formulas import formulas_of
-from replay.tracing.functions import traced
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.formulas import formulas_by_function
+from fuselog.replay.inference.model.parameters import number_fields, settings_type
+from fuselog.replay.inference.model.validation import trial_state
+from fuselog.replay.tracing.formulas import formulas_of
+from fuselog.replay.tracing.functions import traced
 
 
 class Text(NamedTuple):

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.errors import BadInput
-from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.model.checking import check_model
-from replay.inference.model.model import Model
-from replay.tracing.functions import Shape, TracedFunction, traced
-from replay.tracing.graph import Graph
-from replay.tracing.traced import _LOGICAL, _OPERATORS, PRIMITIVES, where
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.inference.model.checking import check_model
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.tracing.functions import Shape, TracedFunction, traced
+from fuselog.replay.tracing.graph import Graph
+from fuselog.replay.tracing.traced import _LOGICAL, _OPERATORS, PRIMITIVES, where
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, VALUE, source
 from tests.replay.tracing.calls import by_compiler, by_python, linearised, over_points
@@ -291,7 +291,7 @@ def test_of_known_numbers_where_is_a_choice():
 
 
 def test_a_graph_holds_just_as_many_nodes_as_it_says(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("replay.tracing.graph.MOST_NODES", 3)
+    monkeypatch.setattr("fuselog.replay.tracing.graph.MOST_NODES", 3)
     graph = Graph()
     for value in (1.0, 2.0, 3.0, 2.0):  # the last is known
         graph.constant(value)

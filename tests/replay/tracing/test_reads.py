@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from replay.inference.estimators import registered_models
-from replay.inference.model.stage import stage_of
-from replay.tracing import functions
-from replay.tracing.functions import TracedFunction, traced
+from fuselog.replay.inference.estimators import registered_models
+from fuselog.replay.inference.model.stage import stage_of
+from fuselog.replay.tracing import functions
+from fuselog.replay.tracing.functions import TracedFunction, traced
 
 Function = Callable[[Any], Any]
 Change = Callable[[], None]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.output.alarming import alarms_of
-from pipeline.output.alarms import Alarm
-from pipeline.output.coverage import sentences
-from pipeline.output.terminal import print_others, print_worst
-from replay.engine.replaying.usage import EARLY, SILENT, UNTAKEN, Row
-from replay.judging.consistency.conditioning import Conditioning
-from replay.judging.errors.constant import Constant
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.coverage import sentences
+from fuselog.pipeline.output.terminal import print_others, print_worst
+from fuselog.replay.engine.replaying.usage import EARLY, SILENT, UNTAKEN, Row
+from fuselog.replay.judging.consistency.conditioning import Conditioning
+from fuselog.replay.judging.errors.constant import Constant
 from tests.words.made.printing import printed
 
 POSE = "/estimates/ekf/robot1/pose"

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from pipeline.output.claims import Claim
-from pipeline.output.terminal import print_claims
+from fuselog.pipeline.output.claims import Claim
+from fuselog.pipeline.output.terminal import print_claims
 from tests.words.made.printing import printed
 
 

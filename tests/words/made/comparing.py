@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.checking.discrepancies import Discrepancy
-from pipeline.comparing.comparing import Paired
-from pipeline.comparing.groups import unlike_runs
-from replay.judging.errors.differences import Difference, Target, paired_difference
+from fuselog.pipeline.checking.discrepancies import Discrepancy
+from fuselog.pipeline.comparing.comparing import Paired
+from fuselog.pipeline.comparing.groups import unlike_runs
+from fuselog.replay.judging.errors.differences import Difference, Target, paired_difference
 
 EIGHT = np.array([1.0, 1.2, 0.9, 1.1, 1.05, 0.95, 1.15, 0.85])
 

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-from pipeline.api.api import record, write
-from pipeline.deploying import certificate
-from pipeline.deploying.c_replay import why_no_replay
-from pipeline.deploying.deploying import deploy
-from pipeline.deploying.folder import lost_sentence
+from fuselog.pipeline.api.api import record, write
+from fuselog.pipeline.deploying import certificate
+from fuselog.pipeline.deploying.c_replay import why_no_replay
+from fuselog.pipeline.deploying.deploying import deploy
+from fuselog.pipeline.deploying.folder import lost_sentence
 from tests.replay.estimators.test_attitude import carried
 
 _DIGEST = re.compile(r"\b[0-9a-f]{16}\b")

@@ -6,21 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.api.api import record
-from pipeline.diagnosing.advice import Advice, Trying, number
-from pipeline.diagnosing.battery.car import faulty, recorded
-from pipeline.diagnosing.causes import Cause
-from pipeline.diagnosing.consistency import unnamed, unseen_errors
-from pipeline.diagnosing.diagnosis import Diagnosis
-from pipeline.diagnosing.findings import Finding, of_estimates, of_innovations, of_messages
-from pipeline.diagnosing.hypotheses.components import of_components
-from pipeline.diagnosing.hypotheses.exchanges import of_numbers
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.sentences import notes_of, ranked
-from recorders.log import Stream, make_stream, schemas
-from replay.engine.replaying.estimator import bind
+from fuselog.pipeline.api.api import record
+from fuselog.pipeline.diagnosing.advice import Advice, Trying, number
+from fuselog.pipeline.diagnosing.battery.car import faulty, recorded
+from fuselog.pipeline.diagnosing.causes import Cause
+from fuselog.pipeline.diagnosing.consistency import unnamed, unseen_errors
+from fuselog.pipeline.diagnosing.diagnosis import Diagnosis
+from fuselog.pipeline.diagnosing.findings import Finding, of_estimates, of_innovations, of_messages
+from fuselog.pipeline.diagnosing.hypotheses.components import of_components
+from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.sentences import notes_of, ranked
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.replay.engine.replaying.estimator import bind
 
 TRYING = Trying("ekf", {}, is_own=False)
 SECOND_NS = 1_000_000_000

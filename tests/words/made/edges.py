@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.linting import columns, covariances, forces, magnetic, places, stamps
-from recorders.log import Stream
-from recorders.plausibility import speeds, turns
-from recorders.plausibility import stamps as clocks
-from recorders.plausibility.finding import Finding
+from fuselog.recorders.linting import columns, covariances, forces, magnetic, places, stamps
+from fuselog.recorders.log import Stream
+from fuselog.recorders.plausibility import speeds, turns
+from fuselog.recorders.plausibility import stamps as clocks
+from fuselog.recorders.plausibility.finding import Finding
 from tests.words.made.faulty import (
     ROWS,
     UPRIGHT,

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream, make_stream, schemas
-from recorders.plausibility.body import Body, Fixes, Series
-from recorders.plausibility.motion import Forces, Lag, Motion, Slope
-from recorders.plausibility.timing import Timing
+from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.plausibility.body import Body, Fixes, Series
+from fuselog.recorders.plausibility.motion import Forces, Lag, Motion, Slope
+from fuselog.recorders.plausibility.timing import Timing
 
 BEGIN_NS = 1_700_000_000 * 10**9
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
-from recorders.importers.tables.guessing import guess
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.tables.guessing import guess
 
 ROWS = np.arange(24)
 # A drive to the north-north-east, whose course in degrees clockwise from north is 20.

@@ -7,10 +7,10 @@ from importlib.util import find_spec
 from types import SimpleNamespace
 from unittest.mock import patch
 
-from pipeline.api.api import record
-from pipeline.exploring.newest import NewestFirst
-from pipeline.exploring.session import open_session
-from recorders.errors import BadInput
+from fuselog.pipeline.api.api import record
+from fuselog.pipeline.exploring.newest import NewestFirst
+from fuselog.pipeline.exploring.session import open_session
+from fuselog.recorders.errors import BadInput
 
 
 def pressed() -> Iterator[str]:
@@ -19,8 +19,8 @@ def pressed() -> Iterator[str]:
         return
     from bokeh.document import Document
 
-    from pipeline.exploring import markup
-    from pipeline.exploring.page import Page
+    from fuselog.pipeline.exploring import markup
+    from fuselog.pipeline.exploring.page import Page
 
     source = record("landmarks", seed=3, duration_s=2.0, landmarks=4)
     document = Document()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.diagnosing.battery.car import (
+from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
     UNIT_FAULTS,
     faulty,
@@ -13,8 +13,8 @@ from pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
-from recorders.log import Stream
-from recorders.plausibility.checks import findings
+from fuselog.recorders.log import Stream
+from fuselog.recorders.plausibility.checks import findings
 
 
 def of_car() -> Iterator[str]:

@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pipeline.output.claims import Claim
-from pipeline.output.report.kinds import opening
-from pipeline.output.results import Result
-from replay.judging.diagnostics import LEAST_SHARE
+from fuselog.pipeline.output.claims import Claim
+from fuselog.pipeline.output.report.kinds import opening
+from fuselog.pipeline.output.results import Result
+from fuselog.replay.judging.diagnostics import LEAST_SHARE
 
 TWO = {"a.position_rmse_m": 0.5, "b.position_rmse_m": 0.25, "a.nees": 9.0}
 BOUNDS = {"b.nees": (2.0, 4.0)}

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.sensing import study
-from pipeline.sensing.noise import noise
-from pipeline.sensing.terms import Terms
-from recorders.log import RunMetadata, make_stream, schemas
-from replay.engine.streams.sources import MemorySource
+from fuselog.pipeline.sensing import study
+from fuselog.pipeline.sensing.noise import noise
+from fuselog.pipeline.sensing.terms import Terms
+from fuselog.recorders.log import RunMetadata, make_stream, schemas
+from fuselog.replay.engine.streams.sources import MemorySource
 
 STEP_S, SIZE = 0.04, 3000
 TIMES_S = STEP_S * np.arange(SIZE)

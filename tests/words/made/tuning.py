@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.tuning.confidence import SearchOutcome, confidence, doubts
-from pipeline.tuning.outcome import Tuning
-from pipeline.tuning.search import Coordinates, Free
+from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence, doubts
+from fuselog.pipeline.tuning.outcome import Tuning
+from fuselog.pipeline.tuning.search import Coordinates, Free
 
 NAMES = ("sigma_range_m", "sigma_bearing_rad", "density")
 FREE = [Free(name, 1.0, 0.01, 100.0, is_positive=True) for name in NAMES]

@@ -10,9 +10,9 @@ from typing import Any
 
 import zstandard
 
-from recorders.atomic import scratch_folder
-from recorders.errors import BadInput
-from recorders.importers.ros.files.raw import BagFile, Batch, Connection, joined
+from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.files.raw import BagFile, Batch, Connection, joined
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _WANTED = "give a .bag, .db3 or .mcap file of ROS, or the folder of one"
@@ -100,15 +100,15 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
         except zstandard.ZstdError as error:
             raise BadInput(f"{path}: cannot be decompressed ({error})") from None
     if place.suffix == ".mcap":
-        from recorders.importers.ros.files.mcap_file import McapFile
+        from fuselog.recorders.importers.ros.files.mcap_file import McapFile
 
         return McapFile(place)
     if place.suffix == ".db3":
-        from recorders.importers.ros.files.sqlite_file import SqliteFile
+        from fuselog.recorders.importers.ros.files.sqlite_file import SqliteFile
 
         return SqliteFile(place)
     if place.suffix in (".bag", ".active"):
-        from recorders.importers.ros.files.ros1_file import Ros1File
+        from fuselog.recorders.importers.ros.files.ros1_file import Ros1File
 
         return Ros1File(place)
     raise BadInput(f"{path}: is not a bag; {_WANTED}")

@@ -8,12 +8,12 @@ from mcap import records
 from rosbags.interfaces import MessageDefinition
 from rosbags.typesys.msg import normalize_msgtype
 
-from recorders.importers.ros.files.raw import FORMATS, UNDEFINED, Batch, Connection, words
-from recorders.log.container.ahead import ahead
-from recorders.log.container.chunks import Contents, Damaged, open_region
-from recorders.log.container.reading import Region, open_container, read_bytes
-from recorders.log.loops import HEAD_BYTES, MESSAGE_HEAD_BYTES
-from recorders.log.opening import Log
+from fuselog.recorders.importers.ros.files.raw import FORMATS, UNDEFINED, Batch, Connection, words
+from fuselog.recorders.log.container.ahead import ahead
+from fuselog.recorders.log.container.chunks import Contents, Damaged, open_region
+from fuselog.recorders.log.container.reading import Region, open_container, read_bytes
+from fuselog.recorders.log.loops import HEAD_BYTES, MESSAGE_HEAD_BYTES
+from fuselog.recorders.log.opening import Log
 
 # Where in a message's record the recorder's stamp is.
 _LOG_TIME = HEAD_BYTES + 6

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
-from recorders.log.layout import windows
+from fuselog.recorders.log.layout import windows
 
 FORMATS = {
     "ros1msg": MessageDefinitionFormat.MSG,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
-from recorders.errors import BadInput
-from recorders.importers.ros.files.raw import Batch, Connection
-from recorders.log.container.ahead import ahead
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.files.raw import Batch, Connection
+from fuselog.recorders.log.container.ahead import ahead
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7

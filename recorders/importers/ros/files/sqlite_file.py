@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import MessageDefinition
 
-from recorders.errors import BadInput
-from recorders.importers.ros.files.raw import FORMATS, UNDEFINED, Batch, Connection, joined
-from recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.importers.ros.files.raw import FORMATS, UNDEFINED, Batch, Connection, joined
+from fuselog.recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
 
 _ROWS = 4096
 # Topic, stamp in ns, message.

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
-from replay.engine.compiling.kernels.values import STORED, Array, Record, combined
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
+from fuselog.replay.engine.compiling.kernels.values import STORED, Array, Record, combined
 
 KNOWN = 64  # sizes up to this are part of a kernel
 

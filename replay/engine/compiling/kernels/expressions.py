@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.compiling.kernels.functions import FUNCTIONS
-from replay.engine.compiling.kernels.known import (
+from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
+from fuselog.replay.engine.compiling.kernels.known import (
     OPERATORS,
     as_python,
     from_python,
@@ -17,7 +17,7 @@ from replay.engine.compiling.kernels.known import (
     is_known,
     is_not_in,
 )
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
@@ -30,8 +30,16 @@ from replay.engine.compiling.kernels.numbers import (
     is_static,
     negative,
 )
-from replay.engine.compiling.kernels.scope import Scope
-from replay.engine.compiling.kernels.values import Array, Record, entries, load, made, part_of, store
+from fuselog.replay.engine.compiling.kernels.scope import Scope
+from fuselog.replay.engine.compiling.kernels.values import (
+    Array,
+    Record,
+    entries,
+    load,
+    made,
+    part_of,
+    store,
+)
 
 # Functions that make arrays, and whether these are zero.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
@@ -312,7 +320,7 @@ class Expressions(Scope):
     def called(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
         """Return what a call gives."""
         write = getattr(function, "lowered", None)
-        if write is not None:  # it knows how, see replay.tracing
+        if write is not None:  # it knows how, see fuselog.replay.tracing
             return write(self.program, self.emitter, arguments)
         if isinstance(function, Hashable) and function in _MAKERS:
             return self.new_array(*arguments, is_zero=_MAKERS[function], **named)

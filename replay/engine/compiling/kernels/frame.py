@@ -3,13 +3,13 @@
 from types import FunctionType
 from typing import Any
 
-from replay.engine.compiling.kernels.expressions import Expressions
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.expressions import Expressions
+from fuselog.replay.engine.compiling.kernels.numbers import (
     Number,
     common_kind,
 )
-from replay.engine.compiling.kernels.program import Program, definition_of
-from replay.engine.compiling.kernels.values import (
+from fuselog.replay.engine.compiling.kernels.program import Program, definition_of
+from fuselog.replay.engine.compiling.kernels.values import (
     Array,
     Record,
     at_run_time,
@@ -18,7 +18,7 @@ from replay.engine.compiling.kernels.values import (
     rebuilt,
     signature,
 )
-from replay.engine.compiling.kernels.variables import placed_names
+from fuselog.replay.engine.compiling.kernels.variables import placed_names
 
 
 class Wider(Exception):

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.compiling.kernels.numbers import Number
-from replay.engine.compiling.kernels.values import Array, Record, entries
+from fuselog.replay.engine.compiling.kernels.numbers import Number
+from fuselog.replay.engine.compiling.kernels.values import Array, Record, entries
 
 
 def is_in(x: Any, many: Any) -> bool:

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from types import FunctionType
 from typing import Any, NamedTuple
 
-from replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
+from fuselog.replay.engine.compiling.kernels.numbers import (
     REAL,
     WHOLE,
     Emitter,
@@ -23,8 +23,8 @@ from replay.engine.compiling.kernels.numbers import (
     is_static,
     kind_of,
 )
-from replay.engine.compiling.kernels.program import DoesNotCompile, Program
-from replay.engine.compiling.kernels.values import (
+from fuselog.replay.engine.compiling.kernels.program import DoesNotCompile, Program
+from fuselog.replay.engine.compiling.kernels.values import (
     Array,
     at_run_time,
     entries,

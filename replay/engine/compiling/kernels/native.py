@@ -24,8 +24,8 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.compiling.cache import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.cache import (
     cache_folder,
     in_turn,
     is_private,
@@ -33,13 +33,13 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
-from replay.engine.compiling.identity import digest_of, identity
-from replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
-from replay.engine.compiling.kernels.lowering import lower
-from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
-from replay.engine.compiling.kernels.program import Program
-from replay.engine.compiling.notices import compiling, done_once
-from replay.engine.compiling.scratch import Memory
+from fuselog.replay.engine.compiling.identity import digest_of, identity
+from fuselog.replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
+from fuselog.replay.engine.compiling.kernels.lowering import lower
+from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
+from fuselog.replay.engine.compiling.kernels.program import Program
+from fuselog.replay.engine.compiling.notices import compiling, done_once
+from fuselog.replay.engine.compiling.scratch import Memory
 
 _ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
@@ -260,7 +260,7 @@ def _surroundings() -> str:
     machine = _machine()
     return "\n".join(
         [
-            digest_of("replay.engine.compiling.kernels"),
+            digest_of("fuselog.replay.engine.compiling.kernels"),
             platform.python_version(),
             f"llvmlite {llvmlite.__version__}",
             str(llvm.get_process_triple()),

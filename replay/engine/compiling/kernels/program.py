@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput
-from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
-from replay.engine.compiling.kernels.values import (
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
+from fuselog.replay.engine.compiling.kernels.values import (
     Array,
     is_local,
     leaves,

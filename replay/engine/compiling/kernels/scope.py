@@ -5,13 +5,13 @@ from itertools import count
 from types import FunctionType
 from typing import Any
 
-from replay.engine.compiling.kernels.known import (
+from fuselog.replay.engine.compiling.kernels.known import (
     from_python,
 )
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.numbers import (
     Emitter,
 )
-from replay.engine.compiling.kernels.program import Program, definition_of
+from fuselog.replay.engine.compiling.kernels.program import Program, definition_of
 
 
 class Scope:

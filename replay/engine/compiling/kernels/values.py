@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.compiling.kernels.numbers import (
+from fuselog.replay.engine.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
