@@ -93,6 +93,7 @@ clean:
 .venv/with-test: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[docs,test]'
+	$(BIN)/python tests/links.py
 	@touch .venv/with-fuselog
 	@touch $@
 

@@ -7,11 +7,17 @@ Names are imported when they are first asked for, from the places that the stub 
 import ast
 import sys
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 _HERE = Path(__file__).parent
+_INSIDE, _BESIDE = _HERE / "recorders", _HERE.parent / "recorders"
+if not _INSIDE.exists() or (_BESIDE.exists() and _INSIDE.samefile(_BESIDE)):
+    __path__ = [str(_HERE.parent), str(_HERE)]  # in a clone the rooms stand beside this folder
+
+from fuselog import replay as _room  # noqa: E402
+
 _RENAMED = {"Told": "Diagnostics"}  # names of the release before
 
 
@@ -26,22 +32,27 @@ def _names() -> dict[str, tuple[str, str]]:
     }
 
 
-def _refuse_others() -> None:
-    """Raise ImportError where Python finds another package under the name of one of ours."""
-    for room in sorted({module.partition(".")[0] for module, _ in _NAMES.values()}):
-        found = find_spec(room)
-        ours = _HERE.parent / room / "__init__.py"
-        place = found and (found.origin or next(iter(found.submodule_search_locations or ()), None))
-        if place is None or not ours.samefile(place):
-            raise ImportError(
-                f"fuselog needs its own package '{room}' ({ours}), but Python finds "
-                f"{place or 'none'}; rename that, or start Python where it is not found first"
-            )
+def _public(name: str) -> Any:
+    module, there = _NAMES[name]
+    return getattr(__import__(module, fromlist=[there]), there)
+
+
+class _Replay(ModuleType):
+    """The package `replay`, which can be called: a function of the interface has the same name."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return _public("replay")(*arguments, **options)
+
+    @property
+    def __signature__(self) -> Any:
+        from inspect import signature
+
+        return signature(_public("replay"))
 
 
 _NAMES = _names()
-_refuse_others()
 __all__ = list(_NAMES)
+_room.__class__ = _Replay
 
 
 def __getattr__(name: str) -> Any:
@@ -52,8 +63,7 @@ def __getattr__(name: str) -> Any:
         return getattr(sys.modules[__name__], new)
     if name not in _NAMES:
         raise AttributeError(f"module 'fuselog' has no attribute '{name}'")
-    module, there = _NAMES[name]
-    found = globals()[name] = getattr(__import__(module, fromlist=[there]), there)
+    found = globals()[name] = _public(name)
     return found
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from fuselog.recorders.errors import BadInput
 
-_ROOT = str(Path(__file__).parents[1])  # where our packages are, whatever the current folder is
+# Where fuselog is, whatever the current folder is.
+_ROOT = str(Path(str(sys.modules["fuselog"].__file__)).parents[1])
 # Python's variable that keeps the current folder off the path, and the value that says it is ours.
 _SAFE_PATH, _OURS = "PYTHONSAFEPATH", "fuselog"
 # Libraries read these in the current folder. Numba loads code from a cache that its file names, and

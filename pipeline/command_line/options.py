@@ -170,7 +170,7 @@ foxglove_option = click.option(
 
 
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return the option --set of a command whose settings this takes, see `fuselog.pipeline.api.asking.TAKERS`.
+    """Return the option --set of a command; `fuselog.pipeline.api.asking.TAKERS` says what takes it.
 
     Where it asks, NAME=?, the command prints what that parameter means, and does nothing else. A command
     that replays logs has --origin too, which is a setting of all their topics.

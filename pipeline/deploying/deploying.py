@@ -103,7 +103,7 @@ def deploy(
 
 
 def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
-    """Put a program in the place of a golden's estimator, for `fuselog.pipeline.checking.checking.check`.
+    """Put a program in place of a golden's estimator, for `fuselog.pipeline.checking.checking.check`.
 
     Args:
         name: the program, as `lib:./robot_ekf.so`.

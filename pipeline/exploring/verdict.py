@@ -30,7 +30,8 @@ class Verdict(NamedTuple):
 def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Verdict:
     """Judge one filter on one log, by the alarms of its replay; those of other cases do not count.
 
-    Whether a filter is too sure of itself is what NIS and NEES say, see `fuselog.pipeline.output.alarming`.
+    Whether a filter is too sure of itself is what NIS and NEES say, see
+    `fuselog.pipeline.output.alarming`.
     """
     if failures:
         return Verdict("failed", "It stopped.", failures[0])

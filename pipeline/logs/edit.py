@@ -241,7 +241,8 @@ def constrain(
 ) -> Changed:
     """Write a log with what its inertial unit says of the body: that it stands, that it rolls on wheels.
 
-    The topics `standing` and `rolling` come beside the unit's own, see `fuselog.pipeline.logs.constraints`.
+    The topics `standing` and `rolling` come beside the unit's own, see
+    `fuselog.pipeline.logs.constraints`.
 
     Args:
         path: the log.

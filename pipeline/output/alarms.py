@@ -1,6 +1,7 @@
 """Defines what makes a replay's numbers doubtful, and why: alarms, causes, verdicts of stress.
 
-`fuselog.pipeline.output.alarming` finds alarms, `fuselog run --diagnose` causes, and `--stress` its verdicts.
+`fuselog.pipeline.output.alarming` finds alarms, `fuselog run --diagnose` causes, and `--stress` its
+verdicts.
 """
 
 from collections.abc import Mapping

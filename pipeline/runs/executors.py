@@ -30,7 +30,7 @@ from fuselog.replay.engine.compiling.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
 PAYING_RUNS = 1000
-PACKAGES = ("recorders", "replay", "pipeline")
+PACKAGES = ("fuselog.recorders", "fuselog.replay", "fuselog.pipeline")
 
 
 class WorkerPool(NamedTuple):
@@ -253,7 +253,7 @@ def version_of_code() -> str:
             _add_sources(digest, folder)
     groups = [group for group in entry_points().groups if group.startswith("fuselog.")]
     entries = [entry for group in groups for entry in entry_points(group=group)]
-    modules = {entry.module.partition(".")[0] for entry in entries} - {*PACKAGES}
+    modules = {entry.module.partition(".")[0] for entry in entries} - {"fuselog"}
     for spec in filter(None, map(find_spec, sorted(modules))):
         for place in spec.submodule_search_locations or ():
             _add_sources(digest, Path(place))

@@ -166,8 +166,8 @@ class Study:
         summary: what it does, in a line.
         run: (experiment, setting) -> what it found; logs and timeline go to the setting's folder.
         options: the type of the experiment's `options`.
-        is_campaign: whether it replays by `fuselog.pipeline.runs.campaigns` alone, so that others may work on
-            parts of the runs.
+        is_campaign: whether it replays by `fuselog.pipeline.runs.campaigns` alone, so that others may
+            work on parts of the runs.
         runs: what the number of runs counts; empty if the study makes none.
     """
 

@@ -1,8 +1,8 @@
 """Simulates optical sensors on aircraft: each has its own clock, and is turned by biases that drift.
 
 Sensors fly at known poses, straight or weaving, and see the targets in turn, each at times of its own.
-The frame is that of `fuselog.recorders.models.optical`: y points up, and a sensor looks ahead, along its own z.
-All white noise that drives targets and biases is continuous, so that they are exact at any time.
+The frame is that of `fuselog.recorders.models.optical`: y points up, and a sensor looks ahead, along its
+own z. All white noise that drives targets and biases is continuous, so that they are exact at any time.
 """
 
 from typing import Annotated, NamedTuple

@@ -1,8 +1,8 @@
 """Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
 
-A file (see `fuselog.replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named after
-their sets. Common sets ship with the package (see `fuselog.replay.sampling.ship`); others are kept in the user's
-cache.
+A file (see `fuselog.replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named
+after their sets. Common sets ship with the package (see `fuselog.replay.sampling.ship`); others are kept
+in the user's cache.
 """
 
 import io

@@ -4,7 +4,7 @@
 million messages block by block, and prints how much memory that took.
 """
 
-import resource
+import resource  # noqa: TID251
 import subprocess
 import sys
 import tempfile

@@ -4,7 +4,7 @@
 million messages into a log, and prints how much memory that took.
 """
 
-import resource
+import resource  # noqa: TID251
 import struct
 import tempfile
 import time

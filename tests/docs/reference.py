@@ -86,7 +86,7 @@ def _python() -> str:
         "`import fuselog` has these names; [Python](../python.md) shows how to use them. "
         "`fuselog.schemas` has the [messages](messages.md).",
     ]
-    for room, nodes in groupby(imports, lambda node: (node.module or "").partition(".")[0]):
+    for room, nodes in groupby(imports, lambda node: (node.module or "").split(".")[1]):
         names = [alias.name for node in nodes for alias in node.names if alias.name != "schemas"]
         names.sort(key=lambda name: (name[0].isupper(), name))  # functions first
         lines += ["", f"## {ROOMS[room]}", "", *(f"::: fuselog.{name}\n" for name in names)]

@@ -1,7 +1,7 @@
 """Runs jobs in forked children, two at once, with limits of memory and of time."""
 
 import os
-import resource
+import resource  # noqa: TID251
 import signal
 import sys
 import time
@@ -49,7 +49,7 @@ def how(status: int) -> str:
 def _begin(job: Callable[[], object], *, is_limited: bool = True) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
-    pid = os.fork()
+    pid = os.fork()  # noqa: TID251
     if pid:
         return pid
     code = FELL
@@ -76,7 +76,7 @@ def _next_end(working: dict[int, tuple[Key, float]]) -> tuple[int, int]:
         for pid, (_, since_s) in working.items():
             ended, status = os.waitpid(pid, os.WNOHANG)
             if not ended and time.monotonic() - since_s > LIMIT_S:
-                os.kill(pid, signal.SIGKILL)
+                os.kill(pid, signal.SIGKILL)  # noqa: TID251
                 ended, status = os.waitpid(pid, 0)
             if ended:
                 return pid, status

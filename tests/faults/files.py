@@ -8,7 +8,7 @@ import contextlib
 import io
 import json
 import lzma
-import resource
+import resource  # noqa: TID251
 import signal
 import tempfile
 import time

@@ -69,7 +69,7 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
             command = list(COMMANDS)[tried % len(COMMANDS)]
             if command not in wholes:
                 wholes[command] = _undisturbed(command, start)
-            number = (signal.SIGKILL, signal.SIGTERM)[int(rng.integers(2))]
+            number = (signal.SIGKILL, signal.SIGTERM)[int(rng.integers(2))]  # noqa: TID251
             over_old = bool(rng.integers(2))
             with _copy_of(wholes[command].folder if over_old else start) as work:
                 done, wrong = _disturbed(command, work, wholes[command], number, rng)

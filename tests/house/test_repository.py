@@ -25,7 +25,8 @@ def test_the_picture_of_the_house_is_what_is_checked() -> None:
     outer, inner, *_ = PYPROJECT["tool"]["importlinter"]["contracts"]
     rooms = [room for layer in inner["layers"] for room in layer.split(" | ")]
     assert shown == [
-        each for top in outer["layers"] for each in [top, *(rooms if top == "replay" else [])]
+        "fuselog",
+        *(each for top in outer["layers"] for each in [top, *(rooms if top == "replay" else [])]),
     ]
     assert set(rooms) == {path.parent.name for path in ROOT.glob("replay/*/__init__.py")}
 
@@ -82,6 +83,16 @@ def test_no_file_cites_what_is_outside_the_repository() -> None:
                     r"\b(?:shared|spec|tech)/[a-z]|\bpapers/[a-z-]+\.txt",
                     path.read_text(encoding="utf-8"),
                 )
+                assert not found, f"{path}: {found}"
+
+
+def test_rooms_are_named_as_parts_of_fuselog() -> None:
+    """In strings and pages too: under a name of its own a room would be loaded twice, in a clone."""
+    alone = re.compile(r"(?:-m|(?:^|[\"';])\s*(?:from|import)) (?:pipeline|recorders|replay)\b", re.M)
+    for folder in ("fuselog", "recorders", "replay", "pipeline", "tests", "docs", "data"):
+        for path in (ROOT / folder).rglob("*.*"):
+            if path.suffix in (".py", ".pyi", ".md", ".toml", ".ipynb"):
+                found = alone.search(path.read_text(encoding="utf-8"))
                 assert not found, f"{path}: {found}"
 
 

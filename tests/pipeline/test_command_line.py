@@ -556,7 +556,7 @@ def test_a_stopped_run_leaves_nothing_and_a_killed_one_a_part(
         assert process.returncode == 128 + number
         assert list(here.iterdir()) == []
     process = start_fuselog(*long)
-    _stop_when(".r.*.part/new", process, signal.SIGKILL)
+    _stop_when(".r.*.part/new", process, signal.SIGKILL)  # noqa: TID251
     assert [path.name[:3] for path in here.iterdir()] == [".r."]
     assert fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r").code == 0
     assert [path.name for path in here.iterdir()] == ["r"]
@@ -663,7 +663,8 @@ def test_names_beyond_the_locale(world: Path) -> None:
     """In the C locale, a name that is not ASCII reaches Python, Rerun and Arrow in three ways."""
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = (
-        "import sys; from fuselog.pipeline.command_line import main; log, folder, timeline = sys.argv[1:]\n"
+        "import sys; from fuselog.pipeline.command_line import main\n"
+        "log, folder, timeline = sys.argv[1:]\n"
         "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "run = main(['run', 'landmarks', '--runs', '1', '--set', 'duration_s=1', '--out', folder])\n"
         "print(run, *[main(['view', log, '--save', timeline]) for _ in range(2)])"

@@ -153,7 +153,8 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:
     Figures are written without being drawn, as by `blank_figures`.
     """
     code = (
-        "import sys, json, io, shlex; from contextlib import *; from fuselog.pipeline.command_line import main\n"
+        "import sys, json, io, shlex; from contextlib import *\n"
+        "from fuselog.pipeline.command_line import main\n"
         "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "for line in json.load(sys.stdin):\n"
         "    out, err = io.StringIO(), io.StringIO()\n"

@@ -136,7 +136,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         stdout=subprocess.PIPE,
     ) as child:
         assert child.stdout.readline() == b"written\n"
-        child.send_signal(signal.SIGKILL)
+        child.send_signal(signal.SIGKILL)  # noqa: TID251
     (part,) = tmp_path.glob(".run.mcap.*.part/new.mcap")
     with pytest.raises(
         BadInput, match=r"new\.mcap: it was cut off.*whole chunks are readable with --recover$"

@@ -72,7 +72,8 @@ def test_a_product_is_exact_or_refused(
 
 def test_bags_and_ulogs_are_imported_without_arrow() -> None:
     code = (
-        "import fuselog.recorders.importers.ros.importer, fuselog.recorders.importers.ulog.importer, sys\n"
+        "import fuselog.recorders.importers.ros.importer\n"
+        "import fuselog.recorders.importers.ulog.importer, sys\n"
         "sys.exit('pyarrow' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

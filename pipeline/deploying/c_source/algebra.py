@@ -1,4 +1,4 @@
-"""Writes the Kalman update in C, operation by operation as `fuselog.replay.inference.kalman.update` has it.
+"""Writes the Kalman update in C, operation by operation as `fuselog.replay.inference.kalman.update`.
 
 `UPDATE` is the one of all filters but those that iterate, which have `ITERATE`; both call `ALGEBRA`.
 Square-root forms have an update of their own, and of this `COMMON` alone.

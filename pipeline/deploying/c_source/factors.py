@@ -1,4 +1,4 @@
-"""Writes square-root forms in C, operation by operation as `fuselog.replay.inference.kalman.square_root`.
+"""Writes square-root forms in C, each operation as in `fuselog.replay.inference.kalman.square_root`.
 
 Names as in `algebra`; ROWS and COLUMNS are how many of both an array to be factorised has at most.
 """

@@ -1,7 +1,7 @@
 """Writes products of covariances with Jacobians in C, as loops over entries not known to be zero.
 
-Sums keep the order of `fuselog.replay.inference.linear_algebra.sparse`. Names as in `algebra`; `columns` lists
-those of a matrix row by row, each row ended by -1.
+Sums keep the order of `fuselog.replay.inference.linear_algebra.sparse`. Names as in `algebra`; `columns`
+lists those of a matrix row by row, each row ended by -1.
 """
 
 from collections.abc import Mapping

@@ -207,7 +207,8 @@ def noise_gain_over(
 ) -> Callable[[Hypothesis, Number], tuple[float, float]]:
     """Return a function that says what undoing a fault gains by the noise of the controls alone.
 
-    The mean and the standard deviation over logs, see `fuselog.pipeline.tuning.control_noise`. Of noises and
+    The mean and the standard deviation over logs, see `fuselog.pipeline.tuning.control_noise`. Of noises
+    and
     outliers it is zero: their likelihood is meant to have that noise.
     """
     most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, all of it this noise

@@ -117,7 +117,7 @@ def _moved(samples: Samples, coupling_rad: float) -> Samples:
 
 
 def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study propagation, figure 3; see `fuselog.pipeline.runs.experiment.Study`. `runs` are the random ones."""
+    """Study propagation, figure 3; see `fuselog.pipeline.runs.experiment.Study`. `runs` are random."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")

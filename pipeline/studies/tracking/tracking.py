@@ -1,6 +1,7 @@
 """Shares what studies of trackers need: tracks judged by run, and differences of trackers.
 
-Tracks are judged as `fuselog.replay.judging.tracks.errors` says, at instants that are the same for all trackers.
+Tracks are judged as `fuselog.replay.judging.tracks.errors` says, at instants that are the same for all
+trackers.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Loops over a ULog's data: where messages begin, and which are whose; see `fuselog.recorders.log.loops`."""
+"""Loops over a ULog's data: where messages begin, which are whose; see `fuselog.recorders.log.loops`."""
 
 from typing import NamedTuple
 

@@ -1,8 +1,9 @@
 """Compiles functions of one run into loops over all runs, which the cores share.
 
 A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
-arrays is written in LLVM's text by ourselves (`fuselog.replay.engine.compiling.kernels`), in milliseconds; any
-other goes through numba (`fuselog.replay.engine.compiling.through_numba`). With FUSELOG_UNCOMPILED=1 all are
+arrays is written in LLVM's text by ourselves (`fuselog.replay.engine.compiling.kernels`), in
+milliseconds; any other goes through numba (`fuselog.replay.engine.compiling.through_numba`). With
+FUSELOG_UNCOMPILED=1 all are
 plain Python, which a debugger can follow: that is the reference.
 """
 

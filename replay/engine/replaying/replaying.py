@@ -77,8 +77,8 @@ def replay(
     A run that an estimator cannot follow fails alone, see `fuselog.replay.engine.replaying.monitor`; the
     failures come last.
     Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
-    begins after the prior of an estimator (see `fuselog.pipeline.runs.initial_states`), or it cannot do as
-    `late` says.
+    begins after the prior of an estimator (see `fuselog.pipeline.runs.initial_states`), or it cannot do
+    as `late` says.
     """
     if late is not None:
         estimators = [taking_late(bound, late) for bound in estimators]

@@ -57,7 +57,7 @@ class Source(Protocol):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Return topics in blocks that follow one another in time; see `fuselog.recorders.log.read_blocks`."""
+        """Return topics in blocks, one after another; see `fuselog.recorders.log.read_blocks`."""
 
     def whole(self) -> "Source":
         """Return the run without a span."""

@@ -1,11 +1,11 @@
 """Models moving targets, and attitude biases and clocks of the sensors on aircraft that see them.
 
-The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`fuselog.recorders.models.optical`), but
-nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's own
-clock, so that a clock that is ahead by c says what the targets were c before its stamp:
+The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`fuselog.recorders.models.optical`),
+but nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's
+own clock, so that a clock that is ahead by c says what the targets were c before its stamp:
     (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`: `estimate_drift` lets
-them walk.
+Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`: `estimate_drift`
+lets them walk.
 """
 
 from typing import Any

@@ -96,7 +96,7 @@ class ReportResults(NamedTuple):
 
 @varying(2)
 class ReportMemory(NamedTuple):
-    """Holds what associates the reports of one stamp: see `fuselog.replay.inference.association.association`.
+    """Associates reports of one stamp: see `fuselog.replay.inference.association.association`.
 
     Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
     """

@@ -11,9 +11,9 @@
 
 Targets keep their velocity but for white acceleration, or move as any registered model with a position
 says; where it has several modes, each track is an interacting multiple model. Sensors are those that
-state what they are like on the channels of their scans, see `fuselog.replay.estimators.tracking.scan_sensors`.
-Places begin tracks, bearings only sharpen those that are confirmed.
-`fuselog.replay.inference.association.tracking` does the work.
+state what they are like on the channels of their scans, see
+`fuselog.replay.estimators.tracking.scan_sensors`. Places begin tracks, bearings only sharpen those that
+are confirmed. `fuselog.replay.inference.association.tracking` does the work.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

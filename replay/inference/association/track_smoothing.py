@@ -1,8 +1,8 @@
 """Smooths tracks backwards: each estimate of a track, given later detections too.
 
 Which detections are a track's stays as the tracker found it; given that, its states are a chain of
-Gaussians that one motion ties together, and `fuselog.replay.inference.smoothing.backward_pass` goes back over
-them.
+Gaussians that one motion ties together, and `fuselog.replay.inference.smoothing.backward_pass` goes back
+over them.
 """
 
 from functools import partial

@@ -1,9 +1,9 @@
 """Tracks many targets: predicts, associates, updates, begins and ends tracks scan by scan.
 
 A model's motion moves every track, that of each mode where it has several (an IMM inside); sensors say
-what a scan measures of a track (see `fuselog.replay.inference.association.scanning`); an association says how
-probable it is that each track has each detection (`association`); what is left over may begin tracks;
-and a management says which tracks are those of targets, and which end (`track_management`).
+what a scan measures of a track (see `fuselog.replay.inference.association.scanning`); an association
+says how probable it is that each track has each detection (`association`); what is left over may begin
+tracks; and a management says which tracks are those of targets, and which end (`track_management`).
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class ScanInputs(NamedTuple):
 
 
 def tracking(tracker: Tracker, read: Function) -> Function:
-    """Make the loop over the scans of one run, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over scans, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """

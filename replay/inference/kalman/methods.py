@@ -121,7 +121,8 @@ class Method:
         variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
         made_for: what the method is with these parameters, where they choose among several; raises
             BadInput where they name none.
-        filtering: what goes through a log, where that is no `fuselog.replay.inference.run.filtering.Filter`.
+        filtering: what goes through a log, where that is no
+            `fuselog.replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
         is_random: whether it draws random numbers, beside those of its samples.
     """

@@ -1,8 +1,8 @@
 """Defines the steps of a recursive filter, which methods make for one model, and their memory.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
-`linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by moments that the model knows.
-All work in one workspace, and the Kalman update after them is the same (`update.kalman_update`).
+`linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by moments that the model
+knows. All work in one workspace, and the Kalman update after them is the same (`update.kalman_update`).
 """
 
 from collections.abc import Callable
@@ -125,8 +125,8 @@ class Workspace(NamedTuple):
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
         step, turned, slope: (t,), the correction of the state, and along what it bends.
         innovations: one for each sensor.
-        samples: what `fuselog.replay.inference.kalman.regression` works in, motion first, one for each of
-            `sampled`.
+        samples: what `fuselog.replay.inference.kalman.regression` works in, motion first, one for each
+            of `sampled`.
     """
 
     state: Floats

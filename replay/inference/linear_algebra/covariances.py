@@ -1,8 +1,9 @@
 """Says what a filter can carry for a covariance: the contract of beliefs between methods.
 
 A belief is a mean (n,) and a matrix (t, t) that stands for its covariance P: P itself (`COVARIANCES`),
-or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). A filter's own steps
-predict and update it; all others, such as an IMM or a smoother, know no more of it than its `Form`.
+or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). A filter's own
+steps predict and update it; all others, such as an IMM or a smoother, know no more of it than its
+`Form`.
 """
 
 from typing import Any, NamedTuple

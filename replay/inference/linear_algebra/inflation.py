@@ -11,7 +11,8 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
     """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
-    a Kalman update still. 1 where no option of `fuselog.replay.inference.model.parameters.ModelParameters` is
+    a Kalman update still. 1 where no option of
+    `fuselog.replay.inference.model.parameters.ModelParameters` is
     given: those are NaN then. The largest of those given holds:
 
     - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;

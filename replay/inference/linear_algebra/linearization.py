@@ -1,7 +1,7 @@
 """Takes derivatives of a model's functions between the tangent spaces of their arguments and results.
 
-A function is traced (`fuselog.replay.tracing`), and the exact derivatives of its graph are what a kernel fills
-into the arrays of its workspace.
+A function is traced (`fuselog.replay.tracing`), and the exact derivatives of its graph are what a kernel
+fills into the arrays of its workspace.
 """
 
 import operator

@@ -1,9 +1,9 @@
 """Moves and compares states on their manifold: boxplus, boxminus, and the right Jacobian.
 
-Kinds and tangent space as in `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
-rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i
-angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called boxplus and the
-difference of two states boxminus; Sola, arXiv 1711.02508.
+Kinds and tangent space as in `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z)
+plus a rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with
+exp(i angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called boxplus and
+the difference of two states boxminus; Sola, arXiv 1711.02508.
 """
 
 from collections.abc import Sequence

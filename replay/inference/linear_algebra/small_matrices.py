@@ -1,6 +1,7 @@
 """Offers linear algebra of a few components to estimators of one's own: scalar loops, in place.
 
-They are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`) and make no
+They are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`) and make
+no
 arrays: what they work in is made there once, before the loop over the messages. Covariances stay
 symmetric. A Kalman filter of x' = F x + w and z = H x + v is
 

@@ -3,8 +3,8 @@
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
 has the parameter's value for a mean, and stands beside the log's; between measurements it moves as
-`fuselog.replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the points of
-a map are added in the same way, see `fuselog.replay.inference.model.point_errors`.
+`fuselog.replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the
+points of a map are added in the same way, see `fuselog.replay.inference.model.point_errors`.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,8 +1,8 @@
 """Defines a model: how a state moves, and what sensors measure of it.
 
 A model is written once, as plain component-first functions: they take tuples of components and return
-tuples, and run on arrays as well. Every method (see `fuselog.replay.inference.kalman.methods`) estimates the
-state of every model that gives what the method needs.
+tuples, and run on arrays as well. Every method (see `fuselog.replay.inference.kalman.methods`) estimates
+the state of every model that gives what the method needs.
 """
 
 from collections.abc import Callable, Mapping
@@ -291,7 +291,8 @@ class Model:
         correct: how an update moves the state where not every component moves by itself.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         augmentable: the parameters that may become part of the state, linear or angles, see
-            `fuselog.replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
+            `fuselog.replay.inference.model.augmentation`: those that motion and sensors read, and no
+            noise.
         calibration: the parameters that say how sensors are mounted, scaled, biased and delayed, each
             with a useful standard deviation: what is known no better counts as not determined.
         owned: by their names the parameters that single topics have, each with the topic and what it is
@@ -317,7 +318,8 @@ class Model:
     >>> model.size, model.kinds
     (2, ('linear', 'linear'))
 
-    `fuselog.replay.inference.model.checking.check_model` says whether the functions keep to what is declared:
+    `fuselog.replay.inference.model.checking.check_model` says whether the functions keep to what is
+    declared:
 
     >>> from dataclasses import replace
     >>> from fuselog.replay.inference.model.checking import check_model

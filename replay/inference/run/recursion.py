@@ -296,7 +296,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """Make the loop over the events of one run, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over events, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
 

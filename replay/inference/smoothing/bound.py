@@ -3,7 +3,8 @@
 At every node, a stamp that has an estimate, stands what the extended Kalman filter would have that
 linearises at the truth, of the filter (`bound`) or of the smoother (`bound:smoother`): the covariance
 along this one trajectory. It needs no inverse of the process noise, which may be singular. Beside it go
-the steps themselves, of which `fuselog.replay.judging.consistency.bounds` makes the bound over an ensemble.
+the steps themselves, of which `fuselog.replay.judging.consistency.bounds` makes the bound over an
+ensemble.
 
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """

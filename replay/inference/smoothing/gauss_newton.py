@@ -4,10 +4,10 @@ What is minimised, over the state at the prior's time and at every stamp after i
 
     1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
 
-A pass is an affine filter about the latest trajectory (`fuselog.replay.inference.smoothing.affine`) and the way
-back over it (`fuselog.replay.inference.smoothing.backward_pass`). Where a step would raise the cost it is taken
-again, damped (Levenberg and Marquardt): every state is measured as it stands, with the start's variances
-over the damping.
+A pass is an affine filter about the latest trajectory (`fuselog.replay.inference.smoothing.affine`) and
+the way back over it (`fuselog.replay.inference.smoothing.backward_pass`). Where a step would raise the
+cost it is taken again, damped (Levenberg and Marquardt): every state is measured as it stands, with the
+start's variances over the damping.
 
 Bell, SIAM J. Optim. 4(3), 1994; Sarkka and Svensson, ICASSP 2020.
 """

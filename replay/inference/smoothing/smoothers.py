@@ -2,8 +2,8 @@
 
 The steps that a filter leaves, and the way back over them, are in
 `fuselog.replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
-`fuselog.replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps, each
-estimate of a fixed lag comes back over the whole of it.
+`fuselog.replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps,
+each estimate of a fixed lag comes back over the whole of it.
 """
 
 import re

@@ -418,7 +418,7 @@ def test_python_says_what_it_compiles_once(
             load.cache_clear()
             compiled(wrap_angle)(value)
         said.append(capsys.readouterr().err)
-    name = r"recorders\.models\.planar\.wrap_angle"
+    name = r"fuselog\.recorders\.models\.planar\.wrap_angle"
     assert re.match(
         rf"fuselog: compiling {name}, once\nfuselog: compiled {name} in \d+\.\d s\n", said[0]
     )

@@ -10,10 +10,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-import fuselog.replay.foreign.native
+from fuselog.replay.foreign import native
 from fuselog.replay.foreign.processes import orphans
 
-HEADER = Path(replay.foreign.native.__file__).parent
+HEADER = Path(native.__file__).parent
 COMPILERS = {".c": ("cc", "-std=c99"), ".cpp": ("c++", "-std=c++17")}
 EXAMPLES = Path(__file__).parents[3] / "docs" / "your-filter"
 MISBEHAVING = Path(__file__).with_name("misbehaving.c")

@@ -608,7 +608,7 @@ def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp
 def test_a_receiver_that_goes_away_is_told(tmp_path: Path) -> None:
     def lose(receiver: Listener) -> None:
         with open_recording("app", "id", connect=receiver.url) as recording:
-            os.killpg(receiver.process.pid, signal.SIGKILL)
+            os.killpg(receiver.process.pid, signal.SIGKILL)  # noqa: TID251
             receiver.process.wait()
             steps = [rr.TimeColumn("step", sequence=[1])]
             recording.send_columns("a", steps, rr.Scalars.columns(scalars=[1.0]))
