@@ -125,8 +125,8 @@ def _make(place: Path) -> tuple[Path, FileLock]:
         lock = FileLock(work / _LOCK, timeout=0)
         try:
             lock.acquire()
-        except (Timeout, FileNotFoundError):
-            continue  # taken for a leftover before it was locked
+        except (Timeout, FileNotFoundError, FileExistsError):
+            continue  # taken for a leftover before it was locked; filelock may make the folder again
         return work, lock
 
 

@@ -10,6 +10,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from fuselog.recorders import atomic
 from fuselog.recorders.atomic import scratch_folder, whole_file, whole_folder
@@ -257,3 +258,19 @@ def test_a_working_folder_that_goes_while_it_is_looked_at_is_none(tmp_path, monk
         assert list(tmp_path.iterdir()) == []
     assert True in gone
     assert caplog.messages == []
+
+
+def test_a_folder_that_was_taken_for_a_leftover_is_made_again(tmp_path, monkeypatch):
+    """By another writer, before it was locked: its folder is gone, or filelock was making it again."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    errors = iter([FileExistsError(), FileNotFoundError()])
+    acquire = FileLock.acquire
+
+    def fail_first(lock, *given, **options):
+        for error in errors:
+            raise error
+        return acquire(lock, *given, **options)
+
+    monkeypatch.setattr(FileLock, "acquire", fail_first)
+    with scratch_folder("mine") as folder:
+        assert folder.is_dir()
