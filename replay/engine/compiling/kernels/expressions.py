@@ -2,6 +2,7 @@
 
 import ast
 import operator
+from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterator
 from types import FunctionType
 from typing import Any
@@ -45,12 +46,12 @@ from fuselog.replay.engine.compiling.kernels.values import (
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
 
 
-class Expressions(Scope):
+class Expressions(Scope, ABC):
     """Represents one function while its expressions are lowered."""
 
+    @abstractmethod
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
         """Lower `yes if condition else no`."""
-        raise NotImplementedError
 
     # --- expressions ---
 
@@ -367,9 +368,9 @@ class Expressions(Scope):
         self.fill(copy, array)
         return copy
 
+    @abstractmethod
     def fill(self, place: Array, value: Any) -> None:
         """Write a number to every place of an array."""
-        raise NotImplementedError
 
     def _worked_out(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
         """Return the result of a function whose arguments are all known: Python has it."""
