@@ -103,6 +103,8 @@ def loop_for(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
 def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
     from numba import njit
 
+    # The code is kept beside this file, under its time and size, and names this module: if the module
+    # moves, the file has to change, or what was kept fails to load.
     return njit(cache=True, nogil=True)(loop)
 
 
