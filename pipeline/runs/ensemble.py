@@ -6,11 +6,12 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from functools import partial
+from itertools import chain, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -183,73 +184,83 @@ def replay_parts(
 
     An estimator that can follow no run of any part is told of, see `Pass.check`.
     """
-    found = find_metrics(metrics)
-    passes: list[Pass] = []
-
-    def replayed(part: Part) -> Iterator[None]:
-        report = Report()
-        bound = bind_from(part.sources, estimators, part.origins, order)
-        judge = Judge(
-            part.sources,
-            found,
-            gap_limit_s=gap_limit_s,
-            first_run=part.first_run,
-            on_errors=on_errors,
-        )
-        with ExitStack() as stack:
-            writers = [
-                stack.enter_context(
-                    LogWriter(
-                        path,
-                        estimates_metadata(source, estimators, path, log, order),
-                        companions=companions,
-                    )
-                )
-                for (path, log), source in zip(part.estimates, part.sources, strict=False)
-            ]
-            drawing = None
-            if part.first_run == 0 and (save or connect):
-                from fuselog.replay.timeline.show import Drawing  # which takes long to import
-
-                asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
-                first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)
-                drawing = stack.enter_context(first)
-            blocks = replay_blocks(
+    found, whole = find_metrics(metrics), None
+    with _told(progress, "replaying") as tell:
+        for part in parts:
+            report = Report()
+            bound = bind_from(part.sources, estimators, part.origins, order)
+            judge = Judge(
                 part.sources,
-                bound,
-                report,
-                order=order,
-                late=late,
-                block_messages=block_messages,
-                is_part=not part.is_all,
+                found,
+                gap_limit_s=gap_limit_s,
+                first_run=part.first_run,
+                on_errors=on_errors,
             )
+            with ExitStack() as stack:
+                writers = [
+                    stack.enter_context(
+                        LogWriter(
+                            path,
+                            estimates_metadata(source, estimators, path, log, order),
+                            companions=companions,
+                        )
+                    )
+                    for (path, log), source in zip(part.estimates, part.sources, strict=False)
+                ]
+                drawing = None
+                if part.first_run == 0 and (save or connect):
+                    from fuselog.replay.timeline.show import Drawing  # which takes long to import
 
-            def judge_and_draw(block: Mapping[str, Ragged]) -> None:
-                judged = judge.add(block)
-                if drawing is not None:
-                    drawing.add(*of_run(block, judged.errors, 0))
+                    asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
+                    first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)
+                    drawing = stack.enter_context(first)
+                blocks = replay_blocks(
+                    part.sources,
+                    bound,
+                    report,
+                    order=order,
+                    late=late,
+                    block_messages=block_messages,
+                    is_part=not part.is_all,
+                )
+                judging = partial(_judge_and_draw, judge, drawing)
+                hand_over = stack.enter_context(in_background(judging))
+                for block in blocks:
+                    hand_over(block)
+                    for run, writer in enumerate(writers):
+                        writer.write([ragged.of_run(run) for ragged in block.values()])
+                    tell()
+            judge.close()
+            done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
+            done.stated = stated_of(bound, part.sources[0])
+            done.meanings = meanings_of(bound)
+            done.usages = report.usages
+            done.untaken = untaken(part.sources, estimators, bound, order)
+            done.left_out = Rejections().plus(source.rejections for source in part.sources)
+            if whole is None:
+                whole = done
+            else:
+                whole.merge(done)
+    assert whole is not None
+    return whole
 
-            hand_over = stack.enter_context(in_background(judge_and_draw))
-            for block in blocks:
-                hand_over(block)
-                for run, writer in enumerate(writers):
-                    writer.write([ragged.of_run(run) for ragged in block.values()])
-                yield
-        judge.close()
-        done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
-        done.stated = stated_of(bound, part.sources[0])
-        done.meanings = meanings_of(bound)
-        done.usages = report.usages
-        done.untaken = untaken(part.sources, estimators, bound, order)
-        done.left_out = Rejections().plus(source.rejections for source in part.sources)
-        if passes:
-            passes[0].merge(done)
-        else:
-            passes.append(done)
 
-    for _ in progress(chain.from_iterable(map(replayed, parts)), "replaying", None):
-        pass
-    return passes[0]
+def _judge_and_draw(judge: Judge, drawing: "Drawing | None", block: Mapping[str, Ragged]) -> None:
+    judged = judge.add(block)
+    if drawing is not None:
+        drawing.add(*of_run(block, judged.errors, 0))
+
+
+@contextmanager
+def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
+    """Tell `progress` by a call of every step of a loop, instead of handing it the loop's items."""
+    steps = iter(progress(repeat(None), title, None))
+    next(steps)
+    try:
+        yield partial(next, steps)
+    finally:
+        if isinstance(steps, Generator):
+            steps.close()
 
 
 @contextmanager
@@ -334,8 +345,8 @@ def replay_blocks(
     block_messages: int = BLOCK_MESSAGES,
     is_part: bool = False,
 ) -> Iterator[dict[str, Ragged]]:
-    """Yield the outputs of a replay, block by block, by topic; the last block says what was covered."""
-    for block in replay(
+    """Iterate over a replay's outputs by topic, block by block; the last one says what was covered."""
+    blocks = replay(
         sources,
         bound,
         order=order,
@@ -343,9 +354,13 @@ def replay_blocks(
         block_messages=block_messages,
         report=report,
         is_part=is_part,
-    ):
-        yield collect([block])
-    yield collect([report.coverage])
+    )
+    return map(by_topic, chain(blocks, (report.coverage,)))
+
+
+def by_topic(block: list[Ragged]) -> dict[str, Ragged]:
+    """Join the streams of one block by topic."""
+    return collect([block])
 
 
 def of_run(

@@ -28,7 +28,7 @@ from fuselog.replay.engine.api.binding import (
 )
 from fuselog.replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
 from fuselog.replay.engine.api.outputs import Estimates, Outputs, Solved
-from fuselog.replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.renamed import renamed
 from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from fuselog.replay.engine.streams.blocks import Block, Ragged
@@ -154,7 +154,7 @@ def recursive(
     def loop() -> Callable[..., None]:
         assert follow is not None
         if not compiled:
-            return uncompiled_over_runs(follow)
+            return OverRuns(follow)
         return compile_over_runs(follow, allocates=allocates)
 
     def advance_all(arguments: tuple[Any, ...], generators: Generators) -> None:

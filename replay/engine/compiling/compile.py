@@ -10,6 +10,7 @@ plain Python, which a debugger can follow: that is the reference.
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from functools import cache, lru_cache, wraps
 from itertools import pairwise
 from types import FunctionType
@@ -106,41 +107,43 @@ def compile_over_runs(
 
         return Kernel(cast(FunctionType, run_once), title)
 
-    def over_runs(runs: int, *arguments: Any, **memory: Any) -> None:
-        if is_uncompiled():
-            plain(runs, *arguments, **memory)
-        else:
-            with done_once():
-                loop()  # which imports what it needs
-            _share(loop(), runs, *arguments, **memory)
-
-    plain = uncompiled_over_runs(run_once)
     if allocates and not is_uncompiled():
         loop()  # says at once where a source is not at hand
-    return over_runs
+    return OverRuns(run_once, loop)
 
 
-def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    """Make the loop of `compile_over_runs` in plain Python.
+@dataclass(frozen=True)
+class OverRuns:
+    """Goes through all runs, see `compile_over_runs`.
 
-    NaN and infinity raise nothing here either.
+    Attributes:
+        run_once: the work of one run.
+        compiled_loop: makes the compiled loop; None for one that is always plain Python.
     """
 
-    def loop(
+    run_once: Callable[..., None]
+    compiled_loop: Callable[[], Loop] | None = None
+
+    def __call__(
+        self,
         runs: int,
         *arguments: Any,
         scratch: Callable[[], Any] | None = None,
         per_run: Sequence[Any] | None = None,
     ) -> None:
+        """Go through the runs; in plain Python, too, NaN and infinity raise nothing."""
+        if self.compiled_loop is not None and not is_uncompiled():
+            with done_once():
+                loop = self.compiled_loop()  # imports what it needs
+            _share(loop, runs, *arguments, scratch=scratch, per_run=per_run)
+            return
         memory = [scratch()] if scratch else []
         with np.errstate(all="ignore"):
             for run in range(runs):
                 if per_run is None:
-                    run_once(run, *arguments, *memory)
+                    self.run_once(run, *arguments, *memory)
                 elif per_run[run] is not None:
-                    run_once(run, *arguments, per_run[run])
-
-    return loop
+                    self.run_once(run, *arguments, per_run[run])
 
 
 def _share(

@@ -190,13 +190,14 @@ class Filter:
             self.stage, self.found, block, state.context, self.settings
         )
         skipped = passed_over(self.name, self.stage, self.found, block, without_covariance)
-        after, made = self.through(state, events, is_end=False)
-        return after, [*made, *skipped]
+        state, events = self.ready(state, events, is_end=False)
+        after, made = self.follow(state, events)
+        return after, [*made, *self.gaps(events), *skipped]
 
-    def through(
+    def ready(
         self, state: FilterState, events: FilterEvents, *, is_end: bool
-    ) -> tuple[FilterState, list[Ragged]]:
-        """Filter the events that need not wait for others."""
+    ) -> tuple[FilterState, FilterEvents]:
+        """Return the events that need not wait for others, and a state that keeps those that do."""
         next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
@@ -212,12 +213,15 @@ class Filter:
         if control is not None and control.interpolated:
             events, waiting = interpolate_control(events, len(control.components), self.gap_ns)
             events = fill_control(self.stage, events)
-        state = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
-        state, made = self.follow(state, events)
+        after = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
+        return after, events
+
+    def gaps(self, events: FilterEvents) -> list[Ragged]:
+        """Report the gaps of the control after which the filter goes on."""
         control = self.stage.model.control
         if control is None or not control.gap or not self.steps.resumes_after_gap:
-            return state, made
-        return state, [*made, not_driven(self.name, control, self.found, events)]
+            return []
+        return [not_driven(self.name, control, self.found, events)]
 
     def finish(self, state: FilterState) -> list[Ragged]:
         """Filter what still waits for messages that do not come any more."""
@@ -228,7 +232,9 @@ class Filter:
         made: list[Ragged] = []
         if state.unsettled is not None:
             no_more = select_events(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
-            state, made = self.through(state, no_more, is_end=True)
+            state, events = self.ready(state, no_more, is_end=True)
+            state, made = self.follow(state, events)
+            made += self.gaps(events)
         if state.waiting is None:
             return state, made
         tail = fill_control(self.stage, hold_control(state.waiting, self.initial, self.gap_ns))

@@ -221,7 +221,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     Returns `process(run, event, inputs, carried, results, memory)`.
     """
     predict = steps.predict
-    update = choosing(steps.updates)
+    updates = steps.updates
     interpolated = stage.model.control is not None and stage.model.control.interpolated
     has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
     resumes_after_gap = steps.resumes_after_gap
@@ -281,7 +281,10 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
             measurement = Measurement(data, parameters, gate, event)
-            outcome = update(source, run, carried.belief, measurement, memory, record)
+            outcome = NOTHING_MEASURED
+            for number in range_of(len(updates)):  # written out: a kernel calls no function by number
+                if source == number:
+                    outcome = updates[number](run, carried.belief, measurement, memory, record)
             if outcome >= 0:
                 return outcome
             if outcome == ALL_WELL:
@@ -367,19 +370,3 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
         if covariance[row, row] < 0.0:
             return NOT_POSITIVE_DEFINITE
     return ALL_WELL
-
-
-def choosing(updates: tuple[Function, ...]) -> Function:
-    """Make `update(source, ...)`: it calls the update of the sensor with this number.
-
-    Args:
-        updates: one for each sensor.
-    """
-
-    def update(source: int, *arguments: Any) -> int:
-        for number in range_of(len(updates)):
-            if source == number:
-                return updates[number](*arguments)
-        return NOTHING_MEASURED
-
-    return update
