@@ -38,7 +38,7 @@ TOKENS = (b"nan", b"inf", b"-1", b"0", b"1e308", b"1e-320", b"1e999", b"9" * 40,
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 # What a child has to import is imported before it is forked.
 ROOMS = (
-    *("fuselog.pipeline", "fuselog.recorders", "fuselog.replay", "tests", "pytest"),
+    *("fuselog", "tests", "pytest", "numba", "rich", "pydantic"),
     *("pandas", "pyarrow", "scipy", "h5py", "rosbags", "mcap", "rerun", "matplotlib", "sqlite3"),
 )
 

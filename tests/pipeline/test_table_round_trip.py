@@ -25,7 +25,7 @@ SHORT: dict[str, dict[str, Any]] = {
 SCENARIOS = [
     each.name
     for each in entry_points(group="fuselog.recorders")
-    if each.value.startswith("recorders.") and isinstance(each.load(), Simulator)
+    if each.value.startswith("fuselog.") and isinstance(each.load(), Simulator)
 ]
 
 
