@@ -112,6 +112,8 @@ def replay_logs(
     for path, run in before.items():
         if run is not None and (sentence := replaced(path, run, run_written(path))):
             warn(sentence)
+    for path in paths[:1]:
+        say_left_out(path, foxglove)
     _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
@@ -136,6 +138,15 @@ def replay_logs(
         value for key, value in done.judge.metrics.items() if split_metric(key)[1] == "failed_runs"
     ]
     return max(failed_runs, default=0) < len(logs)
+
+
+def say_left_out(path: Path, foxglove: bool) -> None:
+    """Say which streams of a new log have no message for Foxglove, if these were asked for."""
+    if foxglove:
+        from fuselog.pipeline.logs.foxglove import left_out
+
+        if sentence := left_out(open_log(path)):
+            warn(f"{path}: {sentence}")
 
 
 def companions_if(foxglove: bool) -> Companions | None:
