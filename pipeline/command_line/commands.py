@@ -38,6 +38,7 @@ from fuselog.pipeline.output.terminal import (
     print_worst,
     progress,
     say,
+    status,
     warn,
 )
 from fuselog.pipeline.runs.ensemble import judge_logs
@@ -49,6 +50,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Companions, Log, open_log
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.differences import FEWEST_RUNS
+from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
 
 
@@ -110,6 +112,8 @@ def replay_logs(
     for path, run in before.items():
         if run is not None and (sentence := replaced(path, run, run_written(path))):
             warn(sentence)
+    for path in paths[:1]:
+        say_left_out(path, foxglove)
     _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
@@ -126,7 +130,7 @@ def replay_logs(
         list(estimators),
         alarms,
         as_json=as_json,
-        written=paths,
+        written=[*paths, *([save] if save else [])],
         details=details,
         unused=unused,
     )
@@ -134,6 +138,15 @@ def replay_logs(
         value for key, value in done.judge.metrics.items() if split_metric(key)[1] == "failed_runs"
     ]
     return max(failed_runs, default=0) < len(logs)
+
+
+def say_left_out(path: Path, foxglove: bool) -> None:
+    """Say which streams of a new log have no message for Foxglove, if these were asked for."""
+    if foxglove:
+        from fuselog.pipeline.logs.foxglove import left_out
+
+        if sentence := left_out(open_log(path)):
+            warn(f"{path}: {sentence}")
 
 
 def companions_if(foxglove: bool) -> Companions | None:
@@ -282,6 +295,10 @@ def _print_outcome(
             "alarms": [asdict(alarm) for alarm in alarms],
             "failures": failures,
             "losses": [*judge.notes_of_coverage, *unused],
+            "worst": {
+                estimator: moment._asdict() | {"run": judge.name_of(moment.run)}
+                for estimator, moment in judge.worst.items()
+            },
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(details or {}))
@@ -298,28 +315,43 @@ def _print_outcome(
         )
     for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
+    for moment in judge.worst.values():
+        say(_worst(moment, judge.name_of(moment.run) if judge.runs > 1 else ""))
     if details and "seconds" in details:
         print_table(("estimator", "time (s)"), list(details["seconds"].items()))
     for path in written:
         say(str(path))
 
 
+def _worst(moment: Moment, run: str = "") -> str:
+    where = "".join(f" of {each}" for each in (moment.case, run) if each)
+    return f"{moment.estimator}: worst at {moment.elapsed_s:.3f} s{where}: {moment.words}"
+
+
 def view_path(
     path: Path,
     *,
     screenshot: Path | None,
-    at_s: float | None,
+    at: float | str | None,
     start_s: float | None,
     end_s: float | None,
     focus: str | None,
     save: Path | None,
     connect: str | None,
+    web: bool,
     gap_limit_s: float,
     recover: bool,
 ) -> None:
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
     from fuselog.replay.timeline import viewer
+    from fuselog.replay.timeline.moments import read_moments, worst_at
 
+    is_shown = save is None and connect is None and not web
+    if at is not None and screenshot is None and not is_shown:
+        raise BadInput(
+            f"--at {at}: places the cursor of the viewer and of --screenshot; leave it out with --save, "
+            "--connect and --web"
+        )
     rrd = path / "timeline.rrd" if path.is_dir() else path
     outputs = [(save, TIMELINE), (screenshot, PICTURE)]
     check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
@@ -327,18 +359,31 @@ def view_path(
         if rrd.suffix != ".rrd":
             rrd = save or folder / "timeline.rrd"
             span = (start_s, end_s)
-            _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
+            with status() as told:
+                told("drawing the timeline")
+                _draw_log(path, rrd, connect, focus, at, span, gap_limit_s, recover=recover)
         elif any(given is not None for given in (start_s, end_s, focus, connect)):
             raise BadInput(
                 f"{rrd}: is a finished timeline; --start, --end, --focus and --connect need a log"
             )
         elif save is not None:
             _copy_timeline(rrd, save)
+        if isinstance(at, str):
+            worst = worst_at([each for each in read_moments(rrd) if focus in (None, each.case)], at)
+            say(_worst(worst))
+            at = worst.elapsed_s
         if screenshot is not None:
-            for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
+            with status() as told:
+                complaints = viewer.screenshot(rrd, screenshot, at_s=at, progress=told)
+            for complaint in complaints:
                 warn(complaint)
-        elif save is None and connect is None:
-            viewer.view(rrd)
+        for written in (save, screenshot):
+            if written is not None:
+                say(str(written))
+        if web:
+            viewer.serve(rrd, lambda url: say(f"viewing {path} at {url}; press Ctrl-C to end"))
+        elif is_shown and screenshot is None:
+            viewer.view(rrd, at_s=at)
 
 
 def _copy_timeline(rrd: Path, save: Path) -> None:
@@ -353,6 +398,7 @@ def _draw_log(
     rrd: Path,
     connect: str | None,
     focus: str | None,
+    at: float | str | None,
     span: tuple[float | None, float | None],
     gap_limit_s: float,
     *,
@@ -370,7 +416,8 @@ def _draw_log(
         source = alter(source, {})  # of several planes, it is drawn in one
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
-    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
+    worst = at if isinstance(at, str) else None
+    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect, at=worst) as drawing:
         judged = [replace(estimates, start_ns=shown.start_ns, end_ns=shown.end_ns)]
         judge = judge_logs(
             judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing

@@ -13,6 +13,7 @@ from fuselog.pipeline.command_line.options import (
     PICTURE,
     RESULT,
     TIMELINE,
+    Instant,
     Seconds,
     gap_option,
     json_option,
@@ -143,15 +144,25 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     "Open a log, estimates or a result in the Rerun viewer.",
     "fuselog view est.mcap",
     "fuselog view run.mcap --start 10 --end 20",
+    "fuselog view est.mcap --at worst:ekf",
     "fuselog view out/landmarks --screenshot picture.png --at 30",
 )
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=PICTURE, help="Take the viewer's picture, headless, as PNG.")
-@click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
+@click.option(
+    "--at",
+    type=Instant(),
+    metavar="SECONDS|worst[:ESTIMATOR]",
+    help="Put the time cursor this many seconds into the run, or at the largest NEES (without NEES the "
+    "largest error) of all estimators or of one.",
+)
 @click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
 @click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
 @click.option("--save", type=TIMELINE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
+@click.option(
+    "--web", is_flag=True, help="Serve the timeline to a browser on this machine until Ctrl-C."
+)
 @click.option("--focus", help="What to show first, such as robot3.")
 @recover_option
 @gap_option

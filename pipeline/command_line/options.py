@@ -55,6 +55,15 @@ class Seconds(click.ParamType):
         return seconds
 
 
+class Instant(Seconds):
+    """Reads a time in seconds, or the words for an estimator's worst moment."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number or the words."""
+        is_worst = isinstance(value, str) and value.partition(":")[0] == "worst"
+        return value if is_worst else super().convert(value, param, ctx)
+
+
 class TimeOffset(Seconds):
     """Reads a time in seconds, or the word that asks to find it."""
 

@@ -50,7 +50,7 @@ def record(
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
-    from fuselog.pipeline.command_line.commands import companions_if
+    from fuselog.pipeline.command_line.commands import companions_if, say_left_out
     from fuselog.pipeline.output.outputs import RECORDED, check_files, replaced, run_written
     from fuselog.pipeline.output.terminal import warn
     from fuselog.pipeline.runs.inputs import load_scenario
@@ -77,6 +77,7 @@ def record(
     beside = companions_if(foxglove)
     write_log(path, recording.streams, metadata, compression=compression, companions=beside)
     say_written(path, sum(map(len, recording.streams)))
+    say_left_out(path, foxglove)
     if sentence := replaced(path, before, open_log(path).run):
         warn(sentence)
 

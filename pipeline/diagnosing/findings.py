@@ -17,17 +17,15 @@ from fuselog.recorders.parameters import field_of
 from fuselog.recorders.plausibility.checks import BLOCK, findings_in
 from fuselog.recorders.plausibility.finding import Cause
 from fuselog.recorders.plausibility.stamps import MOST_LOST
-from fuselog.replay.distributions import chi2
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
+from fuselog.replay.judging.consistency.divergence import find_divergence
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
 FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter
 TAIL = 3.0  # standard deviations
-IMPROBABLE = 1e-4
-WINDOW = 30  # innovations, over which NIS is averaged to see a filter diverge
 LOCKED_OUT = 20  # measurements in a row that a gate keeps out
 KEPT_OUT = 0.05  # of measurements that a gate keeps out, though they are no outliers
 LOST = 0.02  # of the steps of a regular topic, which are longer than usual
@@ -200,23 +198,11 @@ def of_innovations(
 
 
 def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterator[Finding]:
-    """Find from when on NIS is too large for good, where it was not so before."""
-    nis = stream["normalised_innovation_squared"]
-    degrees = np.isfinite(stream["innovation"]).sum(axis=1)
-    used = np.flatnonzero((degrees > 0) & np.isfinite(nis))
-    if len(used) < 4 * WINDOW:
+    """Yield where a filter diverges, and after what."""
+    found = find_divergence(stream)
+    if found is None:
         return
-    ones = np.ones(WINDOW)
-    sums = np.convolve(nis[used], ones, "valid")
-    bounds = chi2.isf(IMPROBABLE, np.convolve(degrees[used], ones, "valid"))
-    is_well = sums <= bounds
-    if is_well[-1] or not is_well.any():
-        return
-    last = int(np.flatnonzero(is_well)[-1])
-    if len(is_well) - last < 2 * WINDOW or np.mean(is_well[: last + 1]) < REGULAR:
-        return
-    row = int(used[min(last + WINDOW, len(used) - 1)])
-    later = used[last + WINDOW :]
+    row = found.row
     there = np.isfinite(stream["innovation"][row])
     about = ", ".join(np.array(stream.components)[there])
     if stream["target_id"][row]:
@@ -224,10 +210,9 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
     yield Finding(
         "divergence",
         topic,
-        f"{case}: diverges at {_at(stream.publish_time_ns[row], epoch_ns)}, after {about}: "
-        f"NIS per component is {nis[later].sum() / degrees[later].sum():.3g} from there on, and was as "
-        "expected before",
-        int(stream.publish_time_ns[row]),
+        f"{case}: diverges at {_at(found.time_ns, epoch_ns)}, after {about}: NIS per component is "
+        f"{found.nis_per_component:.3g} from there on, and was as expected before",
+        found.time_ns,
     )
 
 

@@ -13,7 +13,7 @@ from urllib.parse import quote
 from fuselog.pipeline.logs.mot import mot_files
 from fuselog.pipeline.output.outputs import Kind, check_files, check_folder
 from fuselog.recorders.atomic import whole_file, whole_folder
-from fuselog.recorders.errors import BadInput, UnknownName, choices, some_of, without_warnings_of_numbers
+from fuselog.recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
 from fuselog.recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
@@ -131,7 +131,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
 
 def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
     """Write one log of the companions of all topics that have some."""
-    from fuselog.pipeline.logs.foxglove import companions  # which takes long to import
+    from fuselog.pipeline.logs.foxglove import companions, sentence_of  # which take long to import
 
     check_files([(place, _new("foxglove"))], {"log": [log.path]})
     written = dict.fromkeys(topics, 0)
@@ -143,7 +143,7 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
             raise BadInput(f"{log.path}: has nothing that Foxglove can show; export it as csv")
     without = [topic for topic, messages in written.items() if messages == 0]
     if without:
-        notes.append(f"Foxglove has no message for, left out: {some_of(without)}")
+        notes.append(sentence_of(without))
     return Exported({topic: place for topic, messages in written.items() if messages}, notes)
 
 

@@ -13,10 +13,13 @@ import numpy as np
 from google.protobuf.message import Message
 from scipy.spatial.transform import Rotation
 
+from fuselog.recorders.errors import some_of
 from fuselog.recorders.extras import extra
-from fuselog.recorders.log import Companion, Stream, schemas
+from fuselog.recorders.log import Companion, Log, Stream, schemas
+from fuselog.recorders.log.companions import COMPANION_OF
 from fuselog.recorders.log.planes import FRAME, body_of
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
+from fuselog.replay.engine.vectors.tangent import manifold_blocks
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 from fuselog.replay.timeline.drawing.canvas import PALETTE, TRUTH
@@ -45,8 +48,10 @@ def companions(stream: Stream) -> Iterator[Companion]:
     """Yield the companions of a stream, or of a block of it: none of a prior or of no messages.
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
-    FrameTransforms; ellipses of 95 %, tracks and landmarks SceneUpdate; particles and detections
-    PosesInFrame; geodetic fixes LocationFix. The topic is `/foxglove`, the stream's, and what it is.
+    FrameTransforms; orientations alone are poses at the origin, and lines of sight of moving sensors
+    poses there whose x axis is the line. Ellipses of 95 %, tracks and landmarks become SceneUpdate,
+    particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is `/foxglove`, the
+    stream's, and what it is.
     """
     make = _MAKERS.get(stream.schema.full_name)
     is_stated = stream.topic.startswith("/estimates/")
@@ -63,6 +68,18 @@ def companions(stream: Stream) -> Iterator[Companion]:
         )
 
 
+def left_out(log: Log) -> str:
+    """Say which streams of a log have no companion; empty if all have some."""
+    shown = {topic.metadata[COMPANION_OF] for topic in log.companions.values()}
+    topics = [name for name, topic in log.topics.items() if topic.messages and name not in shown]
+    return sentence_of(topics) if topics else ""
+
+
+def sentence_of(topics: Sequence[str]) -> str:
+    """Say that topics have no companion."""
+    return f"Foxglove has no message for, left out: {some_of(topics)}"
+
+
 def _states(stream: Stream) -> Made:
     """Make the poses of truths and estimates, and what these are unsure of."""
     field = "mean" if "mean" in stream.columns else "state"
@@ -70,6 +87,10 @@ def _states(stream: Stream) -> Made:
     known = stream.take(rows)
     trajectory = trajectory_of(known)
     if trajectory is None:
+        kinds = known.metadata.get("kinds", "").split(",")
+        turned = [columns for kind, columns in manifold_blocks(kinds) if kind == "quaternion"]
+        if len(turned) == 1:
+            yield from _turns(known, rows, known[field][:, turned[0]])
         return
     quaternions = None
     if trajectory.rotation is not None:
@@ -97,6 +118,29 @@ def _fixes(stream: Stream) -> Made:
 
 def _stated_poses(stream: Stream) -> Made:
     yield from _poses(stream, np.arange(len(stream)), stream["position_m"], stream["quaternion"])
+
+
+def _orientations(stream: Stream) -> Made:
+    yield from _turns(stream, np.arange(len(stream)), stream["quaternion"])
+
+
+def _turns(stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], quaternions: Floats) -> Made:
+    """Make poses at the origin, turned by quaternions (n, 4) with w first; no rotation is left out."""
+    known = np.isfinite(quaternions).all(axis=1) & (np.linalg.norm(quaternions, axis=1) > 0.0)
+    places = np.zeros((np.count_nonzero(known), 3))
+    yield from _poses(stream.take(known), rows[known], places, quaternions[known])
+
+
+def _sights(stream: Stream) -> Made:
+    """Make poses of moving sensors, turned so that their x axis is the line of sight."""
+    angles = np.stack([stream["azimuth_rad"], -stream["elevation_rad"]], axis=1)
+    known = np.flatnonzero(np.isfinite(angles).all(axis=1))
+    seen = stream.take(known)
+    turned = Rotation.from_quat(seen["quaternion"], scalar_first=True)
+    forward = Rotation.from_euler("y", -0.5 * np.pi)  # from x to z, where both angles are zero
+    lines = (turned * Rotation.from_euler("YX", angles[known]) * forward).as_quat(scalar_first=True)
+    for row, pose in enumerate(_in_frame(seen, seen["position_m"], lines)):
+        yield "pose", pose, int(known[row])
 
 
 def _poses(
@@ -269,6 +313,8 @@ _MAKERS: dict[str, Callable[[Stream], Made]] = {
     schemas.TRUTH_STATE.full_name: _states,
     schemas.GAUSSIAN_ESTIMATE.full_name: _states,
     schemas.POSE.full_name: _stated_poses,
+    schemas.ORIENTATION.full_name: _orientations,
+    schemas.MOVING_LINE_OF_SIGHT.full_name: _sights,
     schemas.POSITION_FIX.full_name: _fixes,
     schemas.COURSE_FIX.full_name: _fixes,
     schemas.GEODETIC_FIX.full_name: _location_fixes,

@@ -29,6 +29,7 @@ from fuselog.replay.judging.errors.evaluation import (
     unestimated,
     unjudged_sentence,
 )
+from fuselog.replay.judging.errors.moments import Moment, Moments, worst_of
 from fuselog.replay.judging.errors.planes import first_fixes
 from fuselog.replay.judging.errors.truths import Doubt, Truths
 from fuselog.replay.judging.errors.uninformed import Uninformed
@@ -118,6 +119,7 @@ class Judge:
         self._uninformed: dict[str, Uninformed] = {}
         self._unestimated: dict[str, list[str]] = {}
         self._means = MeansOfAll()
+        self._moments = Moments()
         self._doubts: dict[str, Doubt] = {}
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
@@ -197,6 +199,7 @@ class Judge:
             errors = errors_at(errors, errors.elapsed_s > self._burn_in_s + 1e-9)
         judged.errors.append(errors)
         self._measured.add(topic, errors)
+        self._moments.add(errors)
         if self._on_errors is not None:
             self._on_errors(errors)
         columns = columns_of(errors)
@@ -239,6 +242,7 @@ class Judge:
                 self._quantities[topic] = quantities
         self._of_targets = self._of_targets or other._of_targets
         self._means.merge(other._means)
+        self._moments.merge(other._moments)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
         self._diagnostics.merge(other._diagnostics)
@@ -313,6 +317,19 @@ class Judge:
     def components_without_truth(self) -> list[str]:
         """Say of every estimate of which components the truth lacks, or that it is in another plane."""
         return [sentence for sentence in self._unjudged.values() if sentence]
+
+    @property
+    def worst(self) -> dict[str, Moment]:
+        """Return by estimator the moment of its largest NEES; without NEES, of its largest error."""
+        found: dict[str, list[Moment]] = {}
+        for moment in self._moments.found:
+            found.setdefault(moment.estimator, []).append(moment)
+        worst = {estimator: worst_of(moments) for estimator, moments in found.items()}
+        return {estimator: moment for estimator, moment in worst.items() if moment is not None}
+
+    def name_of(self, run: int) -> str:
+        """Return the name of a run by its number."""
+        return self._names[run]
 
     @property
     def failures(self) -> list[str]:

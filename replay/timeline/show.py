@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -12,15 +13,18 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.recorders.errors import BadInput, choices, printable
-from fuselog.recorders.log import Stream
+from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.consistency.divergence import Divergence, find_divergence
 from fuselog.replay.judging.errors.evaluation import Errors, errors_at
+from fuselog.replay.judging.errors.moments import Moments
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 from fuselog.replay.timeline.fanning import Fan, draw_fans
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
+from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
@@ -41,6 +45,7 @@ class Drawing:
         focus: the case that is seen first, such as `robot3`.
         save: the .rrd file to write.
         connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
+        at: `worst` or `worst:ESTIMATOR`: without a focus, the case of that moment is seen first.
         sides: estimators whose scenes stand side by side, with the differences of their errors.
         fans: how far copies are from their estimates.
 
@@ -56,6 +61,7 @@ class Drawing:
         focus: str | None = None,
         save: Path | None = None,
         connect: str | None = None,
+        at: str | None = None,
         sides: Sequence[str] = (),
         fans: Sequence[Fan] = (),
     ) -> None:
@@ -64,7 +70,7 @@ class Drawing:
                 "a timeline needs a destination: give --save FILE.rrd, --connect URL, or both"
             )
         self._source, self._focus, self._save = source, focus, save
-        self._sides, self._fans = sides, fans
+        self._at, self._sides, self._fans = at, sides, fans
         scenario = source.run.scenario if source.run else ""
         known = available("timelines")
         self._timeline: Timeline = load("timelines", scenario) if scenario in known else GENERIC
@@ -75,6 +81,7 @@ class Drawing:
         self._sensed = Sensed(source, is_live=connect is not None)
         self._kept = Thin(KEPT_ROWS, KEPT_ERRORS)
         self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
+        self._moments = Moments()
         self._sent = 0
         self._stack = ExitStack()
         self._live = None
@@ -100,23 +107,42 @@ class Drawing:
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
         """Take in a block of the run's outputs, and the errors of its estimates."""
         self._kept.add(outputs, errors)
+        for each in errors:
+            self._moments.add(each)
         self._sensed.advance(self._kept.last_ns)
         if self._live is not None:
             self._fresh.add(outputs, errors)
             if self._fresh.added >= LIVE_MESSAGES:
                 self._send(self._live, self._fresh.last_ns)
 
-    def _send(self, live: rr.RecordingStream, until_ns: int) -> None:
-        """Send what has come since the last time, and what was sensed up to a stamp."""
+    def _send(self, live: rr.RecordingStream, until_ns: int, last: Scene | None = None) -> None:
+        """Send what has come since the last time, and what was sensed up to a stamp.
+
+        `last` is the whole run, at its end.
+        """
         sensed = self._sensed.read_to(until_ns)
-        self._draw(live, Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus))
+        scene = Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus)
+        if last is not None:
+            scene = replace(scene, moments=last.moments, divergences=last.divergences)
+        self._draw(live, scene)
         self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
         self._sent += 1
 
     def _finish(self) -> None:
+        moments = self._moments.found
+        worst = None if self._at is None else worst_at(moments, self._at)
+        if self._focus is None and worst is not None:
+            self._focus = worst.case
+        scene = Scene(
+            self._sensed.all(),
+            self._kept.outputs,
+            self._kept.errors,
+            self._focus,
+            moments,
+            _divergences(self._kept.whole),
+        )
         if self._live is not None:
-            self._send(self._live, np.iinfo(np.int64).max)
-        scene = Scene(self._sensed.all(), self._kept.outputs, self._kept.errors, self._focus)
+            self._send(self._live, np.iinfo(np.int64).max, scene)
         if self._live is not None and self._sent > 1:  # what moves is there; ranges are of the last part
             self._draw(self._live, scene, is_still=True)
         if self._save is not None:
@@ -130,6 +156,7 @@ class Drawing:
             raise BadInput(f"--focus {self._focus}: nothing in this log has that name; {known}")
         canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
         layout = self._timeline.draw(canvas, scene)
+        keep_moments(recording, scene.moments)
         if self._sides:
             layout = draw_side_by_side(canvas, scene, layout, self._sides)
         if self._fans:
@@ -184,6 +211,16 @@ def _canvas(
     truths = [truth.publish_time_ns[-1:] for case in scene.cases for truth in scene.truths_of(case)]
     end_ns = int(np.concatenate([[epoch_ns], steps_ns[-1:], *truths]).max())
     return Canvas(recording, epoch_ns, end_ns, steps_ns, is_still, scene.dates)
+
+
+def _divergences(outputs: Mapping[str, Stream]) -> dict[str, Divergence]:
+    """Find where estimators diverge, by topic of their innovations."""
+    found = {
+        topic: find_divergence(stream)
+        for topic, stream in outputs.items()
+        if stream.schema.full_name == schemas.INNOVATION.full_name
+    }
+    return {topic: each for topic, each in found.items() if each is not None}
 
 
 def _identity(outputs: Mapping[str, Stream]) -> str:

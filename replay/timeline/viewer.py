@@ -1,4 +1,4 @@
-"""Starts Rerun's viewer, which rerun-sdk brings along: a picture without a screen, or the window.
+"""Starts Rerun's viewer, which rerun-sdk brings along: its window, a picture, or a page for a browser.
 
 It listens on the loopback interface only, reports no usage, reaches no network, and ends with the
 process that started it, however that ends.
@@ -9,10 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
 import rerun as rr
 from PIL import Image
@@ -31,8 +32,11 @@ _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0
 _SAID = "rerun.log"
-# The viewer's own messages lie on top of the first three or four pictures, however long that takes.
-_PICTURES = 7
+# The viewer's own messages lie on top of its first three or four pictures, however long these take, so
+# that those are of an empty window. Of a timeline, the first picture may not show all.
+_EMPTY_PICTURES, _PICTURES = 7, 3
+# The height in pixels of the viewer's bar, with its menu and badges of its environment.
+_BAR = 36
 
 
 class Listener(NamedTuple):
@@ -43,15 +47,21 @@ class Listener(NamedTuple):
 
 
 def screenshot(
-    rrd: Path, png: Path, *, at_s: float | None = None, size: tuple[int, int] = (1600, 1000)
+    rrd: Path,
+    png: Path,
+    *,
+    at_s: float | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    progress: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
-    """Save the viewer's picture of a timeline; needs no screen, only a Vulkan driver.
+    """Save the viewer's picture of a timeline, without its bar; needs no screen, only a Vulkan driver.
 
     Args:
         rrd: the timeline.
         png: the picture to write.
         at_s: where the cursor stands, in seconds since the run's epoch; None is the middle.
         size: width and height in pixels.
+        progress: is told what is being done.
 
     Returns what the views complain of, an empty list where all is well.
 
@@ -62,19 +72,24 @@ def screenshot(
     if not png.parent.is_dir():
         raise BadInput(f"{png}: the folder does not exist; make it first")
     with scratch_folder("fuselog-viewer") as folder, whole_file(png, parents=False) as new:
-        window = f"{size[0]}x{size[1]}"
+        window = f"{size[0]}x{size[1] + _BAR}"
+        progress("picture: starting the viewer")
         with listen(folder, "--headless", "--hide-welcome-screen", "--window-size", window) as listener:
             client = ViewerClient.connect(listener.url)
+            picture = folder / "picture.png"
+            for _ in range(_EMPTY_PICTURES):
+                client.save_screenshot(rerun_path(picture))
+            progress("picture: loading the timeline")
             _load(client, rrd)
             _set_cursor(client, rrd, at_s)
-            picture = folder / "picture.png"
-            for _ in range(_PICTURES):
+            for number in range(_PICTURES):
+                progress(f"picture: drawing, {number + 1} of {_PICTURES}")
                 client.save_screenshot(rerun_path(picture))
             views = client.get_state().views
         info = PngInfo()
         info.add_text("Software", SOFTWARE)
         with Image.open(picture) as image:
-            image.save(new, pnginfo=info)
+            image.crop((0, _BAR, *image.size)).save(new, pnginfo=info)
     return [f"{view.name}: {report}" for view in views for report in view.reports]
 
 
@@ -89,7 +104,10 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
     """
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        raise BadInput("there is no screen to show a timeline on; give --screenshot FILE.png")
+        raise BadInput(
+            "there is no screen to show a timeline on; give --web to see it in a browser, --screenshot "
+            "FILE.png for a picture, --save FILE.rrd for a file, or --connect URL for a running viewer"
+        )
     port = _free_port()
     options = [str(rrd), "--port", str(port), "--bind", "127.0.0.1"]
     with scratch_folder("fuselog-viewer") as folder:
@@ -102,6 +120,26 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
             process.wait()
         if process.returncode != 0:
             raise _why_ended(folder)
+
+
+def serve(rrd: Path, announce: Callable[[str], None]) -> None:
+    """Serve a timeline to browsers of this machine by Rerun's web viewer, until it is interrupted.
+
+    Args:
+        rrd: the timeline.
+        announce: is told the page's address, as soon as it answers.
+
+    Raises BadInput if there is no such file, or the viewer ends.
+    """
+    _require_timeline(rrd)
+    port = _free_port()
+    options = ["--serve-web", "--web-viewer-port", str(port)]
+    with scratch_folder("fuselog-viewer") as folder:
+        with listen(folder, str(rrd.resolve()), *options) as listener:
+            _await_port(listener.process, port)
+            announce(f"http://127.0.0.1:{port}/?url={quote(listener.url, safe='')}")
+            listener.process.wait()
+        raise _why_ended(folder)
 
 
 def view_inline(rrd: Path) -> None:

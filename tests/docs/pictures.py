@@ -19,8 +19,8 @@ from fuselog.replay.timeline.viewer import screenshot
 from tests.docs.gallery import DOCS
 from tests.goldens.recipes import DATA, RECIPES, data_option, first_log, unpack
 
-WINDOW = (960, 600)
-VIEWS = (0, 36, 960, 570)  # without the viewer's own bars
+WINDOW = (960, 564)
+VIEWS = (0, 0, 960, 534)  # without the time panel
 
 
 def draw(name: str, places: Mapping[str, Path], rrd: Path) -> None:

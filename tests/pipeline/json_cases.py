@@ -63,6 +63,14 @@ def bounds_of(innovations: Mapping[str, int]) -> dict[str, Any]:
     }
 
 
+def worst_of(errors: pd.DataFrame) -> dict[str, Any]:
+    """The moment of the largest NEES of the only run."""
+    row = errors.loc[errors["nees"].idxmax()]
+    return {"quantity": "nees", "value": row["nees"], "run": str(Path("run.mcap").resolve())} | {
+        name: row[name] for name in ("estimator", "case", "time_ns", "elapsed_s")
+    }
+
+
 def degrees_of(done: Any) -> dict[str, int]:
     return done.innovations.groupby("estimator")["degrees"].sum().to_dict()
 
@@ -85,6 +93,7 @@ def judged() -> tuple[Any, dict[str, Any]]:
         "alarms": [asdict(each) for each in done.alarms],
         "failures": [],
         "losses": done.losses,
+        "worst": {"ekf": worst_of(done.errors)},
         "coverage": [row],
     }
 
@@ -102,6 +111,7 @@ def of_replay() -> Any:
     }
     del stated["sigma_range_m"]
     return outcome | {
+        "worst": {"ekf": outcome["worst"]["ekf"] | {"run": "run.mcap"}},
         "written": ["again.mcap"],
         "seconds": {"ekf": POSITIVE},
         "parameters": {"ekf": {name: fields[name].default for name in names} | {"sigma_range_m": 0.05}},
@@ -121,7 +131,10 @@ def of_aligned() -> Any:
     assert 0.0 < aligned["ekf.position_rmse_m.robot1"] < outcome["metrics"]["ekf.position_rmse_m.robot1"]
     assert len(found.compared.metrics) > 20
     losses = [*outcome["losses"], *found.compared.notes]
-    return outcome | {"metrics": aligned | found.compared.metrics, "losses": losses, "written": []}
+    moment = found.judge.worst["ekf"]._asdict() | {"run": outcome["worst"]["ekf"]["run"]}
+    assert moment["value"] != outcome["worst"]["ekf"]["value"]
+    changed = {"metrics": aligned | found.compared.metrics, "losses": losses, "written": []}
+    return outcome | changed | {"worst": {"ekf": moment}}
 
 
 def of_trajectories(found: Any) -> Any:

@@ -16,11 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rerun.blueprint import View
 
 import fuselog as fl
 from fuselog.pipeline.api.lists import KEPT
 from fuselog.pipeline.output.results import result_folder
 from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.replay.timeline.drawing.canvas import Scene
 from tests.lists import lists
 from tests.pipeline.conftest import heeding_interrupts
 from tests.replay.foreign.test_isolation import SANE, run_with
@@ -710,10 +712,46 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
 def test_the_run_that_a_result_shows_is_saved(world: Path, fuselog: Fuselog) -> None:
     result = world / "result"
     said = fuselog("view", str(result), "--save", "shown.rrd")
-    assert (said.code, said.err) == (0, "")
+    assert (said.code, said.out, said.err) == (0, "shown.rrd\n", "")
     assert Path("shown.rrd").read_bytes() == (result / "timeline.rrd").read_bytes()
     refused = fuselog("view", str(result), "--save", "shown.rrd", "--start", "1")
     assert (refused.code, "--start, --end, --focus and --connect need a log" in refused.err) == (2, True)
+    refused = fuselog("view", str(result), "--save", "shown.rrd", "--at", "worst")
+    assert (refused.code, "--at worst: places the cursor of the viewer" in refused.err) == (2, True)
+
+
+@pytest.mark.usefixtures("here")
+def test_a_view_opens_at_the_moment_that_a_replay_names(
+    fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two robots, that of the moment is seen first; unless another one is asked for."""
+    fuselog("record", "landmarks", "--set", "robots=2", "--set", "duration_s=2", "-o", "two.mcap")
+    names = ("-e", "ekf", "-e", "ukf", "-o", "est.mcap")
+    worst = fuselog("replay", "two.mcap", *names, "--json").json["worst"]
+    said = fuselog("replay", "two.mcap", *names).out.splitlines()
+    seen: list[Any] = []
+
+    def picture(*_: object, at_s: float, progress: object) -> list[str]:
+        seen.append(at_s)
+        return []
+
+    def draw_cases(scene: Scene, draw_case: Callable[[str], View]) -> View:
+        seen.append(scene.focus)
+        return draw_case(scene.cases[0])
+
+    monkeypatch.setattr("fuselog.replay.timeline.viewer.screenshot", picture)
+    monkeypatch.setattr("fuselog.replay.timeline.families.landmarks.draw_cases", draw_cases)
+    for name in ("ekf", "ukf"):
+        moment = worst[name]
+        shown = fuselog("view", "est.mcap", "--at", f"worst:{name}", "--screenshot", "a.png")
+        line, written = shown.out.splitlines()
+        assert (line in said, line.startswith(f"{name}: worst at ")) == (True, True)
+        assert (written, seen) == ("a.png", [moment["case"], moment["elapsed_s"]])
+        seen.clear()
+    other = {"robot1": "robot2", "robot2": "robot1"}[worst["ekf"]["case"]]
+    shown = fuselog("view", "est.mcap", "--at", "worst", "--focus", other, "--screenshot", "a.png")
+    assert (shown.code, seen[0]) == (0, other)
+    assert f" of {other}: NEES " in shown.out
 
 
 @pytest.mark.usefixtures("here")

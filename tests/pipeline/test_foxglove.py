@@ -171,6 +171,30 @@ def seen() -> list[Stream]:
     ]
 
 
+def test_orientations_and_moving_sights_are_poses_and_other_streams_are_named(fuselog: Fuselog) -> None:
+    made = fuselog("record", "moving-los", "--set", "duration_s=2", "--foxglove", "-o", "los.mcap")
+    assert "los.mcap: Foxglove has no message for, left out: /prior, /truth" in made.err
+    topic = "/sensor1/moving_line_of_sight"
+    sights = read_streams(open_log("los.mcap"), [topic])[topic]
+    poses = decoded("los.mcap")[f"/foxglove{topic}/pose"]
+    assert_allclose(places(poses), sights["position_m"])
+    azimuth, elevation = sights["azimuth_rad"], sights["elevation_rad"]
+    level = np.cos(elevation)
+    seen = np.stack([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level], axis=1)
+    turned = Rotation.from_quat(sights["quaternion"], scalar_first=True)
+    assert_allclose(rotations(poses).apply([1.0, 0.0, 0.0]), turned.apply(seen), atol=1e-12)
+    assert len(set(sights["target_id"])) > 1
+    made = fuselog("record", "orientation", "--set", "steps=3", "--foxglove", "-o", "turned.mcap")
+    assert "Foxglove" not in made.err
+    topics = read_streams(open_log("turned.mcap"), ["/quaternion", "/truth"])
+    found = decoded("turned.mcap")
+    for topic, field in (("/quaternion", "quaternion"), ("/truth", "state")):
+        poses = found[f"/foxglove{topic}/pose"]
+        assert_allclose(places(poses), 0.0)
+        wanted = Rotation.from_quat(topics[topic][field], scalar_first=True)
+        assert_allclose((rotations(poses) * wanted.inv()).magnitude(), 0.0, atol=1e-7)
+
+
 def test_any_log_goes_to_foxglove(fuselog: Fuselog) -> None:
     streams = seen()
     write_log("own.mcap", streams)

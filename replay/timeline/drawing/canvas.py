@@ -7,7 +7,7 @@ no dates, as those of a simulated clock in a bag, `utc` is when they reached the
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import cycle
 
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Schema, Stream, schemas, topics_of
 from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.consistency.divergence import Divergence
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, split_topic
+from fuselog.replay.judging.errors.moments import Moment
 
 Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]
@@ -66,12 +68,16 @@ class Scene:
         outputs: the estimators' streams of this run, by topic.
         errors: the errors of this run's estimates, where there is truth.
         focus: the case that is seen first; None is the first one.
+        moments: where NEES and errors of the whole run are largest.
+        divergences: where estimators diverge, by topic of their innovations.
     """
 
     source: Source
     outputs: Mapping[str, Stream]
     errors: Sequence[Errors]
     focus: str | None = None
+    moments: Sequence[Moment] = ()
+    divergences: Mapping[str, Divergence] = field(default_factory=dict)
 
     @property
     def estimators(self) -> list[str]:

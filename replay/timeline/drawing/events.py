@@ -1,6 +1,6 @@
-"""Writes what happened in a run: gated and late measurements, failures, spans without a sensor."""
+"""Writes what happened in a run: worst moments, rejected and late measurements, failures, gaps."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.engine.replaying.usage import CONTROLS
 from fuselog.replay.engine.streams.failures import sentences_of
+from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.timeline.drawing.canvas import (
     Canvas,
     Scene,
@@ -48,12 +49,16 @@ STATES: Mapping[str, Mapping[float, str]] = {
 
 
 class Happened(NamedTuple):
-    """Holds what happened to an estimator or a sensor: a text for each time, all of one level."""
+    """Holds what happened to an estimator or a sensor: a text for each time, all of one level.
+
+    `part` is the entity below that of `who`, if it has one of its own.
+    """
 
     who: str
     level: str
     time_ns: Times
     texts: list[str]
+    part: str = ""
 
 
 def above_events(
@@ -69,22 +74,24 @@ def draw_events(
     case: str,
     not_drawn: Mapping[str, str] | None = None,
     also: Iterable[Happened] = (),
+    more: Collection[str] = (),
 ) -> list[rrb.TextLogView]:
     """Draw the events of a case, one entity per estimator and sensor: no view where nothing happened.
 
     `not_drawn` says of topics that have no drawing why, beside those that cannot be read; `also` is what
-    happened that only a scenario family knows of.
+    happened that only a scenario family knows of; `more` are other cases whose worst moments are here.
     """
     root = entity_path("events", case)
     reasons = {**scene.unread, **(not_drawn or {})}
     texts = [f"{topic} is not drawn: {reason}" for topic, reason in reasons.items()]
     unread = Happened("log", "INFO", np.full(len(texts), canvas.epoch_ns), texts)
-    happened = [unread, *also, *_of_estimators(scene, case), *_of_sensors(scene, case)]
+    happened = [unread, *also, *_of_moments(scene, {case, *more}), *_of_estimators(scene, case)]
+    happened += [*_of_divergences(scene, case), *_of_sensors(scene, case)]
     happened = [each for each in happened if each.texts]
-    for who, level, time_ns, texts in happened:
+    for who, level, time_ns, texts, part in happened:
         lines = stamped(canvas, time_ns, [f"{who}: {text}" for text in texts])
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
-        canvas.send(f"{root}/{who}", time_ns, columns)
+        canvas.send(entity_path(root, who, part), time_ns, columns)
     return [events_view(root)] if happened else []
 
 
@@ -103,6 +110,27 @@ def events_view(root: str) -> rrb.TextLogView:
     """Return all events below an entity."""
     shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
+
+
+def _of_moments(scene: Scene, cases: Collection[str]) -> Iterator[Happened]:
+    """Yield where the estimators of some cases are worst."""
+    found: dict[str, list[Moment]] = {}
+    for moment in sorted(scene.moments, key=lambda each: each.time_ns):
+        if moment.case in cases:
+            found.setdefault(moment.estimator, []).append(moment)
+    for estimator, moments in found.items():
+        texts = [f"largest {each.words}" + (f" of {each.case}" if each.case else "") for each in moments]
+        yield Happened(estimator, "INFO", np.array([each.time_ns for each in moments]), texts, "worst")
+
+
+def _of_divergences(scene: Scene, case: str) -> Iterator[Happened]:
+    """Yield where estimators diverge, unless a diagnosis has found out what happened."""
+    diagnosed = {estimator for estimator, _ in scene.outputs_of(case, schemas.DIAGNOSED)}
+    for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
+        if stream.topic in scene.divergences and estimator not in diagnosed:
+            found = scene.divergences[stream.topic]
+            text = f"diverges: NIS per component is {found.nis_per_component:.3g} from here on"
+            yield Happened(estimator, "ERROR", np.array([found.time_ns]), [text])
 
 
 def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:

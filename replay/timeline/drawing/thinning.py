@@ -87,6 +87,11 @@ class Thinned(Generic[Rows]):
             self._thin()
         return self._parts[0]
 
+    @property
+    def is_whole(self) -> bool:
+        """Tell whether all rows are kept so far."""
+        return self._shift == 0
+
     def _coarsen(self, most: int) -> None:
         """Widen the cells until so many rows are left at most."""
         self._thin()
@@ -189,6 +194,11 @@ class Thin:
     def outputs(self) -> dict[str, Stream]:
         """Return what is kept, by topic."""
         return {topic: kept.rows for topic, kept in self._outputs.items()}
+
+    @property
+    def whole(self) -> dict[str, Stream]:
+        """Return the outputs of which all is kept."""
+        return {topic: kept.rows for topic, kept in self._outputs.items() if kept.is_whole}
 
     @property
     def errors(self) -> list[Errors]:

@@ -199,7 +199,9 @@ def _draw_names(canvas: Canvas, entity: str, found: Sequence[Errors], extent_m: 
 
 def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLogView]:
     """List what happened to estimators, sensors and messages."""
-    happened = [draw_events(canvas, scene, case) for case in scene.cases[: PLOTTED_NODES + 1]]
+    plotted, others = scene.cases[: PLOTTED_NODES + 1], scene.cases[PLOTTED_NODES + 1 :]
+    happened = [draw_events(canvas, scene, case, more=others) for case in plotted[:1]]
+    happened += [draw_events(canvas, scene, case) for case in plotted[1:]]
     times, first = np.unique(links.publish_time_ns, return_index=True)
     texts = [_line_of(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
     levels = ["WARN" if "lost" in text else "INFO" for text in texts]

@@ -113,7 +113,12 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     sensor.name = "Raw detections, sensor's frame"
     close.name = f"Close-up about the true places, {CELL_M:g} m each"
     board: Board = rrb.Vertical(
-        rrb.Tabs(whole, sensor, *_geodetic_views(canvas, scene), *draw_events(canvas, scene, "")),
+        rrb.Tabs(
+            whole,
+            sensor,
+            *_geodetic_views(canvas, scene),
+            *draw_events(canvas, scene, "", more=scene.cases),
+        ),
         close,
         row_shares=[3, 1] if scene.outputs else [3, 2],
     )

@@ -1,6 +1,7 @@
 """The judge: the same numbers whatever the blocks and parts that it gets, and truths read along."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -20,6 +21,7 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.judging.diagnostics import Diagnostics
 from fuselog.replay.judging.errors.constant import _inverse
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, rmse_interval
+from fuselog.replay.judging.errors.moments import Moments, worst_of
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.sums import BinnedSums
@@ -74,6 +76,7 @@ def assert_alike(one: Judge, other: Judge) -> None:
     for topic, steps in one.steps.items():
         pd.testing.assert_frame_equal(steps, other.steps[topic], rtol=1e-12)
     assert one.bounds == other.bounds
+    assert one.worst == other.worst
     assert (one.failures, one.notes_of_coverage, one.components_without_truth) == (
         other.failures,
         other.notes_of_coverage,
@@ -99,6 +102,32 @@ def test_parts_of_the_runs_merge_to_the_whole(
     parts.merge(judged(sources[2:], [of_runs([2])], first_run=2))
     assert_alike(parts, judged(sources, [outputs]))
     assert set(parts.runs_table["run"]) == {0, 1, 2}
+
+
+def test_the_worst_moment_is_that_of_the_largest_nees_else_of_the_largest_error(
+    sources: list[MemorySource], outputs: dict[str, Ragged]
+) -> None:
+    judge = Judge(sources, gap_limit_s=GAP_S)
+    blocks = [judge.add(block).errors for block in cut(outputs, sources[0].epoch_ns + 2 * 10**9)]
+    assert set(judge.worst) == {"ekf", "dead-reckoning"}
+    for estimator, found in judge.worst.items():
+        errors = [each for block in blocks for each in block if each.estimator == estimator]
+        nees, run, time_ns = (
+            np.concatenate([getattr(each, name) for each in errors])
+            for name in ("nees", "run", "time_ns")
+        )
+        row = int(np.argmax(nees))
+        assert found[:6] == (estimator, "robot1", "nees", nees[row], run[row], time_ns[row])
+        assert found.elapsed_s == pytest.approx((time_ns[row] - sources[0].epoch_ns) * 1e-9)
+    moments = Moments()
+    assert worst_of(moments.found) is None
+    errors = blocks[0][0]
+    moments.add(replace(errors, nees=np.full(len(errors.nees), np.nan)))
+    length = np.hypot(*errors.error[:, errors.position].T)
+    worst = worst_of(moments.found)
+    assert worst is not None
+    assert (worst.quantity, worst.time_ns) == ("position_error_m", errors.time_ns[np.argmax(length)])
+    assert worst.value == pytest.approx(length.max())
 
 
 def test_probabilities_of_modes_are_means_over_the_runs(sources: list[MemorySource]) -> None:

@@ -311,7 +311,21 @@ def quality(errors: Sequence[Errors], case: str) -> tuple[dict[str, Wanted], Tit
         wanted[f"{plot}/{each.estimator}"] = Wanted("curve", time_ns, each.nees)
         wanted[f"{plot}/bounds"] = consistent(count, time_ns)
         titles.add((f"NEES of this run, {count} component{'s' * (count > 1)} (-)", plot[1:]))
+        events = f"/events/{case}".rstrip("/")
+        wanted[f"{events}/{each.estimator}/worst"] = _worst(each)
+        titles.add(("Events", events[1:]))
     return wanted, titles
+
+
+def _worst(errors: Errors) -> Wanted:
+    """The events of the largest NEES and of the largest error, in order of time."""
+    quantity, columns, scale = errors.main
+    length = scale * np.linalg.norm(errors.error[:, columns], axis=1)
+    found = [("NEES", errors.nees), (quantity.replace("rmse", "error"), length)]
+    rows = sorted((int(np.nanargmax(values)), name, np.nanmax(values)) for name, values in found)
+    of = f" of {errors.case}" * bool(errors.case)
+    texts = [f"{errors.estimator}: largest {name} {value:.3g}{of}" for _, name, value in rows]
+    return Wanted("told", errors.time_ns[[row for row, *_ in rows]], texts)
 
 
 def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("one", "two")) -> None:

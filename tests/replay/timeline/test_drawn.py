@@ -278,6 +278,7 @@ def test_a_network_has_messages_on_their_way_and_the_errors_of_its_nodes(tmp_pat
     for node in ("node1", "node3"):
         plots, own = run.quality(node)
         wanted |= plots
+        own -= {("Events", f"events/{node}")}  # all are in one view
         titles |= {(f"{node}: {name}" if "NEES" in name else name, root) for name, root in own}
         for name, stream, _ in run.estimates(node):
             places, root = columns(stream, "mean", *PLANE), f"/map/errors/{name}/{node}"
@@ -339,11 +340,19 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
         ("OpenStreetMap", "geodetic"),
         ("Error of all vehicles together (m)", "plots/error"),
         ("GOSPA, cutoff 10 m (m)", "plots/gospa"),
+        ("Events", "events"),
     }
+    told: dict[str, list[tuple[int, str]]] = {name: [] for name in ESTIMATORS}
     for case in cases:
         plots, own = run.quality(case)
         wanted |= {entity: each for entity, each in plots.items() if "nees" in entity}
         titles |= {(f"{case}: {name}", root) for name, root in own if "NEES" in name}
+        for name in ESTIMATORS:
+            _, stamps, texts = plots[f"/events/{case}/{name}/worst"]
+            told[name] += zip(stamps, texts, strict=True)
+    for name, found in told.items():
+        stamps, texts = zip(*sorted(found, key=lambda each: each[0]), strict=True)
+        wanted[f"/events/{name}/worst"] = Wanted("told", stamps, list(texts))
     truths = [run.truth(case) for case in cases[:2]]
     places = np.stack([columns(truth, "state", *PLANE) for truth in truths], axis=1)
     time_ns = truths[0].publish_time_ns

@@ -11,9 +11,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import matplotlib.image
 import numpy as np
+import psutil
 import pyarrow as pa
 import pytest
 import rerun as rr
@@ -37,12 +40,15 @@ from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
 from fuselog.replay.timeline.drawing.plane import ellipses
 from fuselog.replay.timeline.families.landmarks import GATED
+from fuselog.replay.timeline.moments import read_moments, worst_at
 from fuselog.replay.timeline.show import Drawing, show
 from fuselog.replay.timeline.sinks import open_recording
 from fuselog.replay.timeline.viewer import Listener, listen, screenshot, view
 
 SENSOR = {"rate_hz": 5.0, "outlier_probability": 0.05, "outages_per_minute": 9.0, "outage_s": 2.0}
 RUN = 1
+# The colours of the viewer's badges and warnings, and of its notices.
+BADGE, NOTICE = (255, 122, 12), (173, 187, 255)
 Columns = dict[str, list]
 
 
@@ -660,11 +666,57 @@ def test_what_cannot_be_shown_is_refused(ensemble: Replayed, tmp_path: Path) -> 
         screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
 
 
+def test_a_timeline_keeps_its_worst_moments(rrd: Path, ensemble: Replayed, tmp_path: Path) -> None:
+    moments = read_moments(rrd)
+    for estimator in ("dead-reckoning", "ekf"):
+        errors, rows = of_run(ensemble.errors, estimator)
+        row = np.flatnonzero(rows)[np.argmax(errors.nees[rows])]
+        found = worst_at(moments, f"worst:{estimator}")
+        assert found[:4] == (estimator, "robot1", "nees", errors.nees[row])
+        assert found[4:] == (RUN, errors.time_ns[row], errors.elapsed_s[row])
+        events = read(rrd)[f"/events/robot1/{estimator}/worst"]
+        at = events["utc"].index(errors.time_ns[row])
+        assert told(events)[at] == f"{estimator}: largest {found.words} of robot1"
+    assert worst_at(moments, "worst") == max(moments, key=lambda each: each.value)
+    with pytest.raises(BadInput, match=r"--at worst:efk: .* did you mean 'ekf'"):
+        worst_at(moments, "worst:efk")
+    show(ensemble.sources[RUN], {}, [], save=tmp_path / "log.rrd")
+    with pytest.raises(BadInput, match="--at worst: no estimate is judged by a truth"):
+        worst_at(read_moments(tmp_path / "log.rrd"), "worst")
+
+
+def test_events_tell_where_an_estimator_diverges(ensemble: Replayed, tmp_path: Path) -> None:
+    source = ensemble.sources[RUN]
+    nis = np.random.default_rng(1).chisquare(1, 400)
+    nis[250:] *= 50.0
+    time_ns = source.epoch_ns + 10**7 * np.arange(400)
+    stream = make_stream(
+        "/estimates/ekf/robot1/innovation",
+        schemas.INNOVATION,
+        time_ns,
+        metadata={"components": "range_m", "kinds": "linear"},
+        target_id=np.ones(400),
+        accepted=np.ones(400),
+        innovation=np.sqrt(nis)[:, None],
+        covariance=np.ones((400, 1)),
+        normalised_innovation_squared=nis,
+        log_likelihood=-0.5 * nis,
+    )
+    show(source, {stream.topic: gather([stream])}, [], save=tmp_path / "run.rrd")
+    events = read(tmp_path / "run.rrd")["/events/robot1/ekf"]
+    assert [level for (level,) in events["TextLog:level"]] == ["ERROR"]
+    [text], [stamp] = told(events), events["utc"]
+    assert time_ns[245] < stamp < time_ns[260]
+    after = nis[time_ns > stamp].mean()
+    assert text.startswith("ekf: diverges: NIS per component is ")
+    assert float(text.split()[6]) == pytest.approx(after, rel=0.02)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a screen")
-def test_without_a_screen_the_picture_is_offered(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_screen_other_ways_are_offered(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(BadInput, match=r"no screen .*--screenshot"):
+    with pytest.raises(BadInput, match=r"no screen .*--web .*--screenshot .*--save .*--connect"):
         view(rrd)
     monkeypatch.setenv("DISPLAY", ":54321")
     with pytest.raises(BadInput, match=r"the viewer ended with an error: .*X server"):
@@ -693,7 +745,10 @@ def test_the_picture_shows_the_estimators_and_no_view_complains(rrd: Path, tmp_p
     assert reports == []
     picture = np.rint(255 * matplotlib.image.imread(png)[..., :3]).astype(int)
     assert picture.shape == (800, 1200, 3)
-    scene, plots = picture[60:500, :590], picture[60:, 610:]
+    scene, plots = picture[24:460, :590], picture[24:, 610:]
+    for colour in (BADGE, NOTICE):  # of the viewer's own: that it draws in software, where it listens
+        for place in (picture[:24], plots):
+            assert not (np.abs(place - colour).max(axis=-1) < 4).any()
     for colour in PALETTE[:2]:
         assert (np.abs(scene - colour).max(axis=-1) < 12).sum() > 100
         assert (np.abs(plots - colour).max(axis=-1) < 12).sum() > 100
@@ -705,6 +760,29 @@ def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
     if "Vulkan driver" in str(refused.value):
         pytest.skip(str(refused.value))
     refused.match("--at 99: the run goes from 0 to 20 s")
+
+
+@pytest.mark.paper
+@pytest.mark.unix
+def test_a_page_is_served_to_this_machine_alone_and_ends_with_the_command(
+    rrd: Path, tmp_path: Path
+) -> None:
+    program = str(Path(sys.executable).with_name("fuselog"))
+    command = [program, "view", str(rrd), "--web"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as running:
+        assert running.stdout is not None
+        url = running.stdout.readline().partition(" at ")[2].partition(";")[0]
+        with urlopen(url, timeout=10) as page:
+            assert (page.status, b"rerun" in page.read().lower()) == (200, True)
+        children = psutil.Process(running.pid).children(recursive=True)
+        sockets = [each for child in children for each in child.net_connections("inet")]
+        listening = [each.laddr for each in sockets if each.status == psutil.CONN_LISTEN]
+        running.send_signal(signal.SIGINT)
+        running.wait(10)
+    assert {address.ip for address in listening} == {"127.0.0.1"}
+    assert urlsplit(url).port in {address.port for address in listening}
+    assert not any(child.is_running() for child in children)
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""Finds from when on a filter's innovations are too large for good, as those of one that diverges."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.log import Stream
+from fuselog.replay.distributions import chi2
+
+IMPROBABLE = 1e-4  # of the sum of NIS over a window
+WINDOW = 30  # innovations, over which NIS is averaged
+USUALLY_WELL = 0.8  # of the windows before, in which NIS is as expected
+
+
+class Divergence(NamedTuple):
+    """Holds where a filter begins to diverge.
+
+    Attributes:
+        row: the innovation after which it does.
+        time_ns: its stamp.
+        nis_per_component: the mean from there on.
+    """
+
+    row: int
+    time_ns: int
+    nis_per_component: float
+
+
+def find_divergence(innovations: Stream) -> Divergence | None:
+    """Find from when on NIS is too large for good in one run, where it was as expected before.
+
+    Args:
+        innovations: all of one estimator, in order of time.
+    """
+    nis = innovations["normalised_innovation_squared"]
+    degrees = np.isfinite(innovations["innovation"]).sum(axis=1)
+    used = np.flatnonzero((degrees > 0) & np.isfinite(nis))
+    if len(used) < 4 * WINDOW:
+        return None
+    ones = np.ones(WINDOW)
+    sums = np.convolve(nis[used], ones, "valid")
+    sizes, of_window = np.unique(np.convolve(degrees[used], ones, "valid"), return_inverse=True)
+    is_well = sums <= chi2.isf(IMPROBABLE, sizes)[of_window]
+    if is_well[-1] or not is_well.any():
+        return None
+    last = int(np.flatnonzero(is_well)[-1])
+    if len(is_well) - last < 2 * WINDOW or np.mean(is_well[: last + 1]) < USUALLY_WELL:
+        return None
+    row = int(used[min(last + WINDOW, len(used) - 1)])
+    later = used[last + WINDOW :]
+    mean = float(nis[later].sum() / degrees[later].sum())
+    return Divergence(row, int(innovations.publish_time_ns[row]), mean)

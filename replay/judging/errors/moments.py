@@ -1,0 +1,87 @@
+"""Finds the moments at which estimates are worst: the largest NEES, and the largest error."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from fuselog.replay.judging.errors.evaluation import Errors, Floats
+
+NEES = "nees"
+
+
+class Moment(NamedTuple):
+    """Holds the moment at which something of an estimator is largest.
+
+    Attributes:
+        estimator: the estimator's label, such as `ekf`.
+        case: what it estimates, such as `robot1`; may be empty.
+        quantity: `nees`, or the error of `Errors.main`, such as `position_error_m`.
+        value: how large it is there.
+        run: the number of the run.
+        time_ns: the stamp.
+        elapsed_s: the same since the run's epoch.
+    """
+
+    estimator: str
+    case: str
+    quantity: str
+    value: float
+    run: int
+    time_ns: int
+    elapsed_s: float
+
+    @property
+    def words(self) -> str:
+        """Return what is large, and how large."""
+        name = "NEES" if self.quantity == NEES else self.quantity
+        return f"{name} {self.value:.3g}"
+
+
+class Moments:
+    """Keeps the worst moments of each estimator and case as errors come, of any number of runs."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str, str], Moment] = {}
+
+    def add(self, errors: Errors) -> None:
+        """Add a block of errors."""
+        if not errors.is_bound:
+            main = errors.main
+            length = main.scale * np.sqrt(errors.squared[:, main.columns].sum(axis=1))
+            self._add(errors, NEES, errors.nees)
+            self._add(errors, main.rmse.replace("rmse", "error"), length)
+
+    def _add(self, errors: Errors, quantity: str, values: Floats) -> None:
+        if np.isnan(values).all():
+            return
+        row = int(np.nanargmax(values))
+        value, run, time_ns = float(values[row]), int(errors.run[row]), int(errors.time_ns[row])
+        elapsed_s = float(errors.elapsed_s[row])
+        self._keep(Moment(errors.estimator, errors.case, quantity, value, run, time_ns, elapsed_s))
+
+    def _keep(self, moment: Moment) -> None:
+        key = moment.estimator, moment.case, moment.quantity
+        kept = self._found.get(key)
+        if kept is None or _size(moment) > _size(kept):
+            self._found[key] = moment
+
+    def merge(self, other: "Moments") -> None:
+        """Add the moments of other runs."""
+        for moment in other.found:
+            self._keep(moment)
+
+    @property
+    def found(self) -> list[Moment]:
+        """Return the largest NEES and the largest error of each estimator and case."""
+        return list(self._found.values())
+
+
+def worst_of(moments: Iterable[Moment]) -> Moment | None:
+    """Return the moment of the largest NEES; if none has a NEES, that of the largest error."""
+    return max(moments, key=lambda each: (each.quantity == NEES, _size(each)), default=None)
+
+
+def _size(moment: Moment) -> tuple[float, int, int]:
+    """Return what orders moments of one quantity; of equal values, the earliest is the largest."""
+    return moment.value, -moment.run, -moment.time_ns
