@@ -9,6 +9,8 @@ from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
+    ESTIMATOR,
+    EXPERIMENT,
     PAGE,
     RESULT,
     arrival_option,
@@ -40,8 +42,15 @@ stress_option = click.option(
     "fuselog run landmarks --set ekf.gate_probability=0.999 --set duration_s=30",
     "fuselog run a.mcap b.mcap -e ekf -e ukf --out out/mine",
 )
-@click.argument("experiment", nargs=-1, required=True)
-@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
+@click.option(
+    "-e",
+    "--estimator",
+    "labels",
+    type=ESTIMATOR,
+    multiple=True,
+    help="For logs: an estimator (repeatable).",
+)
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option(
@@ -89,8 +98,15 @@ def run(
     "fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --runs 50",
     "fuselog sweep landmarks --over robots=1,2 --over duration_s=10:60:6",
 )
-@click.argument("experiment", nargs=-1, required=True)
-@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
+@click.option(
+    "-e",
+    "--estimator",
+    "labels",
+    type=ESTIMATOR,
+    multiple=True,
+    help="For logs: an estimator (repeatable).",
+)
 @click.option(
     "--over",
     "swept",

@@ -13,6 +13,7 @@ from fuselog.pipeline.command_line.options import (
     COUNT,
     LOG,
     PLACE,
+    SCENARIO,
     foxglove_option,
     set_option,
 )
@@ -25,7 +26,7 @@ from fuselog.recorders.errors import BadInput, printable
     "fuselog record landmarks --set duration_s=120 -o long.mcap",
     "fuselog record --again run.mcap -o again.mcap",
 )
-@click.argument("scenario", required=False)
+@click.argument("scenario", required=False, type=SCENARIO)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
 @click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
@@ -88,7 +89,7 @@ def record(
     "fuselog import table drive.csv --mapping mapping.toml -o drive.mcap",
     name="import",
 )
-@click.argument("source")
+@click.argument("source", type=SCENARIO)
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SOURCE.mcap].")
 @click.option(
