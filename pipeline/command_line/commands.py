@@ -38,6 +38,7 @@ from fuselog.pipeline.output.terminal import (
     print_worst,
     progress,
     say,
+    say_next,
     warn,
 )
 from fuselog.pipeline.runs.ensemble import judge_logs
@@ -302,6 +303,8 @@ def _print_outcome(
         print_table(("estimator", "time (s)"), list(details["seconds"].items()))
     for path in written:
         say(str(path))
+    if written:
+        say_next("report" if written[0].is_dir() else "view", str(written[0]))
 
 
 def view_path(

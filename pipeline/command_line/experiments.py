@@ -23,7 +23,6 @@ from fuselog.pipeline.command_line.options import (
     settings_option,
     workers_option,
 )
-from fuselog.recorders.errors import printable
 
 diagnose_option = click.option(
     "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
@@ -159,6 +158,7 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
     from fuselog.pipeline.output.outputs import REPORT, check_files
     from fuselog.pipeline.output.report import write_report
+    from fuselog.pipeline.output.terminal import say, say_next
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     seek = None
@@ -167,4 +167,5 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -
 
         seek = likeliest_causes
     write_report(list(results), out, viewer=viewer, diagnose=seek)
-    click.echo(printable(f"{out}: {out.stat().st_size / 1e6:.1f} MB"))
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, a page for any browser")
+    say_next("view", str(results[0]))

@@ -77,9 +77,9 @@ def record(
     recording, metadata = record_run(name, values, seed or 0, run or 0)
     beside = companions_if(foxglove)
     write_log(path, recording.streams, metadata, compression=compression, companions=beside)
-    say_written(path, sum(map(len, recording.streams)))
     if sentence := replaced(path, before, open_log(path).run):
         warn(sentence)
+    say_written(path, sum(map(len, recording.streams)))
 
 
 @command(
@@ -180,9 +180,9 @@ def _import(
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target, stated)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
-    say_written(target, messages)
     for sentence in worst(lint_log(open_log(target), portions=1), target):
         click.echo(printable(sentence))
+    say_written(target, messages)
 
 
 @contextmanager
@@ -205,5 +205,8 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
 
 def say_written(path: Path, messages: int) -> None:
-    """Say what was written: the log, its messages and its size."""
-    click.echo(printable(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB"))
+    """Print what was written: the log, its messages and its size; then what to do with it."""
+    from fuselog.pipeline.output.terminal import say, say_next
+
+    say(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
+    say_next("info", str(path))

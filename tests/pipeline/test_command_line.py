@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -227,9 +228,8 @@ def test_info_names_the_tracker_of_detections(
     ]
     fl.write("seen.mcap", streams)
     said = fuselog("info", "seen.mcap").out
-    assert (
-        "as in fuselog replay seen.mcap -e gm-phd:\n  without a model: -e gm-phd tracker; from " in said
-    )
+    assert "\n  without a model: -e gm-phd tracker; from " in said
+    assert said.endswith("\nnext: fuselog replay seen.mcap -e gm-phd\n")
     assert "No registered model" not in said
     used = ["/radar/scan", "/radar/detection"]
     found = fuselog("info", "seen.mcap", "--json").json["estimators"]
@@ -691,12 +691,29 @@ def test_a_full_standard_output_is_said(world: Path, start_fuselog: Callable[...
     assert process.returncode == 2
 
 
+@pytest.mark.paper
+@pytest.mark.usefixtures("here")
+def test_each_command_prints_the_next(fuselog: Fuselog) -> None:
+    """From the README's first command on to a report, only by what is printed."""
+    page = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^fuselog (record .*?) +#", page, re.MULTILINE)
+    more = {"record": "--set duration_s=5", "view": "--save seen.rrd", "run": "--set duration_s=2"}
+    went = []
+    while (words := shlex.split(command))[0] not in went:
+        went.append(words[0])
+        said = fuselog(*words, *more.get(words[0], "").split())
+        assert said.code == 0, said.err
+        command = said.out.splitlines()[-1].removeprefix("next: fuselog ")
+    assert went == ["record", "info", "replay", "view", "run", "report"]
+    assert command == "view out/landmarks"
+
+
 @pytest.mark.usefixtures("here")
 def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     """Of an estimates log, of a result folder and of its timeline."""
     estimates, result = world / "log.estimates.mcap", world / "result"
-    said = fuselog("info", str(estimates)).out.splitlines()[-1]
-    assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
+    said = fuselog("info", str(estimates)).out.splitlines()[-2]
+    assert said.startswith("Estimates by ekf of log.mcap: for view, evaluate")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
     assert "dead-reckoning, ekf and ukf over 2 simulated runs of 2 s (scenario landmarks)" in said
