@@ -4,7 +4,9 @@ Every command names what takes its settings, by a key of `TAKERS`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +46,23 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
     takers = list(TAKERS[takes](options)) if others else []
     table = [*of_topics, *(row for name in others for row in _answer(name, takers))]
     print_table(["parameter", "of", "default", "unit", "accepts", "meaning"], table)
+
+
+def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Return the parameters whose names begin so, with what each means, as far as these can be told.
+
+    Args:
+        begin: of a name.
+        takes: a key of `TAKERS`.
+        options: the command's, as far as they are given.
+    """
+    found: dict[str, str] = {}
+    with suppress(BadInput, OSError):
+        for entry in chain.from_iterable(TAKERS[takes](options)):
+            for name, *_, meaning in rows_of(entry):
+                if str(name).startswith(begin):
+                    found.setdefault(str(name), str(meaning))
+    return found
 
 
 def _of_topic(name: str) -> Iterator[list[object]]:
@@ -145,6 +164,8 @@ def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = Non
 def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
     """Yield the parameters of an experiment, its study, its scenario or importer, its estimators."""
     named, labels = options["experiment"], options["labels"]
+    if not named:
+        raise BadInput(f"--set NAME{ASKED}: name an experiment, one that fuselog experiments lists")
     logs = [Path(each) for each in named if each.endswith(".mcap")]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
     experiment = stated.with_settings({}, {})

@@ -160,7 +160,9 @@ def _estimator(name: str, estimator: Estimator[Any], variant: Mapping[str, Any] 
     if variant:
         return Entry(name, estimator.summary, facts, estimator.parameters_with(name, variant), variant)
     if estimator.variant:
-        facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
+        [set_by] = [each for each in describe(estimator.parameters) if each.name == estimator.variant]
+        values = set_by.accepts if ", " in set_by.accepts else set_by.meaning
+        facts["variants"] = f"{name}:VALUE sets {estimator.variant}: {values}"
     return Entry(name, estimator.summary, facts, estimator.parameters)
 
 

@@ -29,9 +29,12 @@ def show_list(kind: str) -> None:
     print_table([kind.removesuffix("s"), "what"], list(listed(kind).items()))
     say(f"For all about one of them: fuselog {kind} NAME")
     if kind == "models":
-        methods = listed("methods")
-        rows = [[name, *answers.values()] for name, answers in methods.items()]
-        print_table(["model", *next(iter(methods.values()))], rows, "Methods that estimate them")
+        rows = [
+            [name, " ".join(method for method, answer in answers.items() if answer == "yes")]
+            for name, answers in listed("methods").items()
+        ]
+        print_table(["model", "methods that estimate it"], rows)
+        say("What a model lacks for another method: fuselog models NAME")
 
 
 def listed(kind: str) -> dict[str, Any]:

@@ -38,7 +38,11 @@ from fuselog.pipeline.output.terminal import (
     print_worst,
     progress,
     say,
+<<<<<<< HEAD
     status,
+=======
+    say_next,
+>>>>>>> ways64
     warn,
 )
 from fuselog.pipeline.runs.ensemble import judge_logs
@@ -321,6 +325,8 @@ def _print_outcome(
         print_table(("estimator", "time (s)"), list(details["seconds"].items()))
     for path in written:
         say(str(path))
+    if written:
+        say_next("report" if written[0].is_dir() else "view", str(written[0]))
 
 
 def _worst(moment: Moment, run: str = "") -> str:

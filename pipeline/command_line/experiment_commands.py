@@ -18,6 +18,7 @@ from fuselog.pipeline.output.terminal import (
     print_worst,
     progress,
     say,
+    say_next,
 )
 from fuselog.pipeline.runs.experiment import (
     Experiment,
@@ -110,6 +111,7 @@ def run_named(
     if not result.stress and result.settings.get("estimators"):
         say(NOT_TESTED)
     say(f"{done.folder}: {', '.join(result.contents)}")
+    say_next("report", str(done.folder))
 
 
 def _tell_parameters(experiment: Experiment, *, as_json: bool) -> None:
@@ -187,3 +189,4 @@ def sweep_named(
     ]
     print_table([*points[0], *shown], rows)
     say(f"{done.folder}: the table of all metrics, figures, result.json")
+    say_next("report", str(done.folder))

@@ -9,6 +9,8 @@ from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
+    ESTIMATOR,
+    EXPERIMENT,
     PAGE,
     RESULT,
     arrival_option,
@@ -21,7 +23,6 @@ from fuselog.pipeline.command_line.options import (
     settings_option,
     workers_option,
 )
-from fuselog.recorders.errors import printable
 
 diagnose_option = click.option(
     "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
@@ -40,8 +41,15 @@ stress_option = click.option(
     "fuselog run landmarks --set ekf.gate_probability=0.999 --set duration_s=30",
     "fuselog run a.mcap b.mcap -e ekf -e ukf --out out/mine",
 )
-@click.argument("experiment", nargs=-1, required=True)
-@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
+@click.option(
+    "-e",
+    "--estimator",
+    "labels",
+    type=ESTIMATOR,
+    multiple=True,
+    help="For logs: an estimator (repeatable).",
+)
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option(
@@ -89,8 +97,15 @@ def run(
     "fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --runs 50",
     "fuselog sweep landmarks --over robots=1,2 --over duration_s=10:60:6",
 )
-@click.argument("experiment", nargs=-1, required=True)
-@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
+@click.option(
+    "-e",
+    "--estimator",
+    "labels",
+    type=ESTIMATOR,
+    multiple=True,
+    help="For logs: an estimator (repeatable).",
+)
 @click.option(
     "--over",
     "swept",
@@ -143,6 +158,7 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
     from fuselog.pipeline.output.outputs import REPORT, check_files
     from fuselog.pipeline.output.report import write_report
+    from fuselog.pipeline.output.terminal import say, say_next
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     seek = None
@@ -151,4 +167,5 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -
 
         seek = likeliest_causes
     write_report(list(results), out, viewer=viewer, diagnose=seek)
-    click.echo(printable(f"{out}: {out.stat().st_size / 1e6:.1f} MB"))
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, a page for any browser")
+    say_next("view", str(results[0]))

@@ -8,7 +8,10 @@ import click
 from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
+    ESTIMATOR,
     FORMAT,
+    METRIC,
+    MODEL,
     RESULT,
     TIMELINE,
     Seconds,
@@ -74,7 +77,9 @@ from fuselog.recorders.errors import BadInput
     metavar="SECONDS|estimate",
     help="Add this to the stamps of the estimated trajectory, or find it [default: 0].",
 )
-@click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
+@click.option(
+    "--metric", "metrics", type=METRIC, multiple=True, help="A metric (repeatable) [default: all]."
+)
 @click.option("--out", type=RESULT, help="Write a result folder, as fuselog run does.")
 @errors_option
 @recover_option
@@ -128,7 +133,9 @@ def evaluate(
     "fuselog compare a.mcap b.mcap -e ekf -e ukf",
 )
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
+@click.option(
+    "-e", "--estimator", "labels", type=ESTIMATOR, multiple=True, help="Which estimators (repeatable)."
+)
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
 @click.option(
     "--case", help="Which truth trajectory files are judged by, such as robot2, where a log has several."
@@ -172,10 +179,16 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     "fuselog diagnose run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
+@click.option(
+    "-e",
+    "--estimator",
+    "label",
+    type=ESTIMATOR,
+    help="The estimator; by default the only one of estimates.",
+)
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
 @click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
-@click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
 @click.option("--tried", "tells_tried", is_flag=True, help="List what was tried, with what it gains.")
 @replay_options
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
@@ -195,9 +208,15 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 )
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=ANY_PATH)
 @click.option(
-    "-e", "--estimator", "labels", multiple=True, required=True, help="Which estimators (repeatable)."
+    "-e",
+    "--estimator",
+    "labels",
+    type=ESTIMATOR,
+    multiple=True,
+    required=True,
+    help="Which estimators (repeatable).",
 )
-@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
 @click.option(
     "--save", type=TIMELINE, help="A timeline (.rrd) of the first log to write: copies fan out in it."
@@ -219,7 +238,7 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     "fuselog observability run.mcap --window 10",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--model", help="The model, where several fit the logs.")
+@click.option("--model", type=MODEL, help="The model, where several fit the logs.")
 @click.option(
     "--window",
     "window_s",

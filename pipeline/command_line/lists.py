@@ -3,13 +3,13 @@
 import click
 
 from fuselog.pipeline.command_line.help import command
-from fuselog.pipeline.command_line.options import json_option
+from fuselog.pipeline.command_line.options import MODEL, Name, json_option
 from fuselog.recorders.errors import BadInput
 
 
 def _listing(kind: str, text: str, example: str) -> click.Command:
     @command(text, f"fuselog {kind}s", f"fuselog {kind}s {example}", name=f"{kind}s")
-    @click.argument("name", required=False)
+    @click.argument("name", required=False, type=Name(f"{kind}s"))
     @json_option
     def listing(name: str | None, as_json: bool) -> None:
         _show(kind, name, as_json=as_json)
@@ -42,11 +42,11 @@ experiments = _listing("experiment", "List the shipped experiments, or all about
     "fuselog models robot",
     "fuselog models robot --formulas",
 )
-@click.argument("name", required=False)
+@click.argument("name", required=False, type=MODEL)
 @click.option("--formulas", is_flag=True, help="Print what NAME's functions and their derivatives are.")
 @json_option
 def models(name: str | None, formulas: bool, as_json: bool) -> None:
-    """List the models and whether each method can estimate them or why not, or all about NAME."""
+    """List the models and which methods can estimate them, or all about NAME: also why one cannot."""
     if formulas:
         from fuselog.pipeline.api.catalog import show_formulas
 

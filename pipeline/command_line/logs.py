@@ -169,8 +169,10 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 def view(path: Path, **options: Any) -> None:
     """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
     from fuselog.pipeline.command_line.commands import view_path
+    from fuselog.pipeline.logs.information import say_next_of_view
 
     view_path(path, **options)
+    say_next_of_view(path, recover=options["recover"])
 
 
 @command(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from fuselog.replay.foreign.naming import allow_programs_of_files
 
@@ -87,7 +88,30 @@ class Place(click.ParamType):
         return list(found)
 
 
+class Name(click.types.StringParamType):
+    """Reads a name of what fuselog lists, and completes it in the shell."""
+
+    def __init__(self, kind: str, *, or_file: bool = False) -> None:
+        self._kind, self._or_file = kind, or_file
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the names that begin so, each with a line on it."""
+        from fuselog.pipeline.api.lists import listed
+
+        names = listed(self._kind).items()
+        found = [CompletionItem(name, help=what) for name, what in names if name.startswith(incomplete)]
+        # before the names: bash forgets what came before a file
+        return [CompletionItem(incomplete, type="file"), *found] if self._or_file else found
+
+
 PLACE = Place()
+ESTIMATOR, MODEL, METRIC = map(Name, ("estimators", "models", "metrics"))
+SCENARIO, EXPERIMENT = (Name(kind, or_file=True) for kind in ("scenarios", "experiments"))
 RESULT = Output(file_okay=False)
 LOG_OR_FOLDER = Output(".mcap")
 LOG, TIMELINE, PICTURE, PAGE = map(OutputFile, (".mcap", ".rrd", ".png", ".html"))
@@ -186,12 +210,27 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
     """
     replays = takes in ("estimators", "experiment")
 
+    def complete(
+        context: click.Context,
+        parameter: click.Parameter,  # noqa: ARG001
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        from fuselog.pipeline.api.asking import settings_that_begin
+
+        # click leaves arguments aside while the option lacks its value
+        [argument, *_] = [each for each in context.command.params if isinstance(each, click.Argument)]
+        left = tuple(context.args) if argument.nargs < 0 else next(iter(context.args), None)
+        options = context.params | ({str(argument.name): left} if left else {})
+        found = settings_that_begin(incomplete, takes, options)
+        return [CompletionItem(name, help=meaning) for name, meaning in found.items()]
+
     def added(function: Callable[..., None]) -> Callable[..., None]:
         @click.option(
             "--set",
             "settings",
             multiple=True,
             metavar="KEY=VALUE",
+            shell_complete=complete,
             help="Set a parameter (repeatable); KEY=? says what it means.",
         )
         @wraps(function)

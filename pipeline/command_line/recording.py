@@ -13,6 +13,7 @@ from fuselog.pipeline.command_line.options import (
     COUNT,
     LOG,
     PLACE,
+    SCENARIO,
     foxglove_option,
     set_option,
 )
@@ -25,7 +26,7 @@ from fuselog.recorders.errors import BadInput, printable
     "fuselog record landmarks --set duration_s=120 -o long.mcap",
     "fuselog record --again run.mcap -o again.mcap",
 )
-@click.argument("scenario", required=False)
+@click.argument("scenario", required=False, type=SCENARIO)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
 @click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
@@ -76,10 +77,10 @@ def record(
     recording, metadata = record_run(name, values, seed or 0, run or 0)
     beside = companions_if(foxglove)
     write_log(path, recording.streams, metadata, compression=compression, companions=beside)
-    say_written(path, sum(map(len, recording.streams)))
     say_left_out(path, foxglove)
     if sentence := replaced(path, before, open_log(path).run):
         warn(sentence)
+    say_written(path, sum(map(len, recording.streams)))
 
 
 @command(
@@ -89,7 +90,7 @@ def record(
     "fuselog import table drive.csv --mapping mapping.toml -o drive.mcap",
     name="import",
 )
-@click.argument("source")
+@click.argument("source", type=SCENARIO)
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SOURCE.mcap].")
 @click.option(
@@ -180,9 +181,9 @@ def _import(
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target, stated)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
-    say_written(target, messages)
     for sentence in worst(lint_log(open_log(target), portions=1), target):
         click.echo(printable(sentence))
+    say_written(target, messages)
 
 
 @contextmanager
@@ -205,5 +206,8 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
 
 def say_written(path: Path, messages: int) -> None:
-    """Say what was written: the log, its messages and its size."""
-    click.echo(printable(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB"))
+    """Print what was written: the log, its messages and its size; then what to do with it."""
+    from fuselog.pipeline.output.terminal import say, say_next
+
+    say(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
+    say_next("info", str(path))

@@ -9,9 +9,11 @@ from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
+    ESTIMATOR,
     GOLDEN,
     JUNIT,
     LOG_OR_FOLDER,
+    MODEL,
     RESULT,
     TIMELINE,
     Seconds,
@@ -52,7 +54,13 @@ folds_option = click.option(
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option(
-    "-e", "--estimator", "names", multiple=True, required=True, help="An estimator (repeatable)."
+    "-e",
+    "--estimator",
+    "names",
+    type=ESTIMATOR,
+    multiple=True,
+    required=True,
+    help="An estimator (repeatable).",
 )
 @click.option(
     "-o",
@@ -60,7 +68,7 @@ folds_option = click.option(
     type=LOG_OR_FOLDER,
     help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
 )
-@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
 @click.option(
     "--every",
     "every_s",
@@ -116,9 +124,15 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 )
 @click.argument("log", type=ANY_PATH)
 @click.option(
-    "-e", "--estimator", "names", multiple=True, required=True, help="An estimator, or two (repeatable)."
+    "-e",
+    "--estimator",
+    "names",
+    type=ESTIMATOR,
+    multiple=True,
+    required=True,
+    help="An estimator, or two (repeatable).",
 )
-@click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
 @click.option("--no-browser", is_flag=True, help="Print the page's address, and open nothing.")
 @recover_option
 @gap_option
@@ -141,7 +155,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     "fuselog tune train -e ekf --free sigma_range_m --validate test",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option("-e", "--estimator", "label", type=ESTIMATOR, required=True, help="The estimator.")
 @click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
 @click.option(
     "--by",
@@ -167,7 +181,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @click.option(
     "--out", type=RESULT, default=Path("out/tune"), show_default=True, help="The result folder."
 )
-@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
 @workers_option
 @scheduler_option
 @replay_options
@@ -190,7 +204,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     "fuselog calibrate train -e ekf --fixed lever_y_m --validate test",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option("-e", "--estimator", "label", type=ESTIMATOR, required=True, help="The estimator.")
 @click.option(
     "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
 )
@@ -209,7 +223,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option(
     "--out", type=RESULT, default=Path("out/calibrate"), show_default=True, help="The result folder."
 )
-@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
 @workers_option
 @scheduler_option
 @replay_options
@@ -238,6 +252,7 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     "-e",
     "--estimator",
     "labels",
+    type=ESTIMATOR,
     multiple=True,
     help="With --update: an estimator of the golden (repeatable). Without: a program to check in the "
     "place of the golden's estimator, as lib:./robot_ekf.so.",
@@ -285,8 +300,10 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     "fuselog deploy run.mcap -e ekf --settings tuned.toml --single -o robot_ekf",
 )
 @click.argument("log", type=ANY_PATH)
-@click.option("-e", "--estimator", "name", required=True, help="The filter: ekf, or ukf.")
-@click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option(
+    "-e", "--estimator", "name", type=ESTIMATOR, required=True, help="The filter: ekf, or ukf."
+)
+@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
 @click.option(
     "-o",
     "--out",

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
-from fuselog.pipeline.output.terminal import print_json, print_table, say, warn
+from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
+from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
@@ -182,8 +183,7 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
         for name, topics in estimators_that_fit(log.topics).items():
             by_topics.setdefault(tuple(topics), []).append(name)
     if fit or by_topics:
-        first = "ekf" if fit else next(iter(by_topics.values()))[0]
-        say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e {first}:")
+        say("Estimators that can be replayed over it:")
     else:
         why = nearest(registered_models(), log.topics)
         say(f"No registered model fits it: {why}; {OWN_MODEL}")
@@ -195,6 +195,8 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
         say(f"  {', '.join(others)}: do not fit; --all says what they need")
     for name, each in others.items() if is_all else ():
         say(f"  {name}: needs {'; '.join(each.lacks)}")
+    if known := [*(each.methods for each in fit.values()), *by_topics.values()]:
+        say_next("replay", str(path), "-e", known[0][0])
 
 
 def _some_topics(topics: Sequence[str]) -> str:
@@ -203,20 +205,34 @@ def _some_topics(topics: Sequence[str]) -> str:
     return ", ".join(topics[:MOST_TOPICS]) + more
 
 
+def say_next_of_view(path: Path, *, recover: bool) -> None:
+    """Print what one would type after looking at a result, a log or an estimates log."""
+    if path.is_dir():
+        say_next("report", str(path))
+    elif path.suffix != ".rrd":
+        log = open_log(path, recover=recover)
+        labels, run = _labels(log), log.run
+        if not labels:
+            say_next("info", str(path))
+        elif run and run.scenario in shipped("experiments"):
+            say_next("run", run.scenario, "--runs", "20")
+        else:
+            say_next("evaluate", str(path))
+
+
+def _labels(log: Log) -> list[str]:
+    """List whose estimates a log has."""
+    estimates = [topic.removeprefix(ESTIMATES) for topic in log.topics if topic.startswith(ESTIMATES)]
+    return list(dict.fromkeys(each.partition("/")[0] for each in estimates))
+
+
 def _say_what_to_do(path: Path, log: Log) -> None:
     """Print whose estimates a log has, and what can be done with them."""
-    labels = dict.fromkeys(
-        topic.removeprefix(ESTIMATES).partition("/")[0]
-        for topic in log.topics
-        if topic.startswith(ESTIMATES)
-    )
+    labels = _labels(log)
     place = log.run.notes.get("log") if log.run else None
     of_log = f" of {place}" if place else ""
-    named = shlex.quote(str(path))
-    say(
-        f"Estimates by {', '.join(labels)}{of_log}; what can be done with them: "
-        f"fuselog evaluate {named}, and view, compare, diagnose, export"
-    )
+    say(f"Estimates by {', '.join(labels)}{of_log}: for view, evaluate, compare, diagnose, export")
+    say_next("view", str(path))
 
 
 def _show_bag(path: Path, *, as_json: bool) -> None:

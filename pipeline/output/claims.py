@@ -26,6 +26,7 @@ from fuselog.pipeline.output.expressions import (
     truth,
 )
 from fuselog.pipeline.output.numbers import Number, Value, exactly
+from fuselog.pipeline.output.refutations import refutation
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters
@@ -48,7 +49,7 @@ class Claim:
         paper: what the paper prints, or where.
         ours: what we measured.
         verdict: see `Verdict`.
-        why: the reason of the verdict, where the numbers do not say it.
+        why: the reason of the verdict; of a refuted claim at least the numbers that are against it.
     """
 
     claim: str
@@ -98,7 +99,8 @@ class StatedClaim(Parameters):
             without one the claim is not reproducible.
         value: expression that the texts and the comparison name `value`.
         ours: what we found.
-        why: reason of the verdict, or what has to be known beside it.
+        why: reason of the verdict, or what has to be known beside it. If a refuted claim has neither
+            this nor `unless`, it names the numbers that refute it.
         unless: what is said beside every verdict but `confirmed`.
         reproducible: comparison without which the claim is not reproducible, whatever `holds` says.
         each: names and what they stand for; the claim is made of each, or of each combination. An entry
@@ -286,11 +288,16 @@ def _few_runs(claim: StatedClaim, values: Values) -> str:
     runs, least = values.names.get("runs"), claim.least_runs
     if not isinstance(runs, Number) or least is None or runs.value >= least:
         return ""
-    stated = {name: of for name, of in claim.given.items() if isinstance(of, str)}
-    stated |= {"value": claim.value} if claim.value else {}
+    stated = _stated(claim)
     if not any(needs_runs(each, stated, values) for each in (claim.holds, claim.reproducible) if each):
         return ""
     return f"of {runs.value:g} runs; without an interval it is decided from {least} on"
+
+
+def _stated(claim: StatedClaim) -> dict[str, str]:
+    """Return the claim's expressions by the names that it has for them."""
+    stated = {name: of for name, of in claim.given.items() if isinstance(of, str)}
+    return stated | ({"value": claim.value} if claim.value else {})
 
 
 def _verdict(claim: StatedClaim, values: Values) -> Claim:
@@ -312,4 +319,6 @@ def _verdict(claim: StatedClaim, values: Values) -> Claim:
         return Claim(sentence, paper, ours, "not shown", few)
     if verdict != "confirmed":
         why = "; ".join(filter(None, [why, unless]))
+    if verdict == "refuted" and not why:
+        why = refutation(claim.holds, _stated(claim), values)
     return Claim(sentence, paper, ours, verdict, why)

@@ -62,7 +62,7 @@ def evaluate(expression: str, values: Values) -> Value:
     Raises BadInput where it is none, and `NoMetric` where the result lacks one of its metrics.
     """
     try:
-        return _value(parse(expression), values)
+        return value_of(parse(expression), values)
     except (TypeError, AttributeError, ValueError, OverflowError):
         raise BadInput(
             f"'{expression}' has a number, a list or a comparison where another of these belongs"
@@ -89,7 +89,7 @@ def formatted(template: str, values: Values) -> str:
         if expression is not None:
             found = evaluate(expression, values)
             try:
-                parts.append(_in_words(found, form or ".3g", named=conversion == "n"))
+                parts.append(in_words(found, form or ".3g", named=conversion == "n"))
             except ValueError:
                 raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
     return "".join(parts)
@@ -103,9 +103,10 @@ def expressions_in(template: str) -> list[str]:
         raise BadInput(f"'{template}': {error}; write braces as {{{{ and }}}}") from None
 
 
-def _in_words(value: Value, form: str, *, named: bool) -> str:
+def in_words(value: Value, form: str, *, named: bool = False) -> str:
+    """Write a value, with its interval if it has one, and with the names of numbers if `named`."""
     if isinstance(value, list):
-        return ", ".join(_in_words(each, form, named=named) for each in value)
+        return ", ".join(in_words(each, form, named=named) for each in value)
     if not isinstance(value, Number):
         return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
     text, low, high = (format(each, form) if math.isfinite(each) else MISSING for each in value[:3])
@@ -165,13 +166,13 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
     tree = _Expanded(stated).visit(deepcopy(parse(expression)))
     for node in ast.walk(tree):
         match node:
-            case ast.Call(func=ast.Name(id="value" | "low" | "high"), args=[of]) if _metrics_of(of):
+            case ast.Call(func=ast.Name(id="value" | "low" | "high"), args=[of]) if metrics_of(of):
                 return True
             case ast.Compare(ops=ops, comparators=others):
                 within = [each for op, each in zip(ops, others, strict=True) if isinstance(op, ast.In)]
-                if any(map(_metrics_of, within)):
+                if any(map(metrics_of, within)):
                     return True
-    found = [key for each in _metrics_of(tree) for key in keys_of(*each, values.metrics)]
+    found = [key for each in metrics_of(tree) for key in keys_of(*each, values.metrics)]
     return not values.intervals.keys() >= set(found)
 
 
@@ -197,7 +198,7 @@ class _Expanded(ast.NodeTransformer):
         return node
 
 
-def _metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
+def metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
     """Return the metrics that an expression names: quantity, and what stands in brackets."""
     found = []
     for node in ast.walk(tree):
@@ -207,7 +208,8 @@ def _metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
     return found
 
 
-def _value(node: ast.expr, values: Values) -> Value:
+def value_of(node: ast.expr, values: Values) -> Value:
+    """Return the value of a part of an expression."""
     match node:
         case ast.Constant(value=bool()):
             raise BadInput("true and false are no numbers; compare numbers")
@@ -220,31 +222,31 @@ def _value(node: ast.expr, values: Values) -> Value:
         case ast.Subscript(value=ast.Name(id=quantity), slice=ast.Constant(value=str() as of)):
             return metric(quantity, of, values)
         case ast.Subscript(value=of_list, slice=index):
-            entries, place = _value(of_list, values), _value(index, values)
+            entries, place = value_of(of_list, values), value_of(index, values)
             if not isinstance(entries, list) or not isinstance(place, Number):
                 raise BadInput(f"'{ast.unparse(node)}': only a list has entries")
             if not -len(entries) <= place.value < len(entries):
                 raise NoMetric(ast.unparse(node))
             return entries[int(place.value)]
         case ast.List(elts=entries):
-            return [_value(each, values) for each in entries]
+            return [value_of(each, values) for each in entries]
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return by_entry(negative, _value(operand, values))
+            return by_entry(negative, value_of(operand, values))
         case ast.UnaryOp(op=ast.Not(), operand=operand):
-            return by_entry(negated, _value(operand, values))
+            return by_entry(negated, value_of(operand, values))
         case ast.BinOp(left=left, op=op, right=right):
             combine = combined(OPERATIONS[type(op)])
-            return by_entry(combine, _value(left, values), _value(right, values))
+            return by_entry(combine, value_of(left, values), value_of(right, values))
         case ast.BoolOp(op=op, values=parts):
             together = all_hold if isinstance(op, ast.And) else any_holds
-            return by_entry(lambda *each: together(each), *(_value(part, values) for part in parts))
+            return by_entry(lambda *each: together(each), *(value_of(part, values) for part in parts))
         case ast.Compare(left=left, ops=ops, comparators=others):
-            sides = [_value(each, values) for each in (left, *others)]
+            sides = [value_of(each, values) for each in (left, *others)]
             pairs = zip(ops, sides, sides[1:], strict=False)
             found = [by_entry(COMPARISONS[type(op)], one, other) for op, one, other in pairs]
             return found[0] if len(found) == 1 else by_entry(lambda *each: all_hold(list(each)), *found)
         case ast.Call(func=ast.Name(id=name), args=arguments):
-            return FUNCTIONS[name](*(_value(each, values) for each in arguments))
+            return FUNCTIONS[name](*(value_of(each, values) for each in arguments))
     raise BadInput(f"'{ast.unparse(node)}' is no expression of metrics")
 
 
@@ -257,7 +259,7 @@ def metric(quantity: str, of: str, values: Values) -> Value:
     if not keys:
         raise NoMetric(f"{quantity}[{of}]")
     found = [_of_key(key, name, values) for key, name in keys.items()]
-    return found if _is_many(of) else found[0]
+    return found if is_many(of) else found[0]
 
 
 def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -288,11 +290,12 @@ def _name(key: str, quantity: str, label: str, one: str, estimator: str, case: s
         if "*" in some
         else part
         for part, some, all_ in parts
-        if _is_many(all_)
+        if is_many(all_)
     )
 
 
-def _is_many(of: str) -> bool:
+def is_many(of: str) -> bool:
+    """Tell whether the brackets of a metric stand for a list."""
     return "*" in of or "|" in of
 
 

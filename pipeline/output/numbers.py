@@ -121,26 +121,27 @@ def all_hold(truths: Sequence[Any]) -> Truth:
 
     Where one is missing, so is this.
     """
-    flat = _flat(truths)
-    if "missing" in flat:
+    known = flat(truths)
+    if "missing" in known:
         return "missing"
-    return False if False in flat else None if None in flat else True
+    return False if False in known else None if None in known else True
 
 
 def any_holds(truths: Sequence[Any]) -> Truth:
     """Tell whether one of truths, and of lists of them, is true; open or missing as in `all_hold`."""
-    return negated(all_hold([negated(each) for each in _flat(truths)]))
+    return negated(all_hold([negated(each) for each in flat(truths)]))
 
 
-def _flat(values: Sequence[Any]) -> list[Any]:
-    return [one for each in values for one in (_flat(each) if isinstance(each, list) else [each])]
+def flat(values: Sequence[Any]) -> list[Any]:
+    """List the entries of lists within lists."""
+    return [one for each in values for one in (flat(each) if isinstance(each, list) else [each])]
 
 
 def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Number]:
     """Make a function of numbers or lists of them, such as the least one, end by end."""
 
     def found(*arguments: Value) -> Number:
-        numbers = _flat(arguments)
+        numbers = flat(arguments)
         if not numbers or not all(each.is_known for each in numbers):
             return exactly(None)
         value, low, high = (function([each[place] for each in numbers]) for place in range(3))
@@ -204,9 +205,9 @@ def _chi_square(share: Number, size: Number) -> Number:
 
 def _count(values: list[Any]) -> Number:
     """Count the comparisons that are true; with one missing, how many are is not known."""
-    flat = _flat(values)
-    count = float(sum(each is True for each in flat))
-    return Number(count, math.nan, math.nan) if "missing" in flat else exactly(count)
+    known = flat(values)
+    count = float(sum(each is True for each in known))
+    return Number(count, math.nan, math.nan) if "missing" in known else exactly(count)
 
 
 def _falls(values: list[Number]) -> Truth:

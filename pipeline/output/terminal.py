@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -111,6 +112,11 @@ def status() -> Iterator[Callable[[str], None]]:
 def say(text: str) -> None:
     """Print a line; the terminal breaks it, not we, so that paths stay whole."""
     out.print(printable(text), soft_wrap=True)
+
+
+def say_next(*words: str) -> None:
+    """Print the command that one would type next."""
+    say(f"next: {shlex.join(['fuselog', *words])}")
 
 
 def warn(text: str) -> None:

@@ -39,6 +39,13 @@ def run(names: tuple[str, ...], data: Path) -> None:
 
 
 @main.command()
+def decide() -> None:
+    """Decide the claims of all kept results anew, by the numbers that are kept; run nothing."""
+    for name in pages.stored():
+        pages.decide_anew(name)
+
+
+@main.command()
 def render() -> None:
     """Make what the pages say of results anew."""
     for path in pages.PAGES:

@@ -25,12 +25,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from fuselog.pipeline.api.lists import listed
-from fuselog.pipeline.output.claims import Verdict
+from fuselog.pipeline.output.claims import Verdict, decide, known
 from fuselog.pipeline.output.results import MetricValue, Result, read_result
-from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.importers.tables.mapping import read_mapping
 from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
+from fuselog.recorders.parameters import build
+from fuselog.recorders.registry import load
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
@@ -186,10 +188,30 @@ def store(folder: Path) -> Path:
     """Keep what a result folder holds of claims, metrics and settings; not where its data lay."""
     result: Result = read_result(folder)
     kept = result.model_dump(mode="json", exclude={"files": True, "settings": {"data"}})
-    path = FOLDER / f"{result.experiment}.json"
+    return _write(result.experiment, kept)
+
+
+def _write(name: str, kept: Mapping[str, Any]) -> Path:
+    path = FOLDER / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     return path
+
+
+def decided(name: str) -> list[dict[str, str]]:
+    """The claims of an experiment as it ships, by the numbers of its kept result."""
+    _, experiment = load_experiment(name, {}, {})
+    study = load("studies", experiment.study, Study)
+    numbers = numbers_of(experiment, build(study.options, experiment.options, name))
+    kept, recordings = stored()[name], dict.fromkeys(experiment.recordings, True)
+    found = decide(experiment.claims, kept.metrics, kept.intervals, numbers, recordings)
+    return [vars(claim) for claim in map(known, found)]
+
+
+def decide_anew(name: str) -> None:
+    """Keep the claims of an experiment as its kept numbers decide them now."""
+    kept = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    _write(name, kept | {"claims": decided(name)})
 
 
 @cache

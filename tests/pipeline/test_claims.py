@@ -127,6 +127,31 @@ def test_what_chance_may_have_made_is_not_shown(value: str, verdict: str) -> Non
     assert len(left) == ("nobody" not in value)
 
 
+@pytest.mark.parametrize(
+    ("holds", "why"),
+    [
+        ("value < limit", "nees is not below 2.5 (limit) in 1 of 2 (robot2: 3)"),
+        ("2.5 > value", "nees is not below 2.5 in 1 of 2 (robot2: 3)"),
+        ("value[0] > value[1]", "nees of robot1 is 2 (1.5 to 2.5), not above 3 (nees, robot2)"),
+        ("not (value[0] < 4 or value[1] == 1)", "nees of robot1 is 2 (1.5 to 2.5), below 4"),
+        ("rmse_m[ekf] < 1 and value[1] in [1]", "nees of robot2 is 3, not within 1 to 1"),
+        ("[1, 5] < [2, 4] and rmse_m[ekf] > 0", "[1, 5] is not below 4 in 1 of 2 (entry 2: 5)"),
+        ("[1, 5] < [0, 6] or [1, 5] > [2, 7]", "[1, 5] is not below 0 in 1 of 2 (entry 1: 1); "
+         "[1, 5] is not above 2 in 1 of 2 (entry 1: 1)"),
+        ("over and falls(by_noise[ekf, 1])", "by_noise[ekf, 1] is not below the one before in 2 of 2 "
+         "(entry 1: 2 against 1, entry 2: 4 against 2)"),
+        ("1e5 * rmse_m[ekf] == 50000.0001", "100000.0 * rmse_m[ekf] is 50000, not equal to 50000.0001"),
+    ],
+)  # fmt: skip
+def test_a_refuted_claim_names_the_numbers_that_are_against_it(holds: str, why: str) -> None:
+    given = {"limit": "2 + rmse_m[ekf]", "over": "nees[ekf, *] > 1"}
+    stated = claim(holds=holds, value="nees[ekf, *]", given=given)
+    [found] = decide([stated], METRICS, INTERVALS, {})
+    assert (found.verdict, found.why) == ("refuted", why)
+    [found] = decide([stated.model_copy(update={"unless": "own words"})], METRICS, INTERVALS, {})
+    assert found.why == "own words"
+
+
 def test_a_comparison_with_a_number_that_is_missing_decides_nothing() -> None:
     stated = claim(
         given={"wins": "[rmse_m[ekf], rmse_m[lost]] < 1"},

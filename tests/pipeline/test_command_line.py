@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -229,9 +230,8 @@ def test_info_names_the_tracker_of_detections(
     ]
     fl.write("seen.mcap", streams)
     said = fuselog("info", "seen.mcap").out
-    assert (
-        "as in fuselog replay seen.mcap -e gm-phd:\n  without a model: -e gm-phd tracker; from " in said
-    )
+    assert "\n  without a model: -e gm-phd tracker; from " in said
+    assert said.endswith("\nnext: fuselog replay seen.mcap -e gm-phd\n")
     assert "No registered model" not in said
     used = ["/radar/scan", "/radar/detection"]
     found = fuselog("info", "seen.mcap", "--json").json["estimators"]
@@ -275,6 +275,8 @@ def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
         ("scenarios", "landmarks-adverse", ["outages_per_minute", "fuselog record landmarks-adverse"]),
         ("scenarios", "mrclam", ["sigma_range_m", "fuselog import mrclam PATH"]),
         ("estimators", "ukf", ["gate_probability", "number > 0 <= 1", "/landmarks"]),
+        ("estimators", "tracker", ["tracker:VALUE sets association: nearest, hungarian, jpda"]),
+        ("estimators", "vehicles", ["unscented-powers, products or complex", "registration or static"]),
         ("metrics", "consistency", ["NEES"]),
         (
             "models",
@@ -316,7 +318,7 @@ def test_the_formulas_of_a_model_are_printed(fuselog: Fuselog) -> None:
 
 
 def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog) -> None:
-    """Every cell of the table is filled, or says why not."""
+    """The table names them within 100 columns; JSON and the details say why others cannot."""
     listed = {
         row["name"]: {
             key.removeprefix("by_"): said for key, said in row.items() if key.startswith("by_")
@@ -328,9 +330,11 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
     assert listed["vehicle"] == {**dict.fromkeys(methods, "yes"), "bank": no_angle}
     assert listed["robot"]["bank"] == "yes"
     table = fuselog("models").out
+    assert max(map(len, table.splitlines())) <= 100
+    _, _, rows = table.partition("methods that estimate it")
     for name, cells in listed.items():
-        (row,) = re.findall(rf"^ {name} +((?:yes|no:).*)$", table, re.MULTILINE)
-        assert re.split(r"  +", row.strip()) == list(cells.values())
+        (row,) = re.findall(rf"^ {name} +(.*)$", rows, re.MULTILINE)
+        assert row.split() == [method for method, said in cells.items() if said == "yes"]
 
 
 @pytest.mark.usefixtures("here")
@@ -689,12 +693,29 @@ def test_a_full_standard_output_is_said(world: Path, start_fuselog: Callable[...
     assert process.returncode == 2
 
 
+@pytest.mark.paper
+@pytest.mark.usefixtures("here")
+def test_each_command_prints_the_next(fuselog: Fuselog) -> None:
+    """From the README's first command on to a report, only by what is printed."""
+    page = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^fuselog (record .*?) +#", page, re.MULTILINE)
+    more = {"record": "--set duration_s=5", "view": "--save seen.rrd", "run": "--set duration_s=2"}
+    went = []
+    while (words := shlex.split(command))[0] not in went:
+        went.append(words[0])
+        said = fuselog(*words, *more.get(words[0], "").split())
+        assert said.code == 0, said.err
+        command = said.out.splitlines()[-1].removeprefix("next: fuselog ")
+    assert went == ["record", "info", "replay", "view", "run", "report"]
+    assert command == "view out/landmarks"
+
+
 @pytest.mark.usefixtures("here")
 def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     """Of an estimates log, of a result folder and of its timeline."""
     estimates, result = world / "log.estimates.mcap", world / "result"
-    said = fuselog("info", str(estimates)).out.splitlines()[-1]
-    assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
+    said = fuselog("info", str(estimates)).out.splitlines()[-2]
+    assert said.startswith("Estimates by ekf of log.mcap: for view, evaluate")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
     assert "dead-reckoning, ekf and ukf over 2 simulated runs of 2 s (scenario landmarks)" in said

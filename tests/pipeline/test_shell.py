@@ -21,13 +21,17 @@ BIN = Path(sys.executable).parent
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
-def test_the_readmes_line_completes_commands_and_options() -> None:
-    """What bash offers after `fuselog re` and `fuselog cache --`, once the line has been run."""
+def test_the_readmes_line_completes_commands_options_names_and_settings() -> None:
+    """What bash offers after what was typed so far, once the line has been run."""
     page = (ROOT / "README.md").read_text(encoding="utf-8")
     (line,) = re.findall(r"^eval .*_FUSELOG_COMPLETE=bash_source.*$", page, re.MULTILINE)
     for words, expected in {
         "fuselog re": {"record", "replay", "report"},
         "fuselog cache --": {"--clear"},
+        "fuselog record landm": {"landmarks", "landmarks-adverse"},
+        "fuselog replay run.mcap -e vehicle": {"vehicles", "vehicle-kalman", "vehicle-particles"},
+        "fuselog replay run.mcap -e ekf --set ekf.sigma_ra": {"ekf.sigma_range_m"},
+        "fuselog record landmarks --set dur": {"duration_s"},
     }.items():
         last = len(words.split()) - 1
         script = (

@@ -67,8 +67,8 @@ class ParticlesParameters(Parameters):
     """States the method and its random numbers, which depend on `seed` and on the run's first fixes.
 
     Attributes:
-        method: what particles are of, and their number, as in associations-60; -topology adds the
-            roadside sensor.
+        method: what particles are of (set, axes or associations) and their number, as in
+            associations-60; -topology adds the roadside sensor.
         seed: seed of the random numbers.
     """
 

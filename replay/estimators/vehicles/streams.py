@@ -34,6 +34,7 @@ from fuselog.replay.engine.vectors.components import Components, components_of
 from fuselog.replay.estimators.vehicles.association import MISSED, Scanning
 from fuselog.replay.estimators.vehicles.updates import (
     FIXES,
+    SENSOR,
     Associated,
     Setup,
     put,
@@ -55,8 +56,9 @@ class VehiclesParameters(Parameters):
     """States the method, and what it may assume.
 
     Attributes:
-        method: `FIXES` or `FIXES-SENSOR`: how fixes are used, and what of the roadside sensor is, as in
-            hungarian-topology.
+        method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: how fixes are used (known,
+            hungarian, set, axes, powers, unscented-powers, products or complex), and what of the
+            roadside sensor is (topology, registration or static).
         registration_scan: number of the scan from which on the sensor's pose may be estimated.
         sigma_fix_m: standard deviation of each component of a fix that does not state its covariance;
             without one such a fix is not used.
@@ -129,7 +131,9 @@ def no_results(setup: Setup, runs: int, frames: int) -> VehiclesResults:
 def _find(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> Iterator[Binding]:
     fixes, sensor = split_method(parameters.method)
     if fixes not in FIXES:
-        raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
+        sensors = " or ".join(f"-{each}" for each in SENSOR if each)
+        known = f"{choices(fixes, FIXES)}, and {sensors} may follow"
+        raise BadInput(f"estimator {name}: no method '{fixes}'; {known}")
     found = find_vehicles(name, topics, fixes, sensor)
     scan, sigma_m = parameters.registration_scan, parameters.sigma_fix_m
     for each in found:

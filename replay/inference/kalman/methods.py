@@ -90,7 +90,7 @@ class RegressionParameters(MethodParameters):
     """Defines options of methods that may use samples.
 
     Attributes:
-        sampling: name of the sampling, such as s2kf-50.
+        sampling: name of the sampling: ukf, or gf, rukf or s2kf with a number, such as s2kf-50.
         seed: seed of random samplings.
     """
 

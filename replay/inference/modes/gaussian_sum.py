@@ -58,7 +58,7 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):
     to the left or to the right, and so the mean of all, rounding would say.
 
     Attributes:
-        filter: the filter of every member.
+        filter: the filter of every member: ekf, iekf, ukf, lrkf, analytic or sqrt.
         members: number of members for a whole turn; odd.
     """
 

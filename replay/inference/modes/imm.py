@@ -68,7 +68,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
     """States the filter of every mode, and what is written.
 
     Attributes:
-        filter: the filter of every mode.
+        filter: the filter of every mode: ekf, iekf, ukf, lrkf, analytic or sqrt.
         smoothed_modes: whether the probabilities of the modes given all data are written too, at the end
             of the run and on a topic of their own; the state is not smoothed.
     """

@@ -55,8 +55,9 @@ class SmootherParameters(UnscentedParameters, RegressionParameters):
     """States what goes forward, and how far estimates look ahead.
 
     Attributes:
-        forward: the filter, perhaps with a lag, as in `ekf:lag=500ms`; without a lag every estimate uses
-            the whole run, with one the messages up to so much later.
+        forward: the filter (ekf, iekf, ukf, lrkf, analytic or sqrt), perhaps with a lag, as in
+            `ekf:lag=500ms`; without a lag every estimate uses the whole run, with one the messages up
+            to so much later. Or iterated.
     """
 
     forward: str = "ekf"
