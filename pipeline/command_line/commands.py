@@ -38,11 +38,8 @@ from fuselog.pipeline.output.terminal import (
     print_worst,
     progress,
     say,
-<<<<<<< HEAD
-    status,
-=======
     say_next,
->>>>>>> ways64
+    status,
     warn,
 )
 from fuselog.pipeline.runs.ensemble import judge_logs

@@ -97,7 +97,7 @@ def test_rooms_are_named_as_parts_of_fuselog() -> None:
 
 
 def test_one_version_everywhere() -> None:
-    """That of pyproject.toml, which the installed package has, is cited and is the last release of the changelog."""
+    """The package, its citation and the last release in the changelog have that of pyproject.toml."""
     stated = PYPROJECT["project"]["version"]
     assert version("fuselog") == stated
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
