@@ -514,7 +514,7 @@ def test_output_in_a_narrow_terminal_and_beyond_its_encoding(
     out, err = process.communicate()
     assert process.returncode == 0
     assert err == ""
-    *lines, written = out.splitlines()
+    *lines, written, _ = out.splitlines()
     assert max(len(line) for line in lines if not line.startswith("nees: of one run; ")) <= 60
     assert written == r"\xe4 \u2603.estimates.mcap"
 
@@ -733,7 +733,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
 def test_the_run_that_a_result_shows_is_saved(world: Path, fuselog: Fuselog) -> None:
     result = world / "result"
     said = fuselog("view", str(result), "--save", "shown.rrd")
-    assert (said.code, said.out, said.err) == (0, "shown.rrd\n", "")
+    assert (said.code, said.out.splitlines()[0], said.err) == (0, "shown.rrd", "")
     assert Path("shown.rrd").read_bytes() == (result / "timeline.rrd").read_bytes()
     refused = fuselog("view", str(result), "--save", "shown.rrd", "--start", "1")
     assert (refused.code, "--start, --end, --focus and --connect need a log" in refused.err) == (2, True)
@@ -765,7 +765,7 @@ def test_a_view_opens_at_the_moment_that_a_replay_names(
     for name in ("ekf", "ukf"):
         moment = worst[name]
         shown = fuselog("view", "est.mcap", "--at", f"worst:{name}", "--screenshot", "a.png")
-        line, written = shown.out.splitlines()
+        line, written, _ = shown.out.splitlines()
         assert (line in said, line.startswith(f"{name}: worst at ")) == (True, True)
         assert (written, seen) == ("a.png", [moment["case"], moment["elapsed_s"]])
         seen.clear()
