@@ -1,4 +1,4 @@
-"""Models vehicles and sensors that see them in a frame of their own; state = (x, vx, y, vy).
+"""Models how vehicles move in the plane; state = (x, vx, y, vy).
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, (12)-(14). Component-first: scalars or arrays.
@@ -36,19 +36,3 @@ def noise_moments(
     """
     velocity = (acceleration_sigma_mps2 * duration_s) ** 2
     return 0.25 * velocity * duration_s**2, 0.5 * velocity * duration_s, velocity
-
-
-def into_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Compute where a sensor with pose (x, y, heading) has a point (x, y) in its own frame."""
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-    dx, dy = point[0] - pose[0], point[1] - pose[1]
-    return cosine * dx + sine * dy, cosine * dy - sine * dx
-
-
-def out_of_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Return the point (x, y) that a sensor with this pose has at `point` of its own frame."""
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-    return (
-        pose[0] + cosine * point[0] - sine * point[1],
-        pose[1] + sine * point[0] + cosine * point[1],
-    )

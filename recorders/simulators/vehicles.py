@@ -17,8 +17,9 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.log.planes import FRAME, body_of
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.models.planar import into_frame
 from fuselog.recorders.models.states import PLANE_MOTION
-from fuselog.recorders.models.vehicles import into_frame, turn
+from fuselog.recorders.models.vehicles import turn
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 

@@ -8,7 +8,8 @@ from scipy.stats import kstest, norm
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.models.geodesy import into_tangent_plane
-from fuselog.recorders.models.vehicles import into_frame, noise_moments, out_of_frame, turn
+from fuselog.recorders.models.planar import into_frame, out_of_frame
+from fuselog.recorders.models.vehicles import noise_moments, turn
 from fuselog.recorders.recording import record_run
 
 TURNING = {"turn_rate_radps": [-0.05, 0.05, 0.0, -0.05, 0.05]}

@@ -16,10 +16,11 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.constant_velocity import noise_moments
+from fuselog.recorders.models.inertial import distance
 from fuselog.recorders.models.planar import Components
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.streams.measurements import SPACE
 from fuselog.replay.engine.vectors.tangent import Kind
+from fuselog.replay.estimators.navigation.sensors import ANCHORS, RANGE, TAGS
 from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started
@@ -105,12 +106,6 @@ def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Comp
         0.0, 0.0, turning, 0.0, 0.0, turn,
     )
     # fmt: on
-
-
-def distance(tag: Components, anchor: Components) -> Any:
-    """Return the distance of two points in space."""
-    dx, dy, dz = tag[0] - anchor[0], tag[1] - anchor[1], tag[2] - anchor[2]
-    return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 def see(state: Components, anchor: Components, parameters: Any) -> Components:
@@ -246,9 +241,6 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
 
 
 HOW = "where its first ranges fit best"
-ANCHORS = Map("/anchors", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "anchor_id")
-TAGS = Map("/tags", schemas.BODY_POINT, "point_id", "position_m", SPACE, "tag_id")
-RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear"}
 ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "height_m": "linear"}
 # Of logs that do not say it: a radio in the open, on something that is pushed or driven slowly.

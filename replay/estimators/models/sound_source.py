@@ -13,10 +13,10 @@ from pydantic import PositiveFloat
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.inertial import distance
 from fuselog.recorders.models.planar import Components
 from fuselog.replay.engine.arrays import Floats, Function
 from fuselog.replay.engine.streams.measurements import SPACE
-from fuselog.replay.estimators.models.ranging import distance
 from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started

@@ -14,7 +14,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import schemas
-from fuselog.recorders.models.inertial import cross, into_body, into_plane, product
+from fuselog.recorders.models.inertial import cross, into_body, into_plane, product, triad, unit
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.api.functions import batch, each_run
 from fuselog.replay.engine.api.inputs import Given, Messages, OneRun
@@ -23,7 +23,6 @@ from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.estimators.orientation.magnetometers import with_magnetometer
 from fuselog.replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
 from fuselog.replay.estimators.orientation.resting import of_nine_axes
-from fuselog.replay.estimators.orientation.triad import triad, unit
 
 HALF = np.sqrt(0.5)
 

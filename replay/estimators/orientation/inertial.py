@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.inertial import triad
 from fuselog.replay.distributions.bingham_kernels import (
     compose,
     integrate,
@@ -31,7 +32,6 @@ from fuselog.replay.estimators.orientation.triad import (
     all_finite,
     fill_diagonal,
     fill_isotropic,
-    triad,
     turn_back,
     turn_quaternion,
 )

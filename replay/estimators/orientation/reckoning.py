@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.models.inertial import triad
 from fuselog.replay.distributions.bingham_kernels import compose
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.estimators.orientation.inertial import (
@@ -13,7 +14,7 @@ from fuselog.replay.estimators.orientation.inertial import (
     over_runs,
     prepared,
 )
-from fuselog.replay.estimators.orientation.triad import all_finite, triad, turn_quaternion
+from fuselog.replay.estimators.orientation.triad import all_finite, turn_quaternion
 
 NS = 1e-9
 

@@ -1,12 +1,9 @@
-"""Finds orientation from two directions (TRIAD), and steps of an orientation by a turn."""
+"""Steps an orientation by a turn, and fills what filters of it begin with."""
 
 import math
 
-import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.models.inertial import cross
-from fuselog.recorders.models.planar import Components
 from fuselog.replay.distributions.bingham_kernels import Vector
 
 
@@ -54,32 +51,6 @@ def turn_back(turned: Vector, vector: NDArray) -> None:
     vector[0] = a + w * d + y * f - z * e
     vector[1] = b + w * e + z * d - x * f
     vector[2] = c + w * f + x * e - y * d
-
-
-def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """Find the orientation under which force points up, field north; NaN where they are parallel."""
-    up = unit(force)
-    east = unit(cross(field, up))
-    north = cross(up, east)
-    # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
-    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
-    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
-    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
-    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
-    column, most = (w, a, b, c), w
-    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
-        if size > most:
-            column, most = other, size
-    w, x, y, z = column
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    return w / length, x / length, y / length, z / length
-
-
-def unit(vector: Components) -> Components:
-    """Return the direction of a vector of three components; NaN where it has none."""
-    x, y, z = vector[0], vector[1], vector[2]
-    length = np.sqrt(x * x + y * y + z * z)
-    return x / length, y / length, z / length
 
 
 def fill_diagonal(values: NDArray, out: NDArray) -> None:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.models.vehicles import into_frame, noise_moments, turn
+from fuselog.recorders.models.planar import into_frame
+from fuselog.recorders.models.vehicles import noise_moments, turn
 from fuselog.replay.distributions import chi2
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.estimators.vehicles.association import Hypotheses

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.models.vehicles import out_of_frame
+from fuselog.recorders.models.planar import out_of_frame
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
 from fuselog.replay.judging.errors.evaluation import Floats

@@ -14,7 +14,8 @@ from fuselog.pipeline.runs.recorded import record_ensemble, replay_in_memory
 from fuselog.pipeline.studies.vehicles.cases import Scores, scores_of
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock
-from fuselog.recorders.models.vehicles import into_frame, noise_moments
+from fuselog.recorders.models.planar import into_frame
+from fuselog.recorders.models.vehicles import noise_moments
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.estimators.vehicles.association import (
     GATE_PROBABILITY,

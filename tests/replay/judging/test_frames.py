@@ -9,7 +9,7 @@ from fuselog.pipeline.logs.foxglove import WORLD, companions
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, schemas
 from fuselog.recorders.log.planes import FRAME, frame_of
-from fuselog.recorders.models.vehicles import into_frame
+from fuselog.recorders.models.planar import into_frame
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, record_run
 from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.replaying.estimator import bind
