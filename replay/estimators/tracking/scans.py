@@ -1,7 +1,4 @@
-"""Reads scans of unordered detections of one sensor or several: which detections are of which scan.
-
-A sensor that moves names the topic of its own position in the metadata of its scans, as ORIGIN.
-"""
+"""Reads scans of unordered detections of one sensor or several: which detections are of which scan."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,8 +11,6 @@ from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
 from fuselog.replay.inference.association.scans import Scans, ScanSensor
-
-ORIGIN = "origin"
 
 
 class SensorTopics(NamedTuple):
@@ -149,23 +144,3 @@ def latest_fixes(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]
             if before is None or time_ns >= before.time_ns:
                 latest[run] = Fix(time_ns, places[row])
     return latest
-
-
-def rows_of(scan: Stream, detected: Stream) -> Integers:
-    """Return the row of each detection's scan."""
-    order = np.argsort(scan["scan_id"], kind="stable")
-    return order[np.searchsorted(scan["scan_id"][order], detected["scan_id"])]
-
-
-def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
-    """Return where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
-    if fix is None:
-        return np.zeros((len(scan), 2))
-    last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
-    return read_vectors(fix, "position_m", PLANE)[np.maximum(last, 0)]
-
-
-def detected_places(scan: Stream, detected: Stream, fix: Stream | None) -> Floats:
-    """Return where the detections are in the plane, (n, 2)."""
-    own = places_of_sensor(scan, fix)[rows_of(scan, detected)]
-    return own + read_vectors(detected, "position_m", PLANE)

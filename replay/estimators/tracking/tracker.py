@@ -32,8 +32,9 @@ from fuselog.replay.engine.api.functions import Advance, recursive
 from fuselog.replay.engine.api.inputs import Binding
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.channels import stated
+from fuselog.replay.engine.streams.detections import ORIGIN
 from fuselog.replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
-from fuselog.replay.estimators.tracking.scans import ORIGIN, SensorTopics
+from fuselog.replay.estimators.tracking.scans import SensorTopics
 from fuselog.replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
 from fuselog.replay.estimators.tracking.targets import Targets, targets_of
 from fuselog.replay.estimators.tracking.track_smoother import check_smoothing

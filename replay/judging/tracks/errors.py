@@ -20,6 +20,7 @@ from fuselog.recorders.log import Stream, Topic, schemas, topics_of
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
 from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.judging.errors.truths import COVERS, SOME_TARGETS
 from fuselog.replay.judging.sets.distances import gospa, gospa_pairs
 from fuselog.replay.judging.tracks.clear_mot import NONE, clear_mot, switches_and_breaks
 
@@ -28,8 +29,6 @@ UNREFERENCED_M = 50.0
 # The first instant, when tracks have had time to begin, and how far apart the others are.
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
-# In the metadata of a truth: there are targets that no topic of the log has the truth of.
-COVERS, SOME_TARGETS = "covers", "some targets"
 SOME_ARE_KNOWN = (
     "the truths say that they cover some of the targets: a track more than "
     f"{UNREFERENCED_M:g} m from all of them counts as unreferenced, not as false, and referenced_hota "

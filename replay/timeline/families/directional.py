@@ -3,7 +3,7 @@
 To the right of each are the errors in degrees with their bands, as everywhere.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -36,6 +36,7 @@ from fuselog.replay.timeline.drawing.canvas import (
 from fuselog.replay.timeline.drawing.events import Happened, above_events, draw_events
 from fuselog.replay.timeline.drawing.plane import GRID, Stroke, with_legend
 from fuselog.replay.timeline.drawing.plots import draw_quality
+from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 
 QUATERNION = COMPONENTS[:4]
 # Pictures and outlines are large: fewer of them than of numbers.
@@ -121,44 +122,6 @@ def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
         turned = (track.time_ns, track.states)
         draw_triads(canvas, f"{root}/{track.name}", *turned, colours, 1.0 + 0.1 * number, radius)
     return space_view(root, "Orientation: truth in red, green, blue")
-
-
-def draw_triads(
-    canvas: Canvas,
-    entity: str,
-    time_ns: Times,
-    quaternions: Floats,
-    colours: Sequence[Colour],
-    length: float,
-    radius: float,
-) -> None:
-    """Draw the axes x, y and z, turned, at each time.
-
-    Args:
-        canvas, entity: what is drawn on, and where.
-        time_ns: (n,).
-        quaternions: (n, 4), w first.
-        colours: of x, y and z.
-        length, radius: of the axes, in the unit of the scene.
-    """
-    turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
-    canvas.send(entity, time_ns, turned)
-    labels = [f"{entity.rpartition('/')[2]} {axis}" for axis in "xyz"]
-    arrows = rr.Arrows3D(
-        vectors=length * np.eye(3), colors=colours, radii=radius, labels=labels, show_labels=False
-    )
-    canvas.fix(f"{entity}/axes", arrows)
-
-
-def space_view(root: str, name: str) -> rrb.Spatial3DView:
-    """Return a view of triads about one origin, x towards the eye."""
-    return rrb.Spatial3DView(
-        origin=escaped(root),
-        name=name,
-        eye_controls=rrb.EyeControls3D(
-            position=(2.4, 1.4, 1.2), look_target=(0, 0, 0), eye_up=(0, 0, 1)
-        ),
-    )
 
 
 def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:

@@ -22,8 +22,8 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.planes import frame_of
 from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.streams.detections import ORIGIN, places_of_sensor, rows_of
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
-from fuselog.replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.judging.tracks.clear_mot import NONE
 from fuselog.replay.judging.tracks.errors import (

@@ -18,10 +18,10 @@ from fuselog.replay.engine.replaying import replaying
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.late import parse_late
 from fuselog.replay.engine.replaying.replaying import collect
+from fuselog.replay.engine.streams.detections import detected_places
 from fuselog.replay.engine.streams.measurements import PLANE
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.estimators.tracking.scan_sensors import place_clutter, polar_clutter
-from fuselog.replay.estimators.tracking.scans import detected_places
 from fuselog.replay.inference.association.association import existence_after, marginals
 from fuselog.replay.inference.model.parameters import settings_type
 from fuselog.replay.judging.tracks.errors import instants_of, track_errors, track_figures, tracks_at
