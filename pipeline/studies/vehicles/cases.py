@@ -163,10 +163,11 @@ def scores_of(
     sources: Sequence[Source],
     outputs: Mapping[str, Ragged],
     labels: Iterable[str],
-    sets: Sequence[SetErrors] = (),
+    others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
     """Return the scores of all estimators of the runs; those of sets by the network's fixes."""
     times_ns, truths = truths_of(sources)
+    sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
     return {
         label: score_set(outputs, of_sets[label], truths)

@@ -116,8 +116,8 @@ def _timed(
     begin = time.process_time()
     outputs = replay_in_memory(sources, chosen)
     taken = time.process_time() - begin
-    sets = judge(sources, outputs, 0.2).sets
-    [found] = scores_of(sources, outputs, [label], sets).values()
+    others = judge(sources, outputs, 0.2).others
+    [found] = scores_of(sources, outputs, [label], others).values()
     steps = sum(len(source.streams["/network/scan"]) for source in sources)
     vehicles = sum(topic.endswith("/prior") for topic in sources[0].streams)
     well = np.isfinite(found.assigned)

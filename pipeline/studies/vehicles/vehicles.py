@@ -38,7 +38,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         )
     cases: list[Case] = []
     for name, replayed in Runner(experiment, setting).cases(options.cases):
-        scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators, replayed.sets)
+        scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators, replayed.others)
         sent = bytes_per_step(replayed.sources, experiment.estimators)
         cases.append(Case(name, replayed.sources, scores, sent))
     few = _few(cases[0], options, setting)

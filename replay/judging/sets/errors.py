@@ -20,9 +20,10 @@ from fuselog.replay.engine.vectors.components import Components
 from fuselog.replay.judging.errors.evaluation import POSITION, reference, split_topic
 from fuselog.replay.judging.errors.frames import not_comparable, seen_in
 from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.kinds import KindJudge
 from fuselog.replay.judging.metrics.measuring import Sums, metric_of_sums
 from fuselog.replay.judging.sets.distances import gospa, ospa
-from fuselog.replay.judging.sets.regions import Regions
+from fuselog.replay.judging.sets.regions import Regions, regions_of
 
 Floats = NDArray[np.float64]
 CUTOFF_M = 10.0
@@ -142,6 +143,21 @@ def _judge_run(
         counts = len(estimated), len(there)
         rows[step] = ospa(estimated, there, cutoff_m, ORDER), *parts, *counts
     return rows
+
+
+class SetsJudge(KindJudge):
+    """Judges sets of targets, and regions that hold one."""
+
+    def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
+        """Judge a block; see `KindJudge`."""
+        sources, truths, gap_limit_s, first_run = self.runs
+        for topic, sizes in outputs.items():
+            is_size = sizes.stream.schema.full_name == schemas.ESTIMATE_SIZE.full_name
+            is_set = is_size and f"{topic.rpartition('/')[0]}/element" in outputs
+            if is_set and topic not in self.unjudged:
+                self.unjudged[topic] = unjudged_sets(sizes.stream, sources)
+        sets = set_errors(outputs, truths, gap_limit_s=gap_limit_s, first_run=first_run)
+        return [*sets.items(), *regions_of(outputs, truths, gap_limit_s).items()]
 
 
 class AnySets(ABC):  # noqa: B024  # named tuples have no base of their own

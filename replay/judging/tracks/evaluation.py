@@ -7,7 +7,7 @@ after the log's begin to the last scan that it took.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,13 @@ from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.errors.evaluation import split_topic
 from fuselog.replay.judging.errors.frames import not_comparable, seen_in
 from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
 from fuselog.replay.judging.metrics.measuring import Metric
 from fuselog.replay.judging.tracks.clear_mot import NONE
 from fuselog.replay.judging.tracks.errors import (
     BURN_IN_S,
     PERIOD_S,
+    SOME_ARE_KNOWN,
     VELOCITY,
     Judged,
     TracksAt,
@@ -106,6 +108,32 @@ def track_blocks(
         if (seen := targets.get(frame_of(tracks.stream.metadata))) is not None:
             found[topic] = TrackBlock(*split_topic(topic), sizes, tracks, seen, first_run)
     return found
+
+
+class TracksJudge(KindJudge):
+    """Judges sets of tracks by the targets of each run, which are read once for every frame."""
+
+    def __init__(self, runs: JudgedRuns) -> None:
+        super().__init__(runs)
+        self._targets: dict[str, list[Judged | None]] = {}
+
+    def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
+        """Judge a block; see `KindJudge`."""
+        for topic, rows in outputs.items():
+            is_track = rows.stream.schema.full_name == schemas.TRACK_ESTIMATE.full_name
+            if is_track and topic not in self.unjudged:
+                self._find_targets(topic, rows.stream)
+        return [*track_blocks(outputs, self._targets, self.runs.first_run).items()]
+
+    def _find_targets(self, topic: str, tracks: Stream) -> None:
+        """Find what new tracks are judged by, and whether they can be judged."""
+        self.unjudged[topic] = unjudged_tracks(tracks, self.runs.sources)
+        frame = frame_of(tracks.metadata)
+        if self.unjudged[topic] or frame in self._targets:
+            return
+        self._targets[frame] = [targets_of(source, frame) for source in self.runs.sources]
+        if any(targets is not None and targets.is_partial for targets in self._targets[frame]):
+            self.notes = [SOME_ARE_KNOWN]
 
 
 @dataclass

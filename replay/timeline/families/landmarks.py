@@ -43,7 +43,7 @@ from fuselog.replay.timeline.drawing.plane import (
     with_legend,
 )
 from fuselog.replay.timeline.drawing.plots import draw_quality
-from fuselog.replay.timeline.families.sets import draw_sets
+from fuselog.replay.timeline.drawing.registered import draw_registered
 
 HEADING = "heading_rad"
 # An arrow is so long, as a share of the scene.
@@ -107,7 +107,7 @@ def _draw_robot(
     draw_clouds(canvas, scene, robot, root)
     sights = draw_sights(canvas, scene, robot, tracks, landmarks)
     sights |= _draw_view(canvas, scene, robot, tracks)
-    _, areas = draw_sets(canvas, scene, robot, root)
+    areas = draw_registered(canvas, scene, robot, scene.outputs.values())
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
     board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
     board = above_events(board, draw_events(canvas, scene, robot))

@@ -17,6 +17,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
     WRONG,
+    Board,
     Canvas,
     Colour,
     Scene,
@@ -45,12 +46,13 @@ class Track(NamedTuple):
     places: Floats
 
 
-def draw_moving_sights(
-    canvas: Canvas, scene: Scene, case: str, sensed: Sequence[Stream]
-) -> list[rrb.Container]:
+def draw_moving_sights(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
     """Draw the scene above a close-up of each target's errors: no board without sensors or targets."""
     schema = schemas.MOVING_LINE_OF_SIGHT.full_name
-    sensors = [stream for stream in sensed if stream.schema.full_name == schema]
+    topics = [
+        each for each in scene.topics_near(case) if scene.source.topics[each].schema_name == schema
+    ]
+    sensors = [stream for stream in map(scene.read, topics) if len(stream)]
     tracks = list(_tracks(scene, case))
     if not sensors or not tracks:
         return []

@@ -14,6 +14,7 @@ from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.judging.sets.regions import areas_of, rings_of
 from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
+    Board,
     Canvas,
     Scene,
     Timeline,
@@ -91,6 +92,12 @@ def draw_sets(
     largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
     extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
     return reach, [plot_view(plot, "Area of the set", "m²", extent, note=note, legend=False)]
+
+
+def draw_areas(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
+    """Draw a case's sets in its plane, and return the plot of their areas."""
+    _, plots = draw_sets(canvas, scene, case, entity_path(ROOT, case))
+    return [*plots]
 
 
 TIMELINE = Timeline(draw)

@@ -141,7 +141,7 @@ def test_expected_number_and_gospa_over_runs():
     expected = outputs["/estimates/gm-phd/sensor/cardinality"]["mean"].reshape(40, -1)
     standard_error = expected.mean(axis=1).std() / np.sqrt(40)
     assert abs(expected.mean() - 5.0) < 3.0 * standard_error
-    [found] = judge(sources, outputs, 0.2).sets
+    [found] = judge(sources, outputs, 0.2).others
     assert_array_equal(found.true, 5)
     # with a detection probability of .9 a thing that is missed for one scan is below one half
     assert found.missed.mean() / 50 < 0.7
