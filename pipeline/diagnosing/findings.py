@@ -17,7 +17,7 @@ from fuselog.recorders.parameters import field_of
 from fuselog.recorders.plausibility.checks import BLOCK, findings_in
 from fuselog.recorders.plausibility.finding import Cause
 from fuselog.recorders.plausibility.stamps import MOST_LOST
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness

@@ -58,8 +58,8 @@ def export(
         path: the log, or estimates log.
         to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
             position, and of poses; "mot" has a file of each tracker's tracks and one of all truths, see
-            `fuselog.pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what
-            its viewers can show, see `fuselog.pipeline.logs.foxglove`.
+            `fuselog.pipeline.families.tracking.mot`; "csv" and "parquet" are tables; "foxglove" is one
+            log of what its viewers can show, see `fuselog.pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
             "foxglove", the file.
         topics: which; none stands for all that fit.

@@ -1,6 +1,6 @@
 """Defines how a family judges outputs of a kind of its own, such as tracks, in addition to estimates.
 
-Its class registers as an entry point `fuselog.judges`. Metrics that judge the type of what it returns
+The class registers as an entry point `fuselog.judges`. Metrics that judge the type of what it returns
 make numbers of that.
 """
 

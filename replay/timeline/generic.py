@@ -59,14 +59,14 @@ from fuselog.replay.timeline.drawing.plots import (
 from fuselog.replay.timeline.drawing.registered import draw_registered
 from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 from fuselog.replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
-from fuselog.replay.timeline.families.landmarks import (
+from fuselog.replay.timeline.landmarks import (
     ARROW_SHARE,
     draw_sights,
     draw_track,
     landmarks_of,
     tracks_of,
 )
-from fuselog.replay.timeline.families.navigation import draw_navigation
+from fuselog.replay.timeline.navigation import draw_navigation
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name

@@ -15,10 +15,10 @@ from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.families.tracking.judging.errors import target_topics
 from fuselog.replay.judging.errors.frames import pose_topic, seen_in
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.judge import Judge
-from fuselog.replay.judging.tracks.errors import target_topics
 
 SCENARIOS = {
     name for name in available("recorders") if isinstance(load("recorders", name, object), Simulator)

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fuselog.recorders.models import acoustic, optical
+from fuselog.recorders.families.acoustic import models as acoustic
+from fuselog.recorders.families.los import models as optical
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.tracing import traced
 from fuselog.replay.tracing.functions import Derivative
