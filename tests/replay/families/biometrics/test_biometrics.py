@@ -180,7 +180,7 @@ LEARNT_WITH = """
 import numpy as np
 from threadpoolctl import threadpool_info
 from fuselog.recorders.families.biometrics.models import Comparisons, Matcher
-from fuselog.replay.families.biometrics import biometrics
+from fuselog.replay.families.biometrics import estimators as biometrics
 
 def threads(vectors, *_):
     print(*(each["num_threads"] for each in threadpool_info() if each["user_api"] == "openmp"))
