@@ -98,6 +98,7 @@ from fuselog.replay.engine.streams.blocks import Ragged as Ragged
 from fuselog.replay.engine.streams.measurements import Vectors as Vectors
 from fuselog.replay.engine.streams.sources import LogSource as LogSource
 from fuselog.replay.engine.streams.sources import MemorySource as MemorySource
+from fuselog.replay.families.sets.judging.errors import SetErrors as SetErrors
 from fuselog.replay.inference.all_methods import modelled as modelled
 from fuselog.replay.inference.formulas import formulas as formulas
 from fuselog.replay.inference.model.checking import check_model as check_model
@@ -114,7 +115,6 @@ from fuselog.replay.judging.errors.evaluation import Innovations as Innovations
 from fuselog.replay.judging.metrics.measuring import Metric as Metric
 from fuselog.replay.judging.metrics.measuring import Output as Output
 from fuselog.replay.judging.metrics.measuring import metric_of_sums as metric_of_sums
-from fuselog.replay.judging.sets.errors import SetErrors as SetErrors
 from fuselog.replay.timeline.drawing.canvas import Canvas as Canvas
 from fuselog.replay.timeline.drawing.canvas import Scene as Scene
 from fuselog.replay.timeline.drawing.canvas import Timeline as Timeline

@@ -1,8 +1,9 @@
 """Finds recorders, estimators, metrics and studies by name.
 
 All register in one way, ours and third parties' alike: as entry points of an installed distribution
-(groups `fuselog.recorders`, `fuselog.estimators`, `fuselog.metrics`, `fuselog.studies`,
-`fuselog.timelines`). Listing names imports nothing.
+(groups `fuselog.recorders`, `fuselog.models`, `fuselog.estimators`, `fuselog.judges`, `fuselog.metrics`,
+`fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`). Listing names imports
+nothing.
 """
 
 from collections.abc import Iterator

@@ -19,7 +19,7 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.estimators import registered_models
 from fuselog.replay.inference.model.own_parameters import read_by
 from fuselog.replay.inference.model.parameters import ModelParameters
-from fuselog.replay.judging.tracks.errors import COVERS
+from fuselog.replay.judging.errors.truths import COVERS
 
 AXES = "xyz"
 ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # of what is done to a field

@@ -13,7 +13,7 @@ from fuselog.pipeline.runs.inputs import load_scenario, shipped
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.recording import Importer, Recorder, record_run
 from fuselog.recorders.registry import available, load
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.compiling.cache import cache_folder, is_private, kept_files
 from fuselog.replay.engine.compiling.compile import core_count, is_uncompiled
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source

@@ -23,7 +23,7 @@ from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Supposed, fit, undone
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, schemas, topics_of
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.engine.vectors.tangent import tangent_components

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 from urllib.parse import quote
 
-from fuselog.pipeline.logs.mot import mot_files
 from fuselog.pipeline.output.outputs import Kind, check_files, check_folder
 from fuselog.recorders.atomic import whole_file, whole_folder
 from fuselog.recorders.errors import BadInput, UnknownName, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
+from fuselog.recorders.registry import available, load
 from fuselog.recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 
@@ -33,6 +33,7 @@ TRAJECTORIES: dict[str, tuple[str, Callable[[Trajectory], list[str]]]] = {
 }
 
 Write = Callable[[Stream], None]
+FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]]
 
 
 class Exported(NamedTuple):
@@ -57,8 +58,8 @@ def export(
         path: the log, or estimates log.
         to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
             position, and of poses; "mot" has a file of each tracker's tracks and one of all truths, see
-            `fuselog.pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what
-            its viewers can show, see `fuselog.pipeline.logs.foxglove`.
+            `fuselog.pipeline.families.tracking.mot`; "csv" and "parquet" are tables; "foxglove" is one
+            log of what its viewers can show, see `fuselog.pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
             "foxglove", the file.
         topics: which; none stands for all that fit.
@@ -73,8 +74,8 @@ def export(
         raise BadInput(f"no format '{to}' to export to; {choices(to, get_args(To))}")
     log = open_log(path, recover=recover)
     notes = [log.loss_statement] if log.loss_statement else []
-    if to == "mot":
-        return _export_frames(log, topics, Path(out or f"{log.path.stem}-mot"), notes)
+    if to in available("exports"):
+        return _export_frames(log, to, topics, Path(out or f"{log.path.stem}-{to}"), notes)
     chosen = _chosen(log, to, topics, notes)
     if to == "foxglove":
         return _export_companions(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
@@ -147,10 +148,14 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
     return Exported({topic: place for topic, messages in written.items() if messages}, notes)
 
 
-def _export_frames(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
-    """Write a folder of tracks and truths, frame by frame."""
-    files = mot_files(log, topics)
-    names = {name: f"{quote(name, safe=' ')}{SUFFIXES['mot']}" for name in files}
+def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """Write a folder of what an entry point `fuselog.exports` makes of a log.
+
+    It is called with the log and the topics, and returns for each file its topics and its lines.
+    """
+    frames: FramesOf = load("exports", to)
+    files = frames(log, topics)
+    names = {name: f"{quote(name, safe=' ')}{SUFFIXES[to]}" for name in files}
     check_folder(place, {"log": [log.path]})
     with whole_folder(place, _refuse) as part:
         for name, (_, lines) in files.items():

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fuselog.pipeline.output.alarms import Alarm
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.usage import SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import LOST
 from fuselog.replay.judging.consistency.consistency import CONSISTENT

@@ -198,7 +198,7 @@ def _plus_minus(number: Number, spread: Number) -> Number:
 
 def _chi_square(share: Number, size: Number) -> Number:
     """Find below what a share of chi-square numbers of so many degrees lies; NaN without any degree."""
-    from fuselog.replay.distributions import chi2
+    from fuselog.replay.engine import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
 

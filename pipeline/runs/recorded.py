@@ -21,7 +21,6 @@ from fuselog.replay.engine.streams.sources import MemorySource, Source, memory_s
 from fuselog.replay.judging.errors.evaluation import Errors, Innovations, split_topic
 from fuselog.replay.judging.judge import TIME_BINS, Judge
 from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure
-from fuselog.replay.judging.sets.errors import SetErrors
 
 # Of a run that was judged, so much is kept at least: its sums over time.
 KEPT_BYTES = 8 * TIME_BINS
@@ -29,22 +28,25 @@ KEPT_BYTES = 8 * TIME_BINS
 
 @dataclass(frozen=True)
 class Replayed:
-    """Holds an ensemble in memory, what estimators made of it, and how that compares with the truth."""
+    """Holds an ensemble in memory, what estimators made of it, and how that compares with the truth.
+
+    `others` is what families judge: sets, regions, tracks.
+    """
 
     sources: Sequence[MemorySource]
     outputs: dict[str, Ragged]
     errors: list[Errors]
     innovations: list[Innovations]
-    sets: list[SetErrors]
+    others: list[Any]
 
     @property
-    def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
-        """Return all that metrics may judge."""
+    def judged(self) -> list[Errors | Innovations | Output]:
+        """Return all that metrics of estimates, innovations and messages judge."""
         outputs = [
             Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
             for topic, rows in self.outputs.items()
         ]
-        return [*self.errors, *self.innovations, *self.sets, *outputs]
+        return [*self.errors, *self.innovations, *outputs]
 
     def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
         """Return the metrics of these names, of all where none is given; see `measure`."""
@@ -135,6 +137,6 @@ def replay_in_memory(
 
 
 def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
-    """Compute errors, innovations and set errors of a replay's outputs."""
+    """Judge a replay's outputs by the truth."""
     judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
-    return Replayed(sources, outputs, judged.errors, judged.innovations, judged.sets)
+    return Replayed(sources, outputs, judged.errors, judged.innovations, judged.others)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.pipeline.sensing.terms import Terms
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -14,7 +14,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 
 from fuselog.pipeline.sensing.likelihood import Likelihood, Samples, likelihood
 from fuselog.pipeline.sensing.terms import Terms
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 Floats = NDArray[np.float64]
 Objective = Callable[[Floats], float]

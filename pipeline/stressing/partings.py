@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, schemas
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.vectors.covariances import normalized_error_squared
 from fuselog.replay.engine.vectors.tangent import difference, tangent_components
 

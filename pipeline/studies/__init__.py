@@ -1,5 +1,4 @@
-"""Studies families, one package each: which tables, figures and claims an experiment yields.
+"""Studies what the core estimates, and holds what all studies share; begin with `toolkit.localization`.
 
-Begin with a small one, `ranging.ranging`; `toolkit` has what several share. Verdicts on claims come
-from `fuselog.pipeline.output.claims`.
+The studies of families are in `fuselog.pipeline.families`.
 """

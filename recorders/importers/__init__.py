@@ -1,1 +1,4 @@
-"""Imports real data, one file or package per source; begin with `mrclam`."""
+"""Imports real data of any kind: tables, ROS, ULog, and robots among landmarks; begin with `mrclam`.
+
+Data sets of families are imported in `fuselog.recorders.families`.
+"""

@@ -129,3 +129,35 @@ def strapdown(
         qy,
         qz,
     )
+
+
+def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
+    """Find the orientation under which force points up, field north; NaN where they are parallel."""
+    up = unit(force)
+    east = unit(cross(field, up))
+    north = cross(up, east)
+    # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
+    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
+    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
+    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
+    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
+    column, most = (w, a, b, c), w
+    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
+        if size > most:
+            column, most = other, size
+    w, x, y, z = column
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length
+
+
+def unit(vector: Components) -> Components:
+    """Return the direction of a vector of three components; NaN where it has none."""
+    x, y, z = vector[0], vector[1], vector[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def distance(tag: Components, anchor: Components) -> Component:
+    """Return the distance of two points in space."""
+    dx, dy, dz = tag[0] - anchor[0], tag[1] - anchor[1], tag[2] - anchor[2]
+    return np.sqrt(dx * dx + dy * dy + dz * dz)

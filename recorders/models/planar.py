@@ -46,3 +46,19 @@ def range_bearing(pose: Components, target: Components) -> tuple[Component, Comp
     dx = target[0] - pose[0]
     dy = target[1] - pose[1]
     return np.sqrt(dx * dx + dy * dy), np.arctan2(dy, dx) - pose[2]
+
+
+def into_frame(pose: Components, point: Components) -> tuple[Component, Component]:
+    """Compute where a sensor with pose (x, y, heading) has a point (x, y) in its own frame."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = point[0] - pose[0], point[1] - pose[1]
+    return cosine * dx + sine * dy, cosine * dy - sine * dx
+
+
+def out_of_frame(pose: Components, point: Components) -> tuple[Component, Component]:
+    """Return the point (x, y) that a sensor with this pose has at `point` of its own frame."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    return (
+        pose[0] + cosine * point[0] - sine * point[1],
+        pose[1] + sine * point[0] + cosine * point[1],
+    )

@@ -1,1 +1,4 @@
-"""Simulates sensor streams, one file per scenario family; begin with `landmarks`."""
+"""Simulates robots among landmarks, and inertial units with a receiver; begin with `landmarks`.
+
+The scenarios of families are in `fuselog.recorders.families`.
+"""

@@ -1,4 +1,5 @@
-"""Holds estimators, one package per family, and models that any method estimates; begin with `models`.
+"""Holds the estimators and models of the core: robots, inertial units, batch least squares.
 
-The methods themselves, such as `ekf`, are in `fuselog.replay.inference`.
+Begin with `landmarks`. The methods that estimate models, such as `ekf`, are in
+`fuselog.replay.inference`; families have their own estimators in `fuselog.replay.families`.
 """

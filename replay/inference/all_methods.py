@@ -41,7 +41,7 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
 
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
-    >>> from fuselog.replay.estimators.models.landmarks import ROBOT
+    >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> modelled(ROBOT, "particles:500").parameters().particles
     500
     """

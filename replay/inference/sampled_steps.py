@@ -19,8 +19,8 @@ from fuselog.replay.inference.linear_algebra.manifold import (
     tangent_size,
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.sampling.sets import SampleSets
 from fuselog.replay.inference.step_graphs import Step, traced_step
-from fuselog.replay.sampling.sets import SampleSets
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Kinds = tuple[str, ...]

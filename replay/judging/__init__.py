@@ -1,1 +1,4 @@
-"""Judges estimates by truth: errors, consistency, sets, tracks, verification; begin with `judge`."""
+"""Judges estimates by truth: errors, consistency, metrics; begin with `judge`.
+
+What families judge in addition, such as sets and tracks, registers; see `kinds`.
+"""

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
-from fuselog.recorders.log.planes import Origin, frame_of
+from fuselog.recorders.log.planes import Origin
+from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.bounds import Bounds
@@ -33,6 +34,7 @@ from fuselog.replay.judging.errors.moments import Moment, Moments, worst_of
 from fuselog.replay.judging.errors.planes import first_fixes
 from fuselog.replay.judging.errors.truths import Doubt, Truths
 from fuselog.replay.judging.errors.uninformed import Uninformed
+from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
 from fuselog.replay.judging.metrics.means import MeansOfAll
 from fuselog.replay.judging.metrics.measuring import (
     Metric,
@@ -43,16 +45,10 @@ from fuselog.replay.judging.metrics.measuring import (
 )
 from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from fuselog.replay.judging.metrics.sums import BinnedSums
-from fuselog.replay.judging.sets.errors import SetErrors, set_errors, unjudged_sets
-from fuselog.replay.judging.sets.regions import regions_of
-from fuselog.replay.judging.tracks.errors import SOME_ARE_KNOWN
-from fuselog.replay.judging.tracks.errors import Judged as Targets
-from fuselog.replay.judging.tracks.evaluation import targets_of, track_blocks, unjudged_tracks
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TRACK, SIZE = schemas.TRACK_ESTIMATE.full_name, schemas.ESTIMATE_SIZE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 # A table has at most so many steps; of more, neighbours share a row.
@@ -65,11 +61,11 @@ TIME_BIN_NS = 1_000_000
 
 
 class Judged(NamedTuple):
-    """Holds what is judged of a block: the errors of estimates and of sets, and the innovations."""
+    """Holds what is judged of a block: errors of estimates, innovations, and what families judge."""
 
     errors: list[Errors]
-    sets: list[SetErrors]
     innovations: list[Innovations]
+    others: list[Any]
 
 
 class Judge:
@@ -100,8 +96,9 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
-        self._targets: dict[str, list[Targets | None]] = {}
-        self._of_targets: list[str] = []
+        runs = JudgedRuns(sources, self._truths, gap_limit_s, first_run)
+        self._kinds: list[KindJudge] = [load("judges", name, type)(runs) for name in available("judges")]
+        self._notes: dict[str, None] = {}
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -147,36 +144,15 @@ class Judge:
                 self._bounds.setdefault(split_topic(topic), Bounds()).add(output)
             self._means.add(output)
             self._measured.add(topic, output)
-        found = set_errors(
-            outputs, self._truths, gap_limit_s=self._gap_limit_s, first_run=self._first_run
-        )
-        for topic, sets in found.items():
-            judged.sets.append(sets)
-            self._measured.add(topic, sets)
-        for topic, regions in regions_of(outputs, self._truths, self._gap_limit_s).items():
-            self._measured.add(topic, regions)
-        self._find_targets(outputs)
-        for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
-            self._measured.add(topic, tracks)
+        for kind in self._kinds:
+            for topic, found in kind.add(outputs):
+                judged.others.append(found)
+                self._measured.add(topic, found)
+            for topic, why in kind.unjudged.items():
+                what = " ".join(filter(None, split_topic(topic)))
+                self._unjudged[topic] = f"{what}: not judged: {why}" if why else ""
+            self._notes |= dict.fromkeys(kind.notes)
         return judged
-
-    def _find_targets(self, outputs: Mapping[str, Ragged]) -> None:
-        """Find what new sets and tracks are judged by, and which cannot be judged."""
-        for topic, rows in outputs.items():
-            schema, base = rows.stream.schema.full_name, topic.rpartition("/")[0]
-            is_set = schema == SIZE and f"{base}/element" in outputs
-            if topic in self._unjudged or not (is_set or schema == TRACK):
-                continue
-            unjudged = unjudged_sets if is_set else unjudged_tracks
-            why = unjudged(rows.stream, self._sources)
-            what = " ".join(filter(None, split_topic(topic)))
-            self._unjudged[topic] = f"{what}: not judged: {why}" if why else ""
-            frame = frame_of(rows.stream.metadata)
-            if schema == TRACK and not why and frame not in self._targets:
-                found = [targets_of(source, frame) for source in self._sources]
-                self._targets[frame] = found
-                if any(targets is not None and targets.is_partial for targets in found):
-                    self._of_targets = [SOME_ARE_KNOWN]
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
         begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
@@ -216,7 +192,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._targets, self._on_errors = (), [], {}, None
+        self._sources, self._truths, self._kinds, self._on_errors = (), [], [], None
         self._steps.clear()
         for of_topic in self._uninformed.values():
             of_topic.first.clear()
@@ -240,7 +216,7 @@ class Judge:
                 self._quantities[topic].merge(quantities)
             else:
                 self._quantities[topic] = quantities
-        self._of_targets = self._of_targets or other._of_targets
+        self._notes |= other._notes
         self._means.merge(other._means)
         self._moments.merge(other._moments)
         for what, bounds in other._bounds.items():
@@ -343,7 +319,7 @@ class Judge:
         Those for what was assumed, as of where to begin, come first.
         """
         averaged = "averaged along the true trajectories, since"
-        return [*self._diagnostics.notes(), *self._of_targets] + [
+        return [*self._diagnostics.notes(), *self._notes] + [
             f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
             for what, bounds in self._bounds.items()
             if bounds.complaint

@@ -1,1 +1,4 @@
-"""Draws the Rerun timeline: sinks, columns, one blueprint per scenario family; begin with `show`."""
+"""Draws the Rerun timeline: sinks, columns, the scenes of robots and inertial units; begin with `show`.
+
+Families draw theirs in `fuselog.replay.families`; `generic` draws a log of which no scene is registered.
+"""

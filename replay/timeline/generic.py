@@ -56,17 +56,17 @@ from fuselog.replay.timeline.drawing.plots import (
     plot_view,
     shown_unit,
 )
+from fuselog.replay.timeline.drawing.registered import draw_registered
+from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 from fuselog.replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
-from fuselog.replay.timeline.families.directional import draw_triads, space_view
-from fuselog.replay.timeline.families.landmarks import (
+from fuselog.replay.timeline.landmarks import (
     ARROW_SHARE,
     draw_sights,
     draw_track,
     landmarks_of,
     tracks_of,
 )
-from fuselog.replay.timeline.families.moving_sights import draw_moving_sights
-from fuselog.replay.timeline.families.navigation import draw_navigation
+from fuselog.replay.timeline.navigation import draw_navigation
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name
@@ -94,8 +94,10 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     sensed = [scene.read(topic) for topic in scene.topics_near(case)]
     sensed = [stream for stream in sensed if len(stream)]
     earth = [each for each in sensed if each.schema.full_name == GEODETIC]
-    in_space = draw_navigation(canvas, scene, case, sensed)
-    in_space += draw_moving_sights(canvas, scene, case, sensed)
+    in_space: list[Board] = [
+        *draw_navigation(canvas, scene, case, sensed),
+        *draw_registered(canvas, scene, case, sensed),
+    ]
     places: list[Board] = [
         *in_space,
         *_draw_planes(canvas, scene, case, sensed),

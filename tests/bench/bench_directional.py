@@ -9,14 +9,14 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from fuselog.replay.distributions import bingham
-from fuselog.replay.distributions.bingham import Bingham, make_bingham
-from fuselog.replay.estimators.directional.bingham import (
+from fuselog.replay.families.directional.bingham import (
     BinghamNoise,
     Steps,
     make_steps,
     run_bingham_filter,
 )
+from fuselog.replay.families.directional.distributions import bingham
+from fuselog.replay.families.directional.distributions.bingham import Bingham, make_bingham
 from tests.bench.timing import median_seconds, seconds
 
 REVERSE = np.eye(4)[::-1]

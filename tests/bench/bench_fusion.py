@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from fuselog.replay.estimators.networks.covariance_intersection import fuse
+from fuselog.replay.families.networks.covariance_intersection import fuse
 
 PAIRS, THEIRS, REPEATS = 10_000, 300, 5
 TOLERANCE = 1e-6

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from fuselog.recorders.models.optical import line_of_sight
-from fuselog.replay.estimators.localization import optical
-from fuselog.replay.estimators.localization.optical import Scene
+from fuselog.recorders.families.los.models import line_of_sight
+from fuselog.replay.families.los import localization as optical
+from fuselog.replay.families.los.localization import Scene
 from tests.bench.timing import seconds
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"

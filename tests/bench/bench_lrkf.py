@@ -26,10 +26,10 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
 from fuselog.pipeline.runs.recorded import record_ensemble
-from fuselog.recorders.models.reactor import react
+from fuselog.recorders.families.sampling.reactor import react
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
-from fuselog.replay.sampling import Samples, parse_sampling
+from fuselog.replay.inference.sampling import Samples, parse_sampling
 from tests.bench.reference.reactor import compiled_c
 
 STEP_S, PROCESS, PRESSURE = 0.1, 1e-5, 0.1

@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fuselog.pipeline.runs.recorded import record_ensemble
+from fuselog.recorders.families.directional.headings import equal_sigmas
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
-from fuselog.recorders.models.headings import equal_sigmas
 from fuselog.recorders.models.planar import wrap_angle
 from fuselog.recorders.recording import Recording, simulation_stamps_ns
-from fuselog.replay.distributions import bingham
-from fuselog.replay.distributions.bingham import Bingham, make_bingham
-from fuselog.replay.distributions.wrapped_normal import WrappedNormal
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.families.directional.distributions import bingham
+from fuselog.replay.families.directional.distributions.bingham import Bingham, make_bingham
+from fuselog.replay.families.directional.distributions.wrapped_normal import WrappedNormal
 from tests.bench.columns import Floats, column, copied, offsets, offsets_of, prior, stamps_ns
 from tests.bench.loops import Call, calls_of
 from tests.bench.reference import bingham as bingham_reference

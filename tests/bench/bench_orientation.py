@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
-from fuselog.recorders.models.inertial import product
+from fuselog.recorders.models.inertial import product, triad
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
-from fuselog.replay.estimators.orientation.complementary import HALF
-from fuselog.replay.estimators.orientation.triad import triad
+from fuselog.replay.families.directional.orientation.complementary import HALF
 from tests.bench.timing import median_seconds, seconds
 
 COUNT, STEP_NS, THEIRS = 100_000, 10_000_000, 500

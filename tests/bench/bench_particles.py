@@ -20,7 +20,7 @@ from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
 from fuselog.pipeline.runs.recorded import record_ensemble
-from fuselog.recorders.models.vehicles import noise_moments, turn
+from fuselog.recorders.families.vehicles.models import noise_moments, turn
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource

@@ -16,7 +16,9 @@ from scipy.stats import chi2
 from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS
 from fuselog.replay.engine.streams.blocks import gather
-from fuselog.replay.estimators.tracking.gaussian_mixture_phd import (
+from fuselog.replay.families.sets.judging.distances import gospa
+from fuselog.replay.families.sets.judging.errors import CUTOFF_M, set_errors
+from fuselog.replay.families.tracking.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
     no_components,
@@ -24,9 +26,7 @@ from fuselog.replay.estimators.tracking.gaussian_mixture_phd import (
     settings_of,
 )
 from fuselog.replay.judging.errors.truths import Truths
-from fuselog.replay.judging.sets.distances import gospa
-from fuselog.replay.judging.sets.errors import CUTOFF_M, set_errors
-from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
+from tests.replay.families.tracking.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS = 6
 REPEATS = 5

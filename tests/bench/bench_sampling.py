@@ -9,8 +9,8 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from fuselog.replay.sampling import SetName, cached_set, lcd_samples
-from fuselog.replay.sampling.cache import read_set, write_sets
+from fuselog.replay.inference.sampling import SetName, cached_set, lcd_samples
+from fuselog.replay.inference.sampling.cache import read_set, write_sets
 from tests.bench.timing import median_seconds
 
 # (N, L): CPU seconds per start in the sheet's table; "<.01" is written as .01.

@@ -3,8 +3,8 @@
 import numpy as np
 from sklearn.metrics import roc_curve
 
-from fuselog.replay.estimators.biometrics.pairs import RULES, normalise
-from fuselog.replay.judging.consistency.verification import Floats, genuine_accept_at, roc
+from fuselog.replay.families.biometrics.pairs import RULES, normalise
+from fuselog.replay.families.biometrics.verification import Floats, genuine_accept_at, roc
 from tests.bench.timing import median_seconds
 
 USERS, MATCHERS = 517, 4

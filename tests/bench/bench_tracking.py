@@ -15,19 +15,19 @@ from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS
 from fuselog.replay.engine.streams.blocks import Block, gather, merge_events
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.estimators.tracking.scan_sensors import KINDS
-from fuselog.replay.estimators.tracking.scans import scans_of
-from fuselog.replay.estimators.tracking.targets import targets_of
-from fuselog.replay.estimators.tracking.tracker import (
+from fuselog.replay.families.tracking.association.scans import Scans
+from fuselog.replay.families.tracking.association.tracking import track_scans
+from fuselog.replay.families.tracking.association.tracks import Tracks, no_tracks
+from fuselog.replay.families.tracking.scan_sensors import KINDS
+from fuselog.replay.families.tracking.scans import scans_of
+from fuselog.replay.families.tracking.targets import targets_of
+from fuselog.replay.families.tracking.tracker import (
     TrackerParameters,
     find_sensors,
     settings_of,
     tracker_of,
 )
-from fuselog.replay.inference.association.scans import Scans
-from fuselog.replay.inference.association.tracking import track_scans
-from fuselog.replay.inference.association.tracks import Tracks, no_tracks
-from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
+from tests.replay.families.tracking.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS, REPEATS = 3, 5
 DETECTION, CLUTTER_PER_M2, GATE = 0.9, 3.0 / FIELD_M**2, 0.99

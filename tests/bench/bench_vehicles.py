@@ -19,7 +19,7 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
 from fuselog.pipeline.runs.recorded import record_ensemble
-from fuselog.recorders.models.vehicles import noise_moments, turn
+from fuselog.recorders.families.vehicles.models import noise_moments, turn
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource

@@ -271,19 +271,19 @@ def _ulog(folder: Path) -> None:
 
 
 def _ais(folder: Path) -> None:
-    from tests.recorders.test_ais import SMALL, table
+    from tests.recorders.families.tracking.test_ais import SMALL, table
 
     table(folder, SMALL)
 
 
 def _autoferry(folder: Path) -> None:
-    from tests.recorders.test_autoferry import write
+    from tests.recorders.families.tracking.test_autoferry import write
 
     write(folder)
 
 
 def _broad(folder: Path) -> None:
-    from tests.recorders.test_broad import write
+    from tests.recorders.families.directional.test_broad import write
 
     write(folder / "trial.hdf5")
 
@@ -296,7 +296,7 @@ def _mrclam(folder: Path) -> None:
 
 
 def _scores(folder: Path) -> None:
-    from tests.recorders.test_biometrics import write
+    from tests.recorders.families.biometrics.test_biometrics import write
 
     for name in ("face", "finger"):
         write(folder, name, np.eye(3) + 0.1)
@@ -305,7 +305,7 @@ def _scores(folder: Path) -> None:
 
 
 def _sounds(folder: Path) -> None:
-    from tests.recorders.test_sound_recordings import PLACES, samples_of, write
+    from tests.recorders.families.acoustic.test_sound_recordings import PLACES, samples_of, write
 
     for name in PLACES:
         write(folder / name, samples_of(name))

@@ -15,13 +15,13 @@ from typing import Any
 import click
 import numpy as np
 
+from fuselog.pipeline.families.los.moving import unknowns
 from fuselog.pipeline.runs.experiment import Experiment, load_experiment
 from fuselog.pipeline.runs.inputs import load_scenario, shipped
-from fuselog.pipeline.studies.optical.moving import unknowns
+from fuselog.recorders.families.los.moving import MovingOpticalParameters
 from fuselog.recorders.log import RunMetadata
 from fuselog.recorders.parameters import merge
 from fuselog.recorders.recording import Recording, import_run, record_run
-from fuselog.recorders.simulators.moving_optical import MovingOpticalParameters
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 # Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive

@@ -31,6 +31,32 @@ def test_the_picture_of_the_house_is_what_is_checked() -> None:
     assert set(rooms) == {path.parent.name for path in ROOT.glob("replay/*/__init__.py")}
 
 
+def test_families_are_the_same_in_all_rooms_and_no_part_of_the_core_may_import_one() -> None:
+    rooms = ("pipeline", "recorders", "replay")
+    named = [
+        {each.parent.name for each in (ROOT / room / "families").glob("*/__init__.py")} for room in rooms
+    ]
+    assert named[0] == named[1] == named[2]
+    (contract,) = [
+        each for each in PYPROJECT["tool"]["importlinter"]["contracts"] if each["type"] == "forbidden"
+    ]
+    parts = {
+        f"fuselog.{room}.{each.stem}"
+        for room in rooms
+        for each in (ROOT / room).glob("[a-z]*")
+        if each.suffix == ".py" or (each / "__init__.py").exists()
+    }
+    families = {f"fuselog.{room}.families" for room in rooms}
+    assert {*contract["forbidden_modules"]} == families
+    assert {*contract["source_modules"]} == parts - families
+
+
+def test_the_groups_of_entry_points_are_those_that_are_told() -> None:
+    design = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    told = re.findall(r"`(fuselog\.\w+)`(?=[^|\n]*\| [a-z])", design)
+    assert {*PYPROJECT["project"]["entry-points"]} <= {*told}
+
+
 @pytest.mark.parametrize(
     "name", ["README.md", "CONTRIBUTING.md", "docs/design.md", ".pre-commit-config.yaml"]
 )

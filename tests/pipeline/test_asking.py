@@ -9,7 +9,7 @@ import fuselog as fl
 from fuselog.pipeline.command_line.process import main
 from fuselog.pipeline.logs.constraints import ConstraintParameters
 from fuselog.pipeline.runs.experiment import Experiment, Study
-from fuselog.recorders.importers.biometrics import Matchers
+from fuselog.recorders.families.biometrics.importer import Matchers
 from fuselog.recorders.importers.ros.mapping import Mapping
 from fuselog.recorders.importers.tables.mapping import LogMapping
 from fuselog.recorders.parameters import describe

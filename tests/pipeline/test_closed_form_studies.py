@@ -9,13 +9,16 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm, t
 
+from fuselog.pipeline.families.biometrics.sequential import Drawn, Options, probes_of
+from fuselog.pipeline.families.los.moving import _measure
+from fuselog.pipeline.families.networks.study import network_table, traces_of_equation_17
+from fuselog.pipeline.families.vehicles import scaling
+from fuselog.pipeline.families.vehicles.cases import score_set
+from fuselog.pipeline.families.vehicles.scaling import growth_of
 from fuselog.pipeline.output.expressions import Values, evaluate, formatted
 from fuselog.pipeline.output.numbers import exactly
 from fuselog.pipeline.output.results import Outcome
-from fuselog.pipeline.studies.biometrics.sequential import Drawn, Options, probes_of
 from fuselog.pipeline.studies.navigation import imu_grades
-from fuselog.pipeline.studies.networks.networks import network_table, traces_of_equation_17
-from fuselog.pipeline.studies.optical.moving import _measure
 from fuselog.pipeline.studies.toolkit.repetitions import (
     by_repetition,
     mean_interval,
@@ -24,9 +27,6 @@ from fuselog.pipeline.studies.toolkit.repetitions import (
     root_mean_square,
     worst_deviation,
 )
-from fuselog.pipeline.studies.vehicles import scaling
-from fuselog.pipeline.studies.vehicles.cases import score_set
-from fuselog.pipeline.studies.vehicles.scaling import growth_of
 from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.streams.sources import MemorySource
 from tests.goldens import keeping

@@ -761,7 +761,7 @@ def test_a_view_opens_at_the_moment_that_a_replay_names(
         return draw_case(scene.cases[0])
 
     monkeypatch.setattr("fuselog.replay.timeline.viewer.screenshot", picture)
-    monkeypatch.setattr("fuselog.replay.timeline.families.landmarks.draw_cases", draw_cases)
+    monkeypatch.setattr("fuselog.replay.timeline.landmarks.draw_cases", draw_cases)
     for name in ("ekf", "ukf"):
         moment = worst[name]
         shown = fuselog("view", "est.mcap", "--at", f"worst:{name}", "--screenshot", "a.png")

@@ -14,7 +14,7 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.deploying.certificate import deepest_stack
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.estimators.models.reactor import REACTOR
+from fuselog.replay.families.sampling.reactor import REACTOR
 from tests.claims.pages import DEPLOYED
 from tests.deployed.building import (
     COMPILERS,

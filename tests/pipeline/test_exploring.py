@@ -28,7 +28,7 @@ from fuselog.pipeline.exploring.session import Session, open_session
 from fuselog.pipeline.exploring.sliders import SMALLER, in_words
 from fuselog.pipeline.exploring.verdict import numbers_of
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.estimators.models.landmarks import ROBOT
+from fuselog.replay.estimators.landmarks import ROBOT
 
 SURE = {"sigma_range_m": 0.03}  # of .1
 

@@ -8,14 +8,15 @@ import pandas as pd
 import pytest
 from scipy.stats import norm
 
+from fuselog.pipeline.families.biometrics import study as biometrics
+from fuselog.pipeline.families.directional import bingham, orientation, torus, torus_real
+from fuselog.pipeline.families.networks import cooperative_stress, stress
+from fuselog.pipeline.families.ranging.study import Reference, mean_nis
+from fuselog.pipeline.families.sampling import extended_target, reactor
+from fuselog.pipeline.families.sampling.linearization import REFERENCE
+from fuselog.pipeline.families.sampling.lrkf_dimension import RATED, _measure_moments
 from fuselog.pipeline.output.results import Outcome
-from fuselog.pipeline.studies.biometrics import biometrics
-from fuselog.pipeline.studies.navigation import orientation, outages
-from fuselog.pipeline.studies.networks import cooperative_stress, stress
-from fuselog.pipeline.studies.ranging.ranging import Reference, mean_nis
-from fuselog.pipeline.studies.sampling import bingham, extended_target, reactor, torus, torus_real
-from fuselog.pipeline.studies.sampling.linearization import REFERENCE
-from fuselog.pipeline.studies.sampling.lrkf_dimension import RATED, _measure_moments
+from fuselog.pipeline.studies.navigation import outages
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.sources import MemorySource

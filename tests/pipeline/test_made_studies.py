@@ -8,18 +8,20 @@ import pandas as pd
 import pytest
 from scipy.stats import skew
 
+from fuselog.pipeline.families.acoustic import study as acoustic
+from fuselog.pipeline.families.acoustic.cases import Mode
+from fuselog.pipeline.families.los import printed
+from fuselog.pipeline.families.los import study as los
+from fuselog.pipeline.families.los.cases import ALONE, BLIND, JOINT
+from fuselog.pipeline.families.sets import error_bounds, set_filter, set_membership
+from fuselog.pipeline.families.tracking import ais, autoferry, crossing
+from fuselog.pipeline.families.tracking.study import means_of, nis_metrics
+from fuselog.pipeline.families.vehicles import scaling
+from fuselog.pipeline.families.vehicles import study as vehicles
+from fuselog.pipeline.families.vehicles.cases import Scores
 from fuselog.pipeline.output.results import Outcome
-from fuselog.pipeline.studies.acoustic import acoustic
-from fuselog.pipeline.studies.acoustic.cases import Mode
-from fuselog.pipeline.studies.optical import los, printed
-from fuselog.pipeline.studies.optical.cases import ALONE, BLIND, JOINT
-from fuselog.pipeline.studies.sets import error_bounds, set_filter, set_membership
-from fuselog.pipeline.studies.tracking import ais, autoferry, crossing
-from fuselog.pipeline.studies.tracking.tracking import means_of, nis_metrics
-from fuselog.pipeline.studies.vehicles import scaling, vehicles
-from fuselog.pipeline.studies.vehicles.cases import Scores
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.replay.judging.sets.evaluation import JudgedSets
+from fuselog.replay.families.sets.judging.evaluation import JudgedSets
 
 S = 10**9
 

@@ -139,7 +139,7 @@ def test_ours_are_made_as_those_of_others() -> None:
     for name in set(available("estimators")) - {"exec", "lib"}:
         bind = load("estimators", name, fl.Estimator).bind
         makers.add(getattr(bind, "func", bind).__module__)
-    nine_axes = "fuselog.replay.estimators.orientation.magnetometers"
+    nine_axes = "fuselog.replay.families.directional.orientation.magnetometers"
     assert makers == {
         "fuselog.replay.engine.api.binding",
         "fuselog.replay.inference.estimators",

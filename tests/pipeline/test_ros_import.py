@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import fuselog as fl
 from fuselog.pipeline.api.estimates import judge_estimates
 from fuselog.recorders.recording import import_log
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from tests.recorders.test_ros import START_NS, STEP_NS, Maker, Sent, imported, refusal, write_bag
 from tests.replay.timeline.test_timeline import read
 

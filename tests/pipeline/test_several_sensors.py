@@ -16,7 +16,7 @@ from fuselog.pipeline.exploring.session import Session
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log.streams import empty_stream
 from fuselog.recorders.parameters import parse_settings
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.ensembles import Ensemble

@@ -10,23 +10,20 @@ import pandas as pd
 import pytest
 from scipy.stats import t
 
+from fuselog.pipeline.families.acoustic import recordings, sequence
+from fuselog.pipeline.families.biometrics import sequential
+from fuselog.pipeline.families.directional import orientation, torus, torus_real
+from fuselog.pipeline.families.los import moving
+from fuselog.pipeline.families.networks import cooperative, cooperative_stress, quad_inertial, stress
+from fuselog.pipeline.families.networks import study as networks
+from fuselog.pipeline.families.ranging import study as ranging
+from fuselog.pipeline.families.sampling import extended_target, lrkf_dimension, reactor
+from fuselog.pipeline.families.sets import set_filter, set_membership
+from fuselog.pipeline.families.tracking import autoferry, crossing
+from fuselog.pipeline.families.vehicles import scaling
+from fuselog.pipeline.families.vehicles import study as vehicles
 from fuselog.pipeline.output.charts import Chart
-from fuselog.pipeline.studies.acoustic import recordings, sequence
-from fuselog.pipeline.studies.biometrics import sequential
-from fuselog.pipeline.studies.navigation import (
-    gnss_ins,
-    imu_grades,
-    orientation,
-    outages,
-    quad_inertial,
-)
-from fuselog.pipeline.studies.networks import cooperative, cooperative_stress, networks, stress
-from fuselog.pipeline.studies.optical import moving
-from fuselog.pipeline.studies.ranging import ranging
-from fuselog.pipeline.studies.sampling import extended_target, lrkf_dimension, reactor, torus, torus_real
-from fuselog.pipeline.studies.sets import set_filter, set_membership
-from fuselog.pipeline.studies.tracking import autoferry, crossing
-from fuselog.pipeline.studies.vehicles import scaling, vehicles
+from fuselog.pipeline.studies.navigation import gnss_ins, imu_grades, outages
 from tests.pipeline.test_charts import held, same
 
 Wanted = dict[str, dict[str, Any]]

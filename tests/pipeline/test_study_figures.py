@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2, norm
 
+from fuselog.pipeline.families.acoustic import figures as acoustic
+from fuselog.pipeline.families.acoustic.cases import Mode
+from fuselog.pipeline.families.directional.bingham import error_figure
+from fuselog.pipeline.families.directional.torus import filter_figure
+from fuselog.pipeline.families.los import figures as optical
 from fuselog.pipeline.output.charts import Band, Series
-from fuselog.pipeline.studies.acoustic import figures as acoustic
-from fuselog.pipeline.studies.acoustic.cases import Mode
 from fuselog.pipeline.studies.navigation.inertial import trials_figure
-from fuselog.pipeline.studies.optical import figures as optical
-from fuselog.pipeline.studies.sampling.bingham import error_figure
-from fuselog.pipeline.studies.sampling.torus import filter_figure
-from fuselog.recorders.models.optical import ANGLES
+from fuselog.recorders.families.los.models import ANGLES
 
 RUNS = 7
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fuselog.recorders.errors import BadInput
+from fuselog.recorders.families.los.models import line_of_sight
 from fuselog.recorders.log import Stream
-from fuselog.recorders.models.optical import line_of_sight
 from fuselog.recorders.recording import Recording, record_run
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.importers.broad import _datasets
+from fuselog.recorders.families.directional.broad import _datasets
 from fuselog.recorders.importers.tables.plane import _onto_map
-from fuselog.replay.distributions.torus_mixtures import fit_wrapped_mixture
-from fuselog.replay.regions.moving_sets import from_rings
+from fuselog.replay.families.directional.distributions.torus_mixtures import fit_wrapped_mixture
+from fuselog.replay.families.sets.regions.moving_sets import from_rings
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from fuselog.recorders.log import LogWriter, make_stream, open_log, read_blocks,
 from fuselog.recorders.recording import import_run, record_run
 from fuselog.recorders.simulators.landmarks import _dead
 from fuselog.recorders.simulators.landmarks_parameters import Sensor
-from tests.recorders.test_ais import HEADER, table
+from tests.recorders.families.tracking.test_ais import HEADER, table
 
 STAMPS = st.lists(st.integers(0, 6), min_size=1, max_size=25)
 

@@ -13,7 +13,7 @@ from fuselog.pipeline.diagnosing.advice import Advice, number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters, field_of
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 Kind = Literal[
     "measurement noise",

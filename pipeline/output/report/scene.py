@@ -17,9 +17,9 @@ from fuselog.pipeline.output.report.first_run import (
 )
 from fuselog.pipeline.output.words import count
 from fuselog.recorders.log import open_log, read_streams, schemas, topics_of
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
+from fuselog.replay.engine.streams.detections import ORIGIN, detected_places
 from fuselog.replay.engine.streams.sources import LogSource
-from fuselog.replay.estimators.tracking.scans import ORIGIN, detected_places
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 
 Floats = NDArray[np.float64]

@@ -15,14 +15,14 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.models.inertial import into_body, into_plane, product, rotation
+from fuselog.recorders.models.inertial import into_body, into_plane, product, rotation, triad
 from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.states import ORIENTATION
 from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.vectors.components import components_of
 from fuselog.replay.engine.vectors.tangent import Kind
 from fuselog.replay.estimators.navigation.navigation import UNIT as CARRIED
 from fuselog.replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
-from fuselog.replay.estimators.orientation.orientation import ORIENTATION
-from fuselog.replay.estimators.orientation.triad import triad
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started
@@ -207,7 +207,7 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
 UNIT = replace(CARRIED, delay="", estimates=True)  # its own clock is the only one
 ATTITUDE = Model(
     "orientation of a body with a gyro, an accelerometer and a magnetometer",
-    {**ORIENTATION, **BIAS, **VELOCITY, **PLACE},
+    {**components_of(ORIENTATION), **BIAS, **VELOCITY, **PLACE},
     AttitudeParameters,
     (
         Sensor(

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.models.inertial import cross, into_body, into_plane
+from fuselog.recorders.models.inertial import cross, distance, into_body, into_plane
 from fuselog.recorders.models.orientation import heading
 from fuselog.recorders.models.planar import Components
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.channels import heading_variance
-from fuselog.replay.estimators.models.ranging import ANCHORS, RANGE, TAGS, distance
+from fuselog.replay.engine.streams.measurements import SPACE
+from fuselog.replay.engine.vectors.tangent import Kind
 from fuselog.replay.estimators.navigation.alignment import turn_rate
-from fuselog.replay.inference.model.model import Control, Sensor
+from fuselog.replay.inference.model.model import Control, Map, Sensor
+
+ANCHORS = Map("/anchors", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "anchor_id")
+TAGS = Map("/tags", schemas.BODY_POINT, "point_id", "position_m", SPACE, "tag_id")
+RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 
 
 def be_headed(state: Components, reference: Any, parameters: Any) -> Components:

@@ -40,8 +40,8 @@ from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import trial_parameters
 from fuselog.replay.inference.model.stage import Stage, traced_sensor
 from fuselog.replay.inference.model.validation import trial_state
-from fuselog.replay.sampling import parse_sampling
-from fuselog.replay.sampling.names import Sampling, Unscented
+from fuselog.replay.inference.sampling import parse_sampling
+from fuselog.replay.inference.sampling.names import Sampling, Unscented
 
 
 def _as_list(value: object) -> object:

@@ -34,7 +34,7 @@ from fuselog.replay.inference.linear_algebra.moments import (
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
 from fuselog.replay.inference.model.model import Motion, Sensor
 from fuselog.replay.inference.model.stage import Stage
-from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.inference.sampling.sets import SampleSets
 
 MEANS = 30  # at most so many steps to an intrinsic mean
 
@@ -44,7 +44,7 @@ class SampleMemory(NamedTuple):
     """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
-        points, weights, first, stride: see `fuselog.replay.sampling.sets.SampleSets`.
+        points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
         unsuspected: the standard deviation up to which angles are no matter, see `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) the samples' tangent vectors from the mean.

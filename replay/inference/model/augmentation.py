@@ -128,7 +128,7 @@ def check_augmentable(where: str, model: Model) -> None:
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
     """Add parameters and errors to a model's state; the model itself where there are none.
 
-    >>> from fuselog.replay.estimators.models.landmarks import ROBOT
+    >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
     ['x_m', 'y_m', 'heading_rad', 'bias_range_m']
     """

@@ -30,7 +30,7 @@ from fuselog.replay.inference.linear_algebra.moments import (
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.stage import Stage
-from fuselog.replay.sampling.resampling import choose_systematically
+from fuselog.replay.inference.sampling.resampling import choose_systematically
 
 
 class Cloud(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from fuselog.recorders.log import Topic, schemas
 from fuselog.recorders.log.planes import in_frame
 from fuselog.recorders.log.streams import computed_stream
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Function, Integers
 from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.compiling.notices import done_once
@@ -60,7 +60,7 @@ from fuselog.replay.inference.run.timing import (
     output_times,
     select_events,
 )
-from fuselog.replay.sampling.samplers import Sampler
+from fuselog.replay.inference.sampling.samplers import Sampler
 
 
 class FilterState(NamedTuple):

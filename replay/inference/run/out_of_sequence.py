@@ -47,7 +47,7 @@ from fuselog.replay.inference.run.recursion import (
     processing,
     writing_estimates,
 )
-from fuselog.replay.sampling.sets import sets_by_runs
+from fuselog.replay.inference.sampling.sets import sets_by_runs
 
 # The loop
 

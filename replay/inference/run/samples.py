@@ -7,8 +7,8 @@ from fuselog.replay.engine.arrays import Integers
 from fuselog.replay.inference.run.recursion import (
     FilterEvents,
 )
-from fuselog.replay.sampling.samplers import Sampler
-from fuselog.replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
+from fuselog.replay.inference.sampling.samplers import Sampler
+from fuselog.replay.inference.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
 
 def seeded_generators(

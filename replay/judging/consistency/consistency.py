@@ -7,7 +7,7 @@ Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 Array = NDArray[np.float64]
 CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval

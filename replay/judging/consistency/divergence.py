@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fuselog.recorders.log import Stream
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 IMPROBABLE = 1e-4  # of the sum of NIS over a window
 WINDOW = 30  # innovations, over which NIS is averaged

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 
 Floats = NDArray[np.float64]
 LAGS = 20

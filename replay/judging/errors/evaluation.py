@@ -17,7 +17,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.orientation import heading
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 from fuselog.replay.engine.streams.planes import into_plane_of
 from fuselog.replay.engine.streams.sources import Source

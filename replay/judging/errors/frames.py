@@ -7,7 +7,7 @@ import numpy as np
 
 from fuselog.recorders.log import Topic, schemas, topics_of
 from fuselog.recorders.log.planes import BODY, FRAME, body_of, frame_in_words, frame_of
-from fuselog.recorders.models.vehicles import into_frame
+from fuselog.recorders.models.planar import into_frame
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.vectors.components import Components, match_components
 from fuselog.replay.engine.vectors.tangent import truth_at

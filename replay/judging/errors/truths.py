@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 BLOCK_MESSAGES = 1 << 16
+# In the metadata of a truth: there are targets that no topic of the log has the truth of.
+COVERS, SOME_TARGETS = "covers", "some targets"
 
 
 class Doubt(NamedTuple):

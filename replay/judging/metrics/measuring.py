@@ -46,8 +46,9 @@ class Metric(Generic[Judged, State]):
 
     Attributes:
         summary: what it tells, in a line.
-        judges: `Errors` for what follows from estimates and truth, `SetErrors` for that of sets,
-            `Innovations` for what a filter says of its measurements, `Output` for all else.
+        judges: `Errors` for what follows from estimates and truth, `Innovations` for what a filter says
+            of its measurements, the type that an entry point `fuselog.judges` gives, such as
+            `SetErrors`, or `Output` for all messages.
         start: the state before anything was judged.
         add: the state after one block more; it may change the one that it is handed. The blocks of a
             run come in time.

@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
-from fuselog.replay.distributions import chi2
+from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.measurements import PLANE
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import (

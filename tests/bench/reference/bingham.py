@@ -2,7 +2,7 @@
 
 As they were before filters were made from models (issue 13), to be timed against and for nothing else.
 What a Bingham distribution is turned, predicted and updated by is not the filter's but its own, and is
-taken from `fuselog.replay.distributions`.
+taken from `fuselog.replay.families.directional.distributions`.
 """
 
 import math
@@ -13,9 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.distributions.bingham import Bingham
-from fuselog.replay.distributions.bingham_kernels import predict, turn_columns, update
 from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.families.directional.distributions.bingham import Bingham
+from fuselog.replay.families.directional.distributions.bingham_kernels import (
+    predict,
+    turn_columns,
+    update,
+)
 
 
 class Steps(NamedTuple):

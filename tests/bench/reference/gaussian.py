@@ -285,7 +285,7 @@ class SampleMemory(NamedTuple):
     """Samples of N(0, I), and what a regression at them works in.
 
     Attributes:
-        points, weights, first, stride: see `fuselog.replay.sampling.sets.SampleSets`.
+        points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
         factor: (N, N) lower factor of the covariance of state (n) and noise (N - n): the state's block
             is filled in, the noise's is given, the rest is zero.
         gain: (n, controls), of control noise.

@@ -1,7 +1,8 @@
 """Frozen reference: dead reckoning corrected by the Bingham filter, one loop over all runs.
 
 As it was before filters were made from models (issue 13), to be timed against and for nothing else. What
-a Bingham distribution is predicted and updated by is taken from `fuselog.replay.distributions`.
+a Bingham distribution is predicted and updated by is taken from
+`fuselog.replay.families.directional.distributions`.
 """
 
 import math
@@ -12,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.distributions.bingham_kernels import (
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.families.directional.distributions.bingham_kernels import (
     compose,
     compose_columns,
     integrate,
@@ -21,7 +23,6 @@ from fuselog.replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 _NS = 1e-9
 

@@ -2,7 +2,7 @@
 
 As they were before filters were made from models (issue 13), to be timed against and for nothing else.
 How wrapped normal distributions are fitted is not the filter's, and is taken from
-`fuselog.replay.distributions`.
+`fuselog.replay.families.directional.distributions`.
 """
 
 import math
@@ -13,16 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.distributions.gaussian_kernels import condition
-from fuselog.replay.distributions.wrapped_normal import WrappedNormal
-from fuselog.replay.distributions.wrapped_normal_kernels import (
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.families.directional.distributions.gaussian_kernels import condition
+from fuselog.replay.families.directional.distributions.wrapped_normal import WrappedNormal
+from fuselog.replay.families.directional.distributions.wrapped_normal_kernels import (
     TURN,
     blank_mixture,
     fit_product,
     fit_samples,
     five_samples,
 )
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from tests.bench.reference.gaussian import wrap_angle
 
 

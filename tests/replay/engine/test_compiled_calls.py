@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
-from fuselog.replay.inference.association.association import marginals
+from fuselog.replay.families.tracking.association.association import marginals
 
 
 def total(values: np.ndarray, factor: float) -> float:

@@ -7,7 +7,7 @@ import pytest
 
 import fuselog as fl
 from fuselog.recorders.log import schemas
-from fuselog.replay.estimators.models.landmarks import ROBOT
+from fuselog.replay.estimators.landmarks import ROBOT
 
 
 def nothing(*_: Any) -> None:

@@ -18,6 +18,7 @@ from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.inference.sampling.samplers import unscented
 from fuselog.replay.judging.errors.evaluation import (
     Errors,
     chi_square_interval,
@@ -26,7 +27,6 @@ from fuselog.replay.judging.errors.evaluation import (
 )
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.metrics.metrics import INNOVATION
-from fuselog.replay.sampling.samplers import unscented
 
 Floats = NDArray[np.float64]
 

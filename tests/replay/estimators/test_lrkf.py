@@ -13,15 +13,15 @@ from fuselog.recorders.models.planar import range_bearing
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
-from fuselog.replay.estimators.models.extended_target import EXTENDED_TARGET, measure
-from fuselog.replay.estimators.models.reactor import REACTOR
+from fuselog.replay.families.sampling.extended_target import EXTENDED_TARGET, measure
+from fuselog.replay.families.sampling.reactor import REACTOR
 from fuselog.replay.inference.all_methods import METHODS
 from fuselog.replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
 from fuselog.replay.inference.kalman.steps import Gaussian, Interval, Measurement
 from fuselog.replay.inference.linear_algebra.gaussian import no_innovation
 from fuselog.replay.inference.model.stage import stage_of
-from fuselog.replay.sampling import Samples, parse_sampling
-from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.inference.sampling import Samples, parse_sampling
+from fuselog.replay.inference.sampling.sets import SampleSets
 
 PARAMETERS = {"batch-reactor": {}, "extended-target": {}, "landmarks": {"duration_s": 5.0}}
 SAMPLINGS = ["ukf", "gf-25", "rukf-12", "s2kf-50", "s2kf-100:symmetric", "s2kf-25:rotation=3"]

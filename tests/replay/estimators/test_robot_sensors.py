@@ -15,7 +15,7 @@ from fuselog.recorders.models.planar import drive, wrap_angle
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
-from fuselog.replay.estimators.models.landmarks import (
+from fuselog.replay.estimators.landmarks import (
     RECKONING,
     ROBOT,
     LocalizationParameters,

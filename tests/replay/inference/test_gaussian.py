@@ -33,8 +33,8 @@ from fuselog.replay.inference.model.model import Control, Map, Model, Motion, Se
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.stage import Stage, stage_of
 from fuselog.replay.inference.run.recursion import fault_of
-from fuselog.replay.sampling.samplers import unscented
-from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.inference.sampling.samplers import unscented
+from fuselog.replay.inference.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)

@@ -11,7 +11,7 @@ from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.replay.engine.vectors.tangent import rotation_vector
 from fuselog.replay.inference.kalman.regression import regression, sample_memory
 from fuselog.replay.inference.linear_algebra.manifold import by_right_jacobian
-from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.inference.sampling.sets import SampleSets
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs

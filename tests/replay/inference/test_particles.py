@@ -27,9 +27,9 @@ from fuselog.replay.inference.all_methods import METHODS
 from fuselog.replay.inference.estimators import of_any_model
 from fuselog.replay.inference.model.model import Motion
 from fuselog.replay.inference.particles.filter import BOOTSTRAP
+from fuselog.replay.inference.sampling.resampling import choose_systematically
 from fuselog.replay.judging.metrics.measuring import Output
 from fuselog.replay.judging.metrics.metrics import PARTICLES
-from fuselog.replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs

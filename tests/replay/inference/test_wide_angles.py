@@ -10,14 +10,14 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
-from fuselog.replay.estimators.models.landmarks import ROBOT
+from fuselog.replay.estimators.landmarks import ROBOT
 from fuselog.replay.estimators.navigation.attitude import ATTITUDE
 from fuselog.replay.estimators.navigation.navigation import INERTIAL
 from fuselog.replay.inference.kalman.regression import moved_with_noise, regression, sample_memory
 from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.sampling import parse_sampling
-from fuselog.replay.sampling.sets import SampleSets
+from fuselog.replay.inference.sampling import parse_sampling
+from fuselog.replay.inference.sampling.sets import SampleSets
 
 UNIFORM_RAD, UNIFORM_AXIS_RAD = np.pi / 3**0.5, 1.33
 TURNED = (0.3, -0.2, 9.7, 0.4, -0.3, 0.8)  # force and turn rate

@@ -9,16 +9,16 @@ from fuselog.pipeline.logs.foxglove import WORLD, companions
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, schemas
 from fuselog.recorders.log.planes import FRAME, frame_of
-from fuselog.recorders.models.vehicles import into_frame
+from fuselog.recorders.models.planar import into_frame
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, record_run
 from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.families.tracking.judging.errors import target_topics
 from fuselog.replay.judging.errors.frames import pose_topic, seen_in
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.judge import Judge
-from fuselog.replay.judging.tracks.errors import target_topics
 
 SCENARIOS = {
     name for name in available("recorders") if isinstance(load("recorders", name, object), Simulator)

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.families.biometrics.models import Matcher, score_stream
 from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
-from fuselog.recorders.models.scores import Matcher, score_stream
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from tests.replay.timeline.making import logged_late

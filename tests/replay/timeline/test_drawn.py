@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from fuselog.recorders.families.los.models import direction
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.recorders.models.optical import direction
 from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.families.vehicles.timeline import SHOWN_M
 from fuselog.replay.judging.errors.evaluation import Floats
-from fuselog.replay.timeline.families.landmarks import GATED, SEEN
-from fuselog.replay.timeline.families.vehicles import SHOWN_M
+from fuselog.replay.timeline.landmarks import GATED, SEEN
 from fuselog.replay.timeline.show import show
 from tests.replay.timeline.making import (
     ESTIMATORS,

@@ -9,8 +9,8 @@ from matplotlib.colors import rgb_to_hsv
 from scipy.stats import chi2
 
 from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.families.tracking.ais_timeline import track_colours
 from fuselog.replay.timeline.drawing.canvas import PALETTE, WRONG
-from fuselog.replay.timeline.families.ais import track_colours
 from fuselog.replay.timeline.show import Drawing
 from tests.replay.timeline.made_runs import SECOND, own, samples, scores, sets, vessels
 from tests.replay.timeline.making import ESTIMATORS, columns, drawn, of_both, record

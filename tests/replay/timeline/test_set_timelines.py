@@ -8,9 +8,9 @@ from fuselog.recorders.recording import record_run
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import memory_source
+from fuselog.replay.families.networks.timeline import ARRIVED, LOST
+from fuselog.replay.families.sets.judging.regions import areas_of, rings_of
 from fuselog.replay.judging.judge import Judge
-from fuselog.replay.judging.sets.regions import areas_of, rings_of
-from fuselog.replay.timeline.families.networks import ARRIVED, LOST
 from fuselog.replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read, told
 

@@ -39,7 +39,7 @@ from fuselog.replay.judging.errors.evaluation import Errors, chi_square_interval
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
 from fuselog.replay.timeline.drawing.plane import ellipses
-from fuselog.replay.timeline.families.landmarks import GATED
+from fuselog.replay.timeline.landmarks import GATED
 from fuselog.replay.timeline.moments import read_moments, worst_at
 from fuselog.replay.timeline.show import Drawing, show
 from fuselog.replay.timeline.sinks import open_recording

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fuselog.recorders.models import acoustic, optical
+from fuselog.recorders.families.acoustic import models as acoustic
+from fuselog.recorders.families.los import models as optical
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.tracing import traced
 from fuselog.replay.tracing.functions import Derivative
@@ -345,8 +346,8 @@ MODELS = [
     ("planar.range_bearing((x[0], x[1], x[2]), (x[3], x[4]))", 5, 2),
     ("(planar.wrap_angle(x[0]),)", 1, 1),
     ("vehicles.turn((x[0], x[1], x[2], x[3]), x[4], 0.7)", 5, 4),
-    ("vehicles.into_frame((x[0], x[1], x[2]), (x[3], x[4]))", 5, 2),
-    ("vehicles.out_of_frame((x[0], x[1], x[2]), (x[3], x[4]))", 5, 2),
+    ("planar.into_frame((x[0], x[1], x[2]), (x[3], x[4]))", 5, 2),
+    ("planar.out_of_frame((x[0], x[1], x[2]), (x[3], x[4]))", 5, 2),
     ("vehicles.noise_moments(x[0], x[1])", 2, 3),
     ("constant_velocity.noise_moments(x[0], x[1])", 2, 3),
     ("reactor.react((x[0], x[1]), x[2])", 3, 2),
@@ -408,7 +409,7 @@ def test_models_agree_at_zero_rates_and_half_turns():
     points = np.array(SPECIAL)
     compiled, plain = by_compiler(models(), points), by_python(models(), points)
     names = [call.split("(")[0] for call, _, _ in MODELS]
-    for name in ("planar.drive", "vehicles.turn", "vehicles.out_of_frame", "headings.turn_together"):
+    for name in ("planar.drive", "vehicles.turn", "planar.out_of_frame", "headings.turn_together"):
         k = names.index(name)
         expected = np.array([differences(models()[k].function.function, x) for x in points])
         assert_allclose(compiled[k], plain[k], rtol=1e-12, atol=1e-12, err_msg=name)

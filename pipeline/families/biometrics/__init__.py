@@ -1,0 +1,1 @@
+"""Studies biometric scores: fusion, and verification in sequence; begin with `study`."""

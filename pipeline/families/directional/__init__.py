@@ -1,0 +1,1 @@
+"""Studies axes, orientations and headings on the torus; begin with `bingham`."""

@@ -1,0 +1,1 @@
+"""Studies networks, robots and units that share estimates; begin with `study`."""

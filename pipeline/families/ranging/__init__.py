@@ -1,0 +1,1 @@
+"""Studies ultra-wideband ranges; begin with `study`."""

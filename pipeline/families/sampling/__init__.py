@@ -1,0 +1,1 @@
+"""Studies samples and the systems of the S2KF paper; begin with `reactor`."""

@@ -1,0 +1,141 @@
+"""Takes bounds of a robot's errors from the other robots of its log: their truth says theirs.
+
+So nothing is chosen by the truth of the robot that is judged. Channels state what is found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.families.sets.judging.filter_evaluation import POSE, odometry_error
+from fuselog.replay.families.sets.regions.frames import ERRORS
+from fuselog.replay.families.sets.regions.moving_sets import Growth, odometry_of
+
+Floats = NDArray[np.float64]
+
+# Spans over which odometry is compared with the truth; those up to SHORT_S make the bound's offset.
+SPANS_S = (0.25, 1.0, 2.0, 5.0, 10.0, 20.0)
+SHORT_S = 2.0
+SPAN_STEP_S = 0.5
+
+
+class BoundOptions(Parameters):
+    """States how bounds follow from errors.
+
+    Attributes:
+        margin: odometry's bound is its largest error times this.
+        bearing_quantile: a bearing's bound is what this share of errors stays below, since a
+            misidentified landmark is off by any angle.
+    """
+
+    margin: PositiveFloat = 1.2
+    bearing_quantile: Annotated[float, Field(gt=0, le=1)] = 0.999
+
+
+@dataclass(frozen=True)
+class RobotErrors:
+    """Holds one robot's errors: bearings and differences (n,); odometry, largest by span (spans, 2)."""
+
+    bearing_rad: Floats
+    relative_rad: Floats
+    odometry: Floats
+
+
+def state_bounds(
+    sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
+) -> list[MemorySource]:
+    """State in each robot's channels the bounds that the others keep in all runs.
+
+    Raises BadInput where fewer than two robots have odometry, bearings and truth.
+    """
+    leaves = ("odometry", "range_bearing", "truth")
+    first = sources[0].streams
+    prefixes = [topic.removesuffix("/odometry") for topic in first if topic.endswith("/odometry")]
+    prefixes = [each for each in prefixes if all(f"{each}/{leaf}" in first for leaf in leaves)]
+    if len(prefixes) < 2 or "/landmarks" not in first:
+        raise BadInput(
+            f"{sources[0].name}: the bounds of each robot are taken from the others: two robots or "
+            "more with "
+            "odometry, range_bearing and truth are needed, and /landmarks; "
+            f"there are {len(prefixes)} such robots"
+        )
+    found = {each: [robot_errors(source, each, gap_limit_s) for source in sources] for each in prefixes}
+    stated: dict[str, dict[str, str]] = {}
+    for prefix in prefixes:
+        others = [errors for each, runs in found.items() if each != prefix for errors in runs]
+        for leaf, bounds in zip(leaves, _bounds(others, options), strict=False):
+            stated[f"{prefix}/{leaf}"] = {name: repr(value) for name, value in bounds.items()}
+    return [
+        replace(
+            source,
+            streams={
+                topic: replace(stream, metadata={**stream.metadata, **stated.get(topic, {})})
+                for topic, stream in source.streams.items()
+            },
+        )
+        for source in sources
+    ]
+
+
+def _bounds(
+    others: Sequence[RobotErrors], options: BoundOptions
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return what the channels of odometry and of bearings state."""
+    largest = options.margin * np.max([errors.odometry for errors in others], axis=0)
+    spans_s = np.array(SPANS_S)
+    offset = largest[spans_s <= SHORT_S].max(axis=0)
+    rate = ((largest - offset) / spans_s[:, None]).max(axis=0).clip(min=0.0)
+    position, heading = (Growth(float(offset[k]), float(rate[k])) for k in range(2))
+
+    def quantile(parts: Sequence[Floats]) -> float:
+        return float(np.quantile(np.concatenate(parts), options.bearing_quantile))
+
+    return dict(zip(ERRORS, (*position, *heading), strict=True)), {
+        "bound_rad": quantile([errors.relative_rad for errors in others]),
+        "bearing_bound_rad": quantile([errors.bearing_rad for errors in others]),
+    }
+
+
+def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> RobotErrors:
+    """Return how far one robot's bearings and odometry were off, where its truth is known."""
+    seen, truth = source.streams[f"{prefix}/range_bearing"], source.streams[f"{prefix}/truth"]
+    landmarks, driven = source.streams["/landmarks"], source.streams[f"{prefix}/odometry"]
+    error, look = _bearing_errors(seen, landmarks, truth, gap_limit_s)
+    first, second = np.nonzero(np.triu(look[:, None] == look[None, :], 1))
+    odometry = odometry_of(
+        driven.publish_time_ns, np.stack([driven["forward_mps"], driven["turn_radps"]], axis=1)
+    )
+    largest = []
+    for span_s in SPANS_S:
+        begin = np.arange(
+            driven.publish_time_ns[0], driven.publish_time_ns[-1] - span_s * 1e9, SPAN_STEP_S * 1e9
+        ).astype(np.int64)
+        end = begin + round(span_s * 1e9)
+        poses = [truth_at(truth, stamps, list(POSE.values()), gap_limit_s) for stamps in (begin, end)]
+        largest.append(np.nanmax(odometry_error(odometry, begin, end, *poses), axis=0, initial=0.0))
+    relative = np.abs(wrap_angle(error[first] - error[second]))
+    return RobotErrors(np.abs(error), relative, np.array(largest))
+
+
+def _bearing_errors(
+    seen: Stream, landmarks: Stream, truth: Stream, gap_limit_s: float
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Compute errors (n,) of bearings to mapped landmarks where truth is known, and their stamps."""
+    numbers = landmarks["landmark_id"]
+    order = np.argsort(numbers)
+    row = np.searchsorted(numbers, seen["target_id"], sorter=order).clip(max=len(numbers) - 1)
+    pose = truth_at(truth, seen.publish_time_ns, list(POSE.values()), gap_limit_s)
+    away = landmarks["position_m"][order[row]][:, :2] - pose[:, :2]
+    error = wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2] - seen["bearing_rad"])
+    known = (numbers[order[row]] == seen["target_id"]) & np.isfinite(error)
+    return error[known], seen.publish_time_ns[known]

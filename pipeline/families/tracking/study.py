@@ -1,0 +1,132 @@
+"""Shares what studies of trackers need: tracks judged by run, and differences of trackers.
+
+Tracks are judged as `fuselog.replay.families.tracking.judging.errors` says, at instants that
+are the same for all trackers.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from fuselog.pipeline.output.results import Outcome
+from fuselog.pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.families.tracking.judging.distances import trajectory_gospa
+from fuselog.replay.families.tracking.judging.errors import (
+    CUTOFF_M,
+    PERIOD_S,
+    Judged,
+    TracksAt,
+    as_trajectories,
+    figures_of_whole_tracks,
+    near_tracks,
+    track_errors,
+    track_figures,
+    tracks_at,
+)
+from fuselog.replay.judging.errors.evaluation import Innovations
+
+# The figures whose differences are told.
+COMPARED = (
+    *("gospa_m", "localisation_m2", "switches", "target1_rmse_m", "target1_coverage"),
+    *("target2_rmse_m", "target2_coverage", "target5_rmse_m"),
+)
+# What trajectory GOSPA takes for a target that goes on with another track: half a target missed.
+SWITCH_PENALTY_M = 10.0
+
+
+def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream, Stream]:
+    """Return how many tracks an estimator tells of in every scan of a run, and these tracks.
+
+    Raises BadInput where it is no tracker.
+    """
+    leaves = [f"/estimates/{label}/{leaf}" for leaf in ("set", "track")]
+    if not all(leaf in outputs for leaf in leaves):
+        raise BadInput(
+            f"estimator {label} gives no tracks, and this study compares trackers; leave it out"
+        )
+    sizes, tracks = (outputs[leaf].of_run(run) for leaf in leaves)
+    return sizes, tracks
+
+
+def figures_of(
+    tracked: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
+) -> dict[str, float]:
+    """Compute what the tracks of a run are worth.
+
+    If truths cover some targets, figures of whole tracks leave out those that are never within the
+    cutoff of a target. A track's length is the time from its first to its last instant, and trajectory
+    GOSPA is divided by the root of the number of instants, so that it is as large as GOSPA.
+
+    Args:
+        tracked: the tracks at k instants.
+        truths: (targets, k, 2), where the targets are at these, in m; NaN where one is not there.
+        unreferenced_m: see `Judged`.
+
+    Returns:
+        The figures by name.
+    """
+    is_partial = np.isfinite(unreferenced_m)
+    tracks = near_tracks(tracked, truths)[0] if is_partial else as_trajectories(tracked)
+    lengths_s = [np.ptp(np.flatnonzero(there)) * PERIOD_S for there in np.isfinite(tracks[..., 0])]
+    whole = trajectory_gospa(tracks, truths, CUTOFF_M, SWITCH_PENALTY_M)
+    errors = track_errors(tracked, truths, unreferenced_m=unreferenced_m)
+    return track_figures(errors) | {
+        "tracks": float(len(tracks)),
+        "track_length_s": float(np.mean(lengths_s)) if lengths_s else float("nan"),
+        "trajectory_gospa_m": whole.total / np.sqrt(truths.shape[1]),
+        **figures_of_whole_tracks(tracked, truths, unreferenced_m),
+    }
+
+
+def table_of(
+    outputs: Mapping[str, Ragged],
+    labels: Sequence[str],
+    runs: Mapping[str, Judged],
+    delay_s: float = 0.0,
+) -> pd.DataFrame:
+    """Tabulate by estimator and run; what was told later than `delay_s` before is not known."""
+    rows = []
+    for label in labels:
+        for run, (name, at) in enumerate(runs.items()):
+            tracked = tracks_at(*sets_of(outputs, label, run), at.time_ns, round(delay_s * 1e9))
+            rows.append({"estimator": label, "run": name, **figures_of(tracked, *at[1:])})
+    return pd.DataFrame(rows)
+
+
+def means_of(table: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Return the means over the runs, by estimator."""
+    means: Any = table.drop(columns="run").groupby("estimator", sort=False).mean()
+    return {str(label): row.to_dict() for label, row in means.iterrows()}
+
+
+def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
+    """Mean NIS per measured component, by estimator and sensor: of tracks' likeliest detections."""
+    return {
+        f"{each.estimator}.nis_per_component.{each.case}": float(each.squared.sum() / each.degrees.sum())
+        for each in innovations
+        if each.degrees.sum()
+    }
+
+
+def measure_changes(
+    table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
+) -> None:
+    """Measure by how much figures of one estimator exceed those of another, of pairs that were run."""
+    for label, other in pairs:
+        if {label, other} <= set(table["estimator"]):
+            for quantity in [name for name in COMPARED if name in table]:
+                change = difference(table, quantity, label, other)
+                of = "-".join(filter(None, (other, case)))
+                outcome.measure(f"{label}.change_in_{quantity}.{of}", *change)
+
+
+def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
+    """Compute by how much a quantity of one estimator is above that of another, over the runs."""
+    by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
+    return mean_interval((by_run[label] - by_run[other]).tolist())

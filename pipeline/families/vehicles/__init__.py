@@ -1,0 +1,1 @@
+"""Studies cooperative vehicles: Zhang et al. 2016; begin with `study`."""

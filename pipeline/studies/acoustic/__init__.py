@@ -1,4 +1,0 @@
-"""Studies sounds and shots: Osborne et al. 2014, recordings, sequences.
-
-Begin with `acoustic`.
-"""

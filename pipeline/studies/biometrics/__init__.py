@@ -1,1 +1,0 @@
-"""Studies biometric scores: fusion, and verification in sequence; begin with `biometrics`."""

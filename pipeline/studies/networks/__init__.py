@@ -1,1 +1,0 @@
-"""Studies sensor networks and robots that share estimates; begin with `networks`."""

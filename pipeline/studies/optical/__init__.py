@@ -1,1 +1,0 @@
-"""Studies lines of sight: Belfadel et al. 2014, and moving sensors; begin with `los`."""

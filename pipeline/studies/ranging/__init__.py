@@ -1,1 +1,0 @@
-"""Studies ultra-wideband ranges; begin with `ranging`."""

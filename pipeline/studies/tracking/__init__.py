@@ -1,1 +1,0 @@
-"""Studies trackers: vessels, ferries, targets that cross; begin with `tracking`."""

@@ -1,1 +1,0 @@
-"""Studies cooperative vehicles: Zhang et al. 2016; begin with `vehicles`."""

@@ -1,0 +1,1 @@
+"""Records shots and sounds that arrays of microphones hear; begin with `simulator`."""

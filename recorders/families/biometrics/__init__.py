@@ -1,0 +1,1 @@
+"""Records scores of biometric matchers; begin with `simulator`."""

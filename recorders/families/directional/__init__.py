@@ -1,0 +1,1 @@
+"""Records axes, orientations and headings; begin with `orientation`."""

@@ -1,0 +1,1 @@
+"""Simulates networks of nodes that track a target; begin with `ispace`."""

@@ -1,0 +1,1 @@
+"""Simulates ranges of radio tags to anchors; begin with `simulator`."""

@@ -1,0 +1,1 @@
+"""Simulates relative bearings with bounded errors; begin with `simulator`."""

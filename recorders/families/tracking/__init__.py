@@ -1,0 +1,1 @@
+"""Records many targets: crossing ways, reports of vessels, ferries; begin with `crossing`."""

@@ -1,0 +1,1 @@
+"""Simulates vehicles that sensors of other vehicles see; begin with `simulator`."""

@@ -1,0 +1,32 @@
+"""Places detections of scans in the plane: of which scan each is, and where its sensor was then.
+
+A sensor that moves names the topic of its own position in the metadata of its scans, as ORIGIN.
+"""
+
+import numpy as np
+
+from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+
+ORIGIN = "origin"
+
+
+def rows_of(scan: Stream, detected: Stream) -> Integers:
+    """Return the row of each detection's scan."""
+    order = np.argsort(scan["scan_id"], kind="stable")
+    return order[np.searchsorted(scan["scan_id"][order], detected["scan_id"])]
+
+
+def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
+    """Return where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
+    if fix is None:
+        return np.zeros((len(scan), 2))
+    last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
+    return read_vectors(fix, "position_m", PLANE)[np.maximum(last, 0)]
+
+
+def detected_places(scan: Stream, detected: Stream, fix: Stream | None) -> Floats:
+    """Return where the detections are in the plane, (n, 2)."""
+    own = places_of_sensor(scan, fix)[rows_of(scan, detected)]
+    return own + read_vectors(detected, "position_m", PLANE)

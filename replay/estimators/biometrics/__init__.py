@@ -1,1 +1,0 @@
-"""Fuses biometric scores; begin with `biometrics`."""

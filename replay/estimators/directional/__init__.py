@@ -1,1 +1,0 @@
-"""Filters axes, orientations and pairs of angles; begin with `directional`."""

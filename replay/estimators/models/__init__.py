@@ -1,1 +1,0 @@
-"""Models systems for every recursive method, one file each; begin with `landmarks`."""

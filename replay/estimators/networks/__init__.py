@@ -1,1 +1,0 @@
-"""Estimates in networks of nodes and robots that share estimates; begin with `networks`."""

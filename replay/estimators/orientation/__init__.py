@@ -1,1 +1,0 @@
-"""Estimates orientation from inertial and magnetic samples; begin with `orientation`."""

@@ -1,0 +1,1 @@
+"""Locates shooters and sources of sound by arrival times; begin with `localization`."""

@@ -1,0 +1,172 @@
+"""Locates a sound by differences of its arrivals at microphones: the model `sound-source`.
+
+All differences are of one reference, whose own error they share: it is a part of the state, so that the
+differences are independent given it. A source of microphones that all are at one height is taken to be
+there, for nothing tells by how much it is above or below.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.models.inertial import distance
+from fuselog.recorders.models.planar import Components
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.streams.measurements import SPACE
+from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
+from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.start import Start, Started
+
+# A source is sought on a grid about the microphones, so many times as large as they are apart, and from
+# the best of its points on.
+SOUGHT = np.linspace(-1.5, 1.5, 21)
+BEST = 3
+ALIKE = 6  # decimals of a cost, in units of one standard deviation squared, that tell two places apart
+NEAR_M = 1e-9  # from a microphone, where no direction leads to it
+WIDER = 100.0  # of the standard deviations of what is found: a start that is worth a ten-thousandth
+
+
+class SoundSourceParameters(ModelParameters):
+    """States the air and the start.
+
+    The start is found by least squares; its standard deviation is a hundred times what these say, so
+    that it counts little beside the differences.
+
+    Attributes:
+        speed_of_sound_mps: speed of sound in the air.
+        start_sigma_m: largest standard deviation of the start, per axis.
+        height_sigma_m: standard deviation of the source's height from that of the microphones, where all
+            have one.
+    """
+
+    speed_of_sound_mps: PositiveFloat | None = None
+    start_sigma_m: PositiveFloat = 100.0
+    height_sigma_m: PositiveFloat = 0.01
+
+
+def stay(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """Keep the state: it does not move."""
+    x, y, z, reference = state
+    return x, y, z, reference
+
+
+def hear(state: Components, reference: Components, parameters: Any) -> Components:
+    """Compute how much later a sound comes at the first of two points than at the second, and errs."""
+    away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
+    return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
+
+
+def read_differences(stream: Stream) -> Floats:
+    """Read what is measured (n, 1)."""
+    return stream["difference_s"][:, None]
+
+
+def read_variances(stream: Stream) -> Floats:
+    """Return a reading's covariance (n, 1, 1)."""
+    return stream["variance_s2"][:, None, None]
+
+
+def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
+    """Return the place that fits the differences of the first stamp best, sought from all sides.
+
+    Raises BadInput where they are fewer than the coordinates that they have to tell.
+    """
+    stream, points = streams["differences"], streams[MICROPHONES.topic]
+    first = stream.take(stream.publish_time_ns == stream.publish_time_ns[:1])
+    places = dict(zip(points["landmark_id"].tolist(), points["position_m"], strict=True))
+    pairs = np.stack([first["microphone_id"], first["reference_id"]], axis=1)
+    known = np.array([pair[0] in places and pair[1] in places for pair in pairs.tolist()], bool)
+    reference = np.array([[*places[m], *places[r]] for m, r in pairs[known].tolist()]).reshape(-1, 6)
+    measured = first["difference_s"][known]
+    array = np.unique(reference.reshape(-1, 3), axis=0)
+    is_flat = len(array) > 0 and np.ptp(array[:, 2]) == 0.0
+    free = 2 if is_flat else 3
+    if len(measured) < free:
+        raise BadInput(
+            f"topic {stream.topic}: {len(measured)} differences of microphones in {MICROPHONES.topic} "
+            f"at its first stamp; {free} are needed to locate a source"
+        )
+    shared_s2 = first["reference_variance_s2"][0]
+    sigma = np.sqrt(first["variance_s2"][known] + shared_s2)
+    middle, size = array.mean(axis=0), np.linalg.norm(np.ptp(array, axis=0))
+
+    def residuals(place: Floats) -> Floats:
+        state = (*place, *middle[free:], 0.0)
+        return (hear(state, reference.T, parameters)[0] - measured) / sigma
+
+    def slopes(place: Floats) -> Floats:
+        away = np.append(place, middle[free:]) - reference.reshape(-1, 2, 3)
+        toward = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), NEAR_M)
+        return (toward[:, 0] - toward[:, 1])[:, :free] / (parameters.speed_of_sound_mps * sigma)[:, None]
+
+    grid = np.stack(np.meshgrid(*[SOUGHT] * free), axis=-1).reshape(-1, free, 1)
+    starts = middle[:free, None] + size * grid
+    costs = np.sum(residuals(np.swapaxes(starts, 0, 1)) ** 2, axis=1)
+    from scipy.optimize import least_squares  # which takes long to import
+
+    scale = np.full(free, size)
+    fits = [
+        least_squares(residuals, start[:, 0], x_scale=scale, loss="soft_l1")  # see `_settled`
+        for start in starts[np.argsort(costs.round(ALIKE), kind="stable")[:BEST]]
+    ]
+    best = min(fits, key=lambda fit: round(float(fit.cost), ALIKE))
+    place, information = _settled(residuals, slopes, best.x, float(size))
+    information = information / WIDER**2 + np.eye(free) / parameters.start_sigma_m**2
+    covariance = np.diag([0.0] * free + [parameters.height_sigma_m**2] * (3 - free) + [shared_s2])
+    covariance[:free, :free] = np.linalg.inv(information)
+    time_ns = int(first.publish_time_ns[0])
+    return Started(time_ns, np.array([*place, *middle[free:], 0.0]), covariance, HOW)
+
+
+def _settled(
+    residuals: Function, slopes: Function, place: Floats, near_m: float
+) -> tuple[Floats, Floats]:
+    """Find where a soft_l1 cost's gradient is zero, near a place (n,), and the information (n, n) there.
+
+    A search by the cost itself ends where rounding hides what is lower, at another place on another CPU.
+    Of a source that nothing tells the distance of, the gradient is zero at infinity: it stays in place.
+    """
+
+    def cost(there: Floats) -> float:
+        return float(np.sum(np.sqrt(1.0 + residuals(there) ** 2) - 1.0))
+
+    def gradient(there: Floats) -> Floats:
+        off = residuals(there)
+        return slopes(there).T @ (off / np.sqrt(1.0 + off**2))
+
+    from scipy.optimize import root  # which takes long to import
+
+    found = root(gradient, place, tol=1e-14).x
+    if np.linalg.norm(found - place) < near_m and cost(found) <= cost(place) + 10.0**-ALIKE:
+        place = found
+    weight = (1.0 + residuals(place) ** 2) ** -1.5
+    return place, (slopes(place).T * weight) @ slopes(place)
+
+
+HOW = "where its differences fit best"
+MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
+REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
+SOUND_SOURCE = Model(
+    "where a sound came from, from differences of its arrivals at microphones",
+    {"x_m": "linear", "y_m": "linear", "z_m": "linear", "reference_s": "linear"},
+    SoundSourceParameters,
+    (
+        Sensor(
+            "differences",
+            schemas.ARRIVAL_DIFFERENCE,
+            {"difference_s": "linear"},
+            hear,
+            reference=(MICROPHONES, REFERENCES),
+            read=read_differences,
+            covariance=read_variances,
+        ),
+    ),
+    Motion(stay, linear=True),
+    start=Start({}, find=find_source),
+    augmentable={"speed_of_sound_mps": "linear"},
+    takes_fixes=False,
+)

@@ -1,0 +1,1 @@
+"""Fuses biometric scores, and judges verification; begin with `estimators`."""

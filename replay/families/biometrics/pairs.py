@@ -1,0 +1,148 @@
+"""Makes pairs of probes and gallery entries: normalised scores, rules, and folds of users."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.families.biometrics.models import TOPIC, Matcher
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+
+Scorer = Callable[[Floats], Floats]
+
+
+Learner = Callable[[Floats, Booleans, np.random.Generator], Scorer]
+
+
+TANH_SCALE = 0.01
+IMPOSTORS_PER_USER = 2
+
+
+class Pairs(NamedTuple):
+    """States which comparisons are fused: probe and gallery user (n,) of each, and their fold (users,).
+
+    Without folds (None) nothing is learnt.
+    """
+
+    probe: Integers
+    gallery: Integers
+    fold: Integers | None = None
+
+
+def normalise(scores: Floats, how: str) -> Floats:
+    """Bring scores to a common scale; missing ones (NaN) stay missing.
+
+    `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
+    column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
+
+    Args:
+        scores: (users, users, matchers), NaN where missing.
+        how: the name of the normalisation.
+    """
+    match how:
+        case "z" | "tanh":
+            z = (scores - np.nanmean(scores, axis=(0, 1))) / _deviations(scores)
+            return z if how == "z" else 0.5 * (np.tanh(TANH_SCALE * z) + 1)
+        case "min-max" | "column-min-max":
+            over = (0, 1) if how == "min-max" else (0,)
+            low = np.nanmin(scores, axis=over, keepdims=True)
+            width = np.nanmax(scores, axis=over, keepdims=True) - low
+            return np.where(width > 0, (scores - low) / np.where(width > 0, width, 1.0), 0.0)
+    return scores
+
+
+def _deviations(scores: Floats) -> Floats:
+    """Compute the standard deviation (matchers,) of each matcher's scores, missing ones left out."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviations = np.nanstd(scores, axis=(0, 1), ddof=1)
+    unusable = ~(np.isfinite(deviations) & (deviations > 0))
+    if unusable.any():
+        raise BadInput(
+            f"topic {TOPIC}: the scores of matcher {np.argmax(unusable) + 1} of {len(unusable)} have a "
+            f"standard deviation of {deviations[unusable][0]:g}; leave the matcher out, or scale it"
+        )
+    return deviations
+
+
+RULES: dict[str, Callable[..., Floats]] = {
+    "mean": np.nanmean,
+    "sum": np.nansum,
+    "product": np.nanprod,
+    "minimum": np.nanmin,
+    "maximum": np.nanmax,
+    "median": np.nanmedian,
+}
+
+
+def all_pairs(users: int) -> Pairs:
+    """Return every probe with every gallery entry."""
+    return Pairs(np.repeat(np.arange(users), users), np.tile(np.arange(users), users))
+
+
+def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
+    """Draw the paper's trimmed database: genuine comparisons, two random other probes per gallery user.
+
+    The probe is the same for all matchers: one for each would inflate the results.
+    """
+    gallery = np.repeat(np.arange(users), IMPOSTORS_PER_USER)
+    step = np.argsort(rng.random((users, users - 1)), axis=1)[:, :IMPOSTORS_PER_USER] + 1
+    impostor = (gallery + step.ravel()) % users
+    return Pairs(
+        np.concatenate([np.arange(users), impostor]), np.concatenate([np.arange(users), gallery])
+    )
+
+
+def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
+    """Return the fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
+    if users < 2 * folds:
+        fewer = f", or at most {users // 2} folds" if users >= 4 else ""
+        raise BadInput(
+            f"{users} users are too few for {folds} folds; give at least {2 * folds} users{fewer}"
+        )
+    return rng.permutation(users) % folds
+
+
+def cross_validate(
+    vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
+) -> Floats:
+    """Fuse scores (n,), each learnt without the users of its gallery user's fold.
+
+    `limit` bounds how many impostor vectors are learnt from.
+
+    Args:
+        vectors: (n, m), a score of each matcher.
+        pairs: the users of each vector, and the folds of users.
+        learner: makes a fusion of the vectors that it learns from.
+        limit: how many impostor vectors are learnt from at most.
+        rng: draws these.
+    """
+    fused = np.empty(len(vectors))
+    genuine = pairs.probe == pairs.gallery
+    assert pairs.fold is not None
+    for fold in range(pairs.fold.max() + 1):
+        judged = pairs.fold[pairs.gallery] == fold
+        learnt = ~judged & (pairs.fold[pairs.probe] != fold)
+        impostors = rng.permutation(np.flatnonzero(learnt & ~genuine))[:limit]
+        rows = np.concatenate([np.flatnonzero(learnt & genuine), np.sort(impostors)])
+        fused[judged] = learner(vectors[rows], genuine[rows], rng)(vectors[judged])
+    return fused
+
+
+def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
+    """List the three factors' subsets: each modality, the k-th matcher of each modality, all, singles.
+
+    A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
+    the larger ones.
+    """
+    by_modality: dict[str, list[int]] = {}
+    for index, matcher in enumerate(matchers):
+        by_modality.setdefault(matcher.modality, []).append(index)
+    subsets = {name: indices for name, indices in by_modality.items() if len(indices) > 1}
+    if len(by_modality) > 1:
+        ranks = min(map(len, by_modality.values()))
+        if ranks > 1:
+            for rank in range(ranks):
+                subsets[f"matcher-{rank + 1}"] = [of[rank] for of in by_modality.values()]
+        subsets["all"] = list(range(len(matchers)))
+    return subsets | {matcher.name: [index] for index, matcher in enumerate(matchers)}

@@ -1,0 +1,1 @@
+"""Filters axes, orientations and pairs of angles; begin with `estimators`."""

@@ -1,0 +1,264 @@
+"""Filters axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
+
+The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
+Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in
+compiled loops, parallel over runs.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.orientation import require_unit
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.families.directional.distributions import bingham
+from fuselog.replay.families.directional.distributions.bingham import Bingham
+from fuselog.replay.families.directional.distributions.bingham_kernels import (
+    compose,
+    framed,
+    inverse,
+    local_moments,
+    predict,
+    turn_columns,
+    update,
+)
+from fuselog.replay.families.directional.distributions.gaussian_kernels import condition
+
+
+class Steps(NamedTuple):
+    """Holds the steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
+
+    A row is a prediction with a known increment u, then an update with a measurement z; a row of NaN
+    in either leaves that half of the step out.
+
+    Attributes:
+        offsets: (runs + 1,).
+        increment: unit vectors u (rows, d), the identity (1, 0, ...) where there is no control input.
+        measurement: unit vectors z (rows, d).
+    """
+
+    offsets: Integers
+    increment: Floats
+    measurement: Floats
+
+
+def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
+    """Make steps with every vector at exactly unit length.
+
+    Args:
+        offsets: (runs + 1,), where the rows of each run begin.
+        increment: known turns (rows, d), unit vectors.
+        measurement: unit vectors (rows, d), NaN for none.
+
+    Raises BadInput where a vector is neither unit nor NaN, or the numbers of rows differ.
+    """
+    if not len(increment) == len(measurement) == offsets[-1]:
+        raise BadInput(
+            f"{len(increment)} increments and {len(measurement)} measurements for {offsets[-1]} steps; "
+            "give a row of each for every step, NaN for none"
+        )
+    return Steps(offsets, _unit_or_nan(increment, "increment"), _unit_or_nan(measurement, "measurement"))
+
+
+def _unit_or_nan(x: NDArray, what: str) -> Floats:
+    missing = np.isnan(x).all(axis=-1, keepdims=True)
+    unit = require_unit(np.where(missing, np.eye(x.shape[-1])[0], x), what)
+    return np.ascontiguousarray(np.where(missing, np.nan, unit))
+
+
+class BinghamNoise(NamedTuple):
+    """Holds system noise w and measurement noise v, no batch axes, modes at or near the identity."""
+
+    system: Bingham
+    measurement: Bingham
+
+
+class Gaussian(NamedTuple):
+    """Holds Gaussian states: mean (..., d) and covariance (..., d, d)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+class GaussianNoise(NamedTuple):
+    """Holds covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
+
+    system: Floats
+    measurement: Floats
+
+
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once, allocates=False)
+
+
+def run_bingham_filter(
+    noise: BinghamNoise, state: Bingham, steps: Steps, rotations: Floats | None = None
+) -> tuple[Bingham, Bingham]:
+    """Run the recursive Bingham filter: algorithms 1 and 2.
+
+    Args:
+        noise: see there.
+        state: the distributions before the first row, batch axis (runs,).
+        steps: see there.
+        rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
+            the modes, see `fuselog.replay.engine.vectors.tangent`.
+
+    Returns:
+        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
+        fit does not converge, the run is NaN from there on and the others go on.
+    """
+    rows, d = steps.measurement.shape
+    identity = np.eye(d)[0]
+    state = Bingham(state.axes.copy(), state.concentrations.copy())
+    estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
+    _over_runs(_bingham_run)(
+        len(steps.offsets) - 1,
+        steps,
+        bingham.covariance(noise.system),
+        bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
+        state,
+        estimates,
+        _rotations(steps) if rotations is None else rotations,
+    )
+    return state, estimates
+
+
+def _rotations(steps: Steps) -> Floats:
+    rows, d = steps.measurement.shape
+    return np.empty((rows, d - 1, d - 1))
+
+
+def _bingham_run(
+    run: int,
+    steps: Steps,
+    system: NDArray,
+    inverse_noise: NDArray,
+    state: Bingham,
+    estimates: Bingham,
+    rotations: NDArray,
+) -> None:
+    axes, z = state.axes[run], state.concentrations[run]
+    d = len(z)
+    moments, local = np.empty(d), np.empty((d, d))
+    for row in range(steps.offsets[run], steps.offsets[run + 1]):
+        if not math.isnan(steps.increment[row, 0]):
+            turn_columns(axes, steps.increment[row])
+            if not predict(axes, z, system):
+                z[:] = np.nan
+        if not math.isnan(steps.measurement[row, 0]):
+            update(axes, z, inverse_noise, steps.measurement[row])
+        if math.isnan(z[0]):
+            # NaN stays: all later rows of the run are NaN as well
+            axes[:] = np.nan
+        estimates.axes[row] = axes
+        estimates.concentrations[row] = z
+        local_moments(axes, z, moments, local)
+        _store_rotations(local, rotations[row])
+
+
+def run_kalman_filter(
+    noise: GaussianNoise,
+    state: Gaussian,
+    steps: Steps,
+    rotations: Floats | None = None,
+    *,
+    rotated: bool,
+) -> tuple[Gaussian, Gaussian]:
+    """Run the paper's modified Kalman filter on R^d (section 7), which mirrors measurements.
+
+    Means are normalised.
+
+    Args:
+        noise: see there; the paper adds it as it is, wherever the state points.
+        state: the Gaussians before the first row, batch axis (runs,).
+        steps: see there.
+        rotations: as for `run_bingham_filter`.
+        rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
+
+    Returns:
+        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
+        covariance loses its definiteness is NaN from there on.
+    """
+    rows, d = steps.measurement.shape
+    state = Gaussian(state.mean.copy(), state.covariance.copy())
+    estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
+    noise = GaussianNoise(*map(np.ascontiguousarray, noise))
+    local = _rotations(steps) if rotations is None else rotations
+    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates, local)
+    return state, estimates
+
+
+def _kalman_run(
+    run: int,
+    steps: Steps,
+    noise: GaussianNoise,
+    rotated: bool,
+    state: Gaussian,
+    estimates: Gaussian,
+    rotations: NDArray,
+) -> None:
+    x, p = state.mean[run], state.covariance[run]
+    d = len(x)
+    added, frame, innovation = np.empty((d, d)), np.empty(d), np.empty(d)
+    for row in range(steps.offsets[run], steps.offsets[run + 1]):
+        if not math.isnan(steps.increment[row, 0]):
+            compose(x.copy(), steps.increment[row], x)
+            turn_columns(p, steps.increment[row])
+            turn_columns(p.T, steps.increment[row])
+            _frame(x, rotated, frame)
+            framed(noise.system, frame, added)
+            for i in range(d):
+                for j in range(d):
+                    p[i, j] += added[i, j]
+        if not math.isnan(steps.measurement[row, 0]):
+            along = 0.0
+            for i in range(d):
+                along += x[i] * steps.measurement[row, i]
+            # z and -z are one axis: take the one on the side of the state
+            side = math.copysign(1.0, along)
+            for i in range(d):
+                innovation[i] = side * steps.measurement[row, i] - x[i]
+            _frame(x, rotated, frame)
+            framed(noise.measurement, frame, added)
+            condition(x, p, innovation, added)
+            length = _length(x)
+            for i in range(d):
+                x[i] /= length
+        estimates.mean[row] = x
+        estimates.covariance[row] = p
+        inverse(x, frame)
+        framed(p, frame, added)
+        _store_rotations(added, rotations[row])
+
+
+def _store_rotations(local: NDArray, covariance: NDArray) -> None:
+    """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
+
+    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
+    """
+    t = len(covariance)
+    for i in range(t):
+        for j in range(t):
+            covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
+
+
+def _length(x: NDArray) -> float:
+    squared = 0.0
+    for i in range(len(x)):
+        squared += x[i] * x[i]
+    return math.sqrt(squared)
+
+
+def _frame(state: NDArray, rotated: bool, frame: NDArray) -> None:
+    """Fill the state scaled to unit length where `rotated`, else the identity."""
+    length = _length(state)
+    for i in range(len(state)):
+        identity = 1.0 if i == 0 else 0.0
+        frame[i] = state[i] / length if rotated else identity

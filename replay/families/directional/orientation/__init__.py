@@ -1,0 +1,1 @@
+"""Estimates orientation from inertial and magnetic samples; begin with `estimators`."""

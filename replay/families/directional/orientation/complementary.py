@@ -1,0 +1,293 @@
+"""Estimates orientation by common methods: Madgwick's, Mahony's, and Laidig and Seel's VQF.
+
+They are what filters are compared with, and tell no covariance: one is assumed. Madgwick, "An
+efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
+Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
+Automatic Control 53(5), 2008; VQF is its authors' library, as it is. Gains and parameters are the
+authors' own. Quaternions turn body vectors into east, north, up; each begins with its first sample.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.inertial import cross, into_body, into_plane, product, triad, unit
+from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.api.functions import batch, each_run
+from fuselog.replay.engine.api.inputs import Given, Messages, OneRun
+from fuselog.replay.engine.api.outputs import Estimates, Results
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.families.directional.orientation.estimators import (
+    FIELDS,
+    ORIENTATION,
+    of_inertial_samples,
+)
+from fuselog.replay.families.directional.orientation.magnetometers import with_magnetometer
+from fuselog.replay.families.directional.orientation.resting import of_nine_axes
+
+HALF = np.sqrt(0.5)
+
+
+class AssumedParameters(Parameters):
+    """States what is assumed, since the method estimates no covariance.
+
+    Attributes:
+        sigma_deg: standard deviation about each axis that is stated.
+    """
+
+    sigma_deg: PositiveFloat = 3.0
+
+    @property
+    def covariance(self) -> Floats:
+        """Return the covariance of the rotation vector, rad^2, (3, 3)."""
+        return np.radians(self.sigma_deg) ** 2 * np.eye(3)
+
+
+class MadgwickParameters(AssumedParameters):
+    """States the gain; the default is the author's for such a unit.
+
+    Attributes:
+        gain: gain of the gradient's direction, in rad/s.
+    """
+
+    gain: NonNegativeFloat = 0.041
+
+
+class MahonyParameters(AssumedParameters):
+    """States the gains.
+
+    Attributes:
+        gain: gain of the correction, in 1/s.
+        bias_gain: gain of the correction of the bias, in 1/s^2.
+    """
+
+    gain: NonNegativeFloat = 1.0
+    bias_gain: NonNegativeFloat = 0.3
+
+
+class VqfParameters(AssumedParameters):
+    """States the time constants.
+
+    Attributes:
+        inclination_s: time constant of the correction of inclination.
+        heading_s: time constant of the correction of heading.
+    """
+
+    inclination_s: PositiveFloat = 3.0
+    heading_s: PositiveFloat = 9.0
+
+
+class ComplementarySettings(NamedTuple):
+    """Holds the gains, and the covariance (3, 3) that is assumed."""
+
+    gain: float
+    bias_gain: float
+    covariance: Floats
+
+
+class ComplementaryState(NamedTuple):
+    """Carries orientations (runs, 4), zero for none yet; biases; stamps."""
+
+    orientation: Floats
+    bias: Floats
+    time_ns: Integers
+
+
+def start(given: Given[Any]) -> tuple[ComplementarySettings, ComplementaryState]:
+    """Start with nothing known."""
+    values = given.parameters
+    settings = ComplementarySettings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
+    return settings, ComplementaryState(
+        np.zeros((given.runs, 4)), np.zeros((given.runs, 3)), np.zeros(given.runs, int)
+    )
+
+
+def follow_madgwick(
+    run: int,
+    settings: ComplementarySettings,
+    messages: Messages,
+    state: ComplementaryState,
+    results: Results,
+) -> None:
+    """Take a step of the gyro, and one down the gradient of what force and field contradict."""
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        force, rate, field = unit_vectors(messages.value[row])
+        if not can_follow(run, force, rate, field, state):
+            continue
+        q = began(run, messages, row, state)
+        duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
+        # the author's north is x, see (46)
+        w, x, y, z = product((HALF, 0.0, 0.0, -HALF), q)
+        across, ahead, up = into_plane((w, x, y, z), field)
+        north = np.sqrt(across * across + ahead * ahead)
+        gravity = (
+            2 * (x * z - w * y) - force[0],
+            2 * (w * x + y * z) - force[1],
+            1 - 2 * (x * x + y * y) - force[2],
+        )
+        a, b, c = gravity
+        d = north * (1 - 2 * (y * y + z * z)) + 2 * up * (x * z - w * y) - field[0]
+        e = 2 * north * (x * y - w * z) + 2 * up * (w * x + y * z) - field[1]
+        f = 2 * north * (w * y + x * z) + up * (1 - 2 * (x * x + y * y)) - field[2]
+        # the transpose of the Jacobians (26) and (33)
+        gw = -2 * y * a + 2 * x * b - 2 * up * y * d + 2 * (up * x - north * z) * e + 2 * north * y * f
+        gx = 2 * z * a + 2 * w * b - 4 * x * c + 2 * up * z * d + 2 * (north * y + up * w) * e
+        gx += 2 * (north * z - 2 * up * x) * f
+        gy = -2 * w * a + 2 * z * b - 4 * y * c - 2 * (2 * north * y + up * w) * d
+        gy += 2 * (north * x + up * z) * e + 2 * (north * w - 2 * up * y) * f
+        gz = 2 * x * a + 2 * y * b + 2 * (up * x - 2 * north * z) * d
+        gz += 2 * (up * y - north * w) * e + 2 * north * x * f
+        length = np.sqrt(gw * gw + gx * gx + gy * gy + gz * gz)
+        gain = settings.gain / length if length > 0.0 else 0.0
+        dw, dx, dy, dz = product((w, x, y, z), (0.0, 0.5 * rate[0], 0.5 * rate[1], 0.5 * rate[2]))
+        w, x = w + duration_s * (dw - gain * gw), x + duration_s * (dx - gain * gx)
+        y, z = y + duration_s * (dy - gain * gy), z + duration_s * (dz - gain * gz)
+        keep(run, messages, row, product((HALF, 0.0, 0.0, HALF), (w, x, y, z)), settings, state, results)
+
+
+def follow_mahony(
+    run: int,
+    settings: ComplementarySettings,
+    messages: Messages,
+    state: ComplementaryState,
+    results: Results,
+) -> None:
+    """Take a step of the gyro less its bias, turned towards what force and field say, (48)."""
+    bias = state.bias[run]
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        force, rate, field = unit_vectors(messages.value[row])
+        if not can_follow(run, force, rate, field, state):
+            continue
+        q = began(run, messages, row, state)
+        duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
+        up = into_body(q, (0.0, 0.0, 1.0))
+        east, north, above = into_plane(q, field)
+        ahead = into_body(q, (0.0, np.sqrt(east * east + north * north), above))
+        a, b = cross(force, up), cross(field, ahead)
+        x, y, z = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+        bias[0] -= settings.bias_gain * x * duration_s
+        bias[1] -= settings.bias_gain * y * duration_s
+        bias[2] -= settings.bias_gain * z * duration_s
+        wx = 0.5 * (rate[0] - bias[0] + settings.gain * x)
+        wy = 0.5 * (rate[1] - bias[1] + settings.gain * y)
+        wz = 0.5 * (rate[2] - bias[2] + settings.gain * z)
+        dw, dx, dy, dz = product(q, (0.0, wx, wy, wz))
+        moved = (
+            q[0] + duration_s * dw,
+            q[1] + duration_s * dx,
+            q[2] + duration_s * dy,
+            q[3] + duration_s * dz,
+        )
+        keep(run, messages, row, moved, settings, state, results)
+
+
+def unit_vectors(value: Floats) -> Any:
+    """Return the directions of force and field, and the turn rate between them.
+
+    A field that is not finite is none, as between two samples of a slower magnetometer: zero, which
+    turns nothing.
+    """
+    rate = value[3], value[4], value[5]
+    if not np.isfinite(value[6] + value[7] + value[8]):
+        return unit(value[:3]), rate, (0.0, 0.0, 0.0)
+    return unit(value[:3]), rate, unit(value[6:])
+
+
+def can_follow(run: int, force: Any, rate: Any, field: Any, state: ComplementaryState) -> bool:
+    """Tell whether a sample says anything: force and turn rate, and the first one the field too."""
+    if not np.isfinite(force[0] + force[1] + force[2] + rate[0] + rate[1] + rate[2]):
+        return False
+    q = state.orientation[run]
+    is_blank = q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0
+    return not (is_blank and field[0] == 0.0 and field[1] == 0.0 and field[2] == 0.0)
+
+
+def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
+    """Return the orientation so far; of the first sample that of its force and field."""
+    q = state.orientation[run]
+    if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
+        q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
+        state.time_ns[run] = messages.time_ns[row]
+    return q[0], q[1], q[2], q[3]
+
+
+def keep(
+    run: int,
+    messages: Messages,
+    row: int,
+    q: Any,
+    settings: ComplementarySettings,
+    state: ComplementaryState,
+    results: Results,
+) -> None:
+    """Normalise, carry and tell an orientation."""
+    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for part in range(4):
+        state.orientation[run, part] = q[part] / length
+        results.mean[row, part] = q[part] / length
+    results.covariance[row] = settings.covariance
+    state.time_ns[run] = messages.time_ns[row]
+
+
+def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
+    """Return the library's estimate at every stamp; samples are taken to be evenly spaced.
+
+    Raises BadInput where the library is not installed.
+    """
+    try:
+        from vqf import VQF
+    except ImportError:
+        raise BadInput("estimator vqf needs the package vqf: pip install vqf") from None
+    samples = streams["inertial"]
+    is_last = np.diff(samples.publish_time_ns, append=-1) != 0  # of one stamp, which have their mean
+    force, rate, field = (np.ascontiguousarray(samples[name][is_last]) for name in FIELDS)
+    time_ns = samples.publish_time_ns[is_last]
+    step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
+    if not has_field.any():
+        raise BadInput(f"topic {samples.topic}: has no magnetic field; estimator vqf needs one")
+    slower = len(has_field) / int(has_field.sum())
+    vqf = VQF(
+        step_s,
+        magTs=slower * step_s,
+        tauAcc=parameters.inclination_s,
+        tauMag=parameters.heading_s,
+    )
+    if has_field.all():
+        mean = vqf.updateBatch(rate, force, field)["quat9D"]
+    else:
+        mean = np.empty((len(rate), 4))
+        for row in range(len(rate)):
+            vqf.update(rate[row], force[row])
+            if has_field[row]:
+                vqf.updateMag(field[row])
+            mean[row] = vqf.getQuat9D()
+    return Estimates(time_ns, mean, np.tile(parameters.covariance, (len(mean), 1, 1)))
+
+
+MADGWICK = of_nine_axes(
+    of_inertial_samples(
+        "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+    )
+)
+MAHONY = of_nine_axes(
+    of_inertial_samples(
+        "Mahony's complementary filter of orientation and bias",
+        MahonyParameters,
+        start,
+        follow=follow_mahony,
+    )
+)
+VQF = with_magnetometer(
+    batch(
+        "VQF of Laidig and Seel, by the package vqf",
+        parameters=VqfParameters,
+        streams={"inertial": schemas.INERTIAL_SAMPLE},
+        static={},
+        components=ORIENTATION,
+        truth="truth",
+        solve=each_run(solve_vqf),
+    )
+)

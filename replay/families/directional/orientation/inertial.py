@@ -1,0 +1,309 @@
+"""Estimates orientation from inertial and magnetic samples by dead reckoning and Bingham filter.
+
+Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
+
+Made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021). The body rests
+first, which gives the bias of the gyro. Then the accelerometer and the magnetometer are carried to the
+end of a block by the gyro and averaged, which tells gravity from motion; the TRIAD attitude of the
+averages is a quaternion measurement for the filter. Quaternions turn body vectors into east, north, up.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.models.inertial import triad
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.families.directional.distributions.bingham_kernels import (
+    compose,
+    integrate,
+    local_moments,
+    predict,
+    turn_columns,
+    update,
+)
+from fuselog.replay.families.directional.orientation.triad import (
+    all_finite,
+    fill_diagonal,
+    fill_isotropic,
+    turn_back,
+    turn_quaternion,
+)
+
+_NS = 1e-9
+
+
+class InertialModel(NamedTuple):
+    """Holds what the filter takes for granted, the same for all logs.
+
+    Attributes:
+        rest_s: how long the body rests at the start, at most.
+        block_s: how much time is averaged into one attitude.
+        attitude_sigma_rad: standard deviation of a block's attitude about each axis.
+        drift_sigma_rad: standard deviation of one second's dead reckoning about each axis.
+        gap_s: a longer gap between two samples makes the orientation unknown.
+    """
+
+    rest_s: float = 20.0
+    block_s: float = 1.0
+    attitude_sigma_rad: float = math.radians(10.0)
+    drift_sigma_rad: float = math.radians(0.4)
+    gap_s: float = 0.1
+
+
+class InertialSamples(NamedTuple):
+    """Holds the samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns: (rows,).
+        rate: gyro, rad/s, (rows, 3).
+        force: accelerometer, (rows, 3), any unit: at rest it points up.
+        field: magnetometer, (rows, 3), any unit.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    rate: Floats
+    force: Floats
+    field: Floats
+
+
+class InertialState(NamedTuple):
+    """Holds what the filter carries from sample to sample, first axis runs.
+
+    Attributes:
+        time_ns: of the first sample, the last one, the start of the block, (runs, 3); -1 for none yet.
+        rate_sum: the gyro's sum over the rest (runs, 3).
+        rest_samples: how many samples rate_sum has (runs,).
+        axes: of the Bingham distribution at the start of the block (runs, 4, 4).
+        concentrations: (runs, 4), all 0 while the orientation is unknown.
+        covariance: of its error as a rotation vector in the body's frame, rad^2, (runs, 3, 3).
+        increment: the rotation since, (runs, 4).
+        force: sum over the block, carried to the last sample, (runs, 3).
+        field: the same of the magnetometer, (runs, 3).
+        rest_s: how long the body rests, if that is less than the model says, (runs,).
+    """
+
+    time_ns: Integers
+    rate_sum: Floats
+    rest_samples: Integers
+    axes: Floats
+    concentrations: Floats
+    covariance: Floats
+    increment: Floats
+    force: Floats
+    field: Floats
+    rest_s: Floats
+
+
+class OrientationEstimates(NamedTuple):
+    """Holds per sample the orientation (rows, 4), and covariance in the body frame (rows, 3, 3).
+
+    NaN while the orientation is unknown, and where a sample is not finite.
+    """
+
+    orientation: Floats
+    covariance: Floats
+
+
+def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialState:
+    """Return the state before the first sample.
+
+    Args:
+        runs: how many.
+        rest_s: (runs,), rests that end before the model's.
+    """
+    return InertialState(
+        np.full((runs, 3), -1),
+        np.zeros((runs, 3)),
+        np.zeros(runs, np.int64),
+        np.tile(np.eye(4), (runs, 1, 1)),
+        np.zeros((runs, 4)),
+        np.zeros((runs, 3, 3)),
+        np.tile(np.eye(4)[0], (runs, 1)),
+        np.zeros((runs, 3)),
+        np.zeros((runs, 3)),
+        np.full(runs, np.inf) if rest_s is None else rest_s,
+    )
+
+
+@cache
+def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """Return the loop over runs of what takes one run through its samples, compiled."""
+    return compile_over_runs(run_once, allocates=False)
+
+
+def run_inertial_filter(
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates | None = None,
+) -> tuple[InertialState, OrientationEstimates]:
+    """Go through the samples of an ensemble; returns the state after them and the estimates.
+
+    These are filled into `estimates`, all NaN, where given. Raises BadInput where the columns have
+    different lengths or the model's numbers are not positive.
+    """
+    samples, estimates = prepared(model, samples, estimates)
+    state = InertialState._make(part.copy() for part in state)
+    over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
+    return state, estimates
+
+
+def attitudes(
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
+) -> OrientationEstimates:
+    """Return the TRIAD attitude of every sample alone: gravity is taken for all that is felt.
+
+    Args and errors as `run_inertial_filter`.
+    """
+    samples, estimates = prepared(model, samples, estimates)
+    rows = len(samples.force)
+    over_runs(_attitude)(rows, samples.force, samples.field, estimates.orientation)
+    estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
+    return estimates
+
+
+def prepared(
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
+) -> tuple[InertialSamples, OrientationEstimates]:
+    """Check samples, and return them with estimates to fill; see `run_inertial_filter`.
+
+    Args:
+        model: the filter's.
+        samples: of all runs.
+        estimates: to fill, all NaN; made where it is None.
+    """
+    rows = int(samples.offsets[-1])
+    if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
+        raise BadInput(
+            "inertial samples: give for each a time, and turn rate, specific force and magnetic field "
+            "of 3 numbers"
+        )
+    if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
+        raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
+    if estimates is None:
+        estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
+    return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
+
+
+def _attitude(row: int, force: NDArray, field: NDArray, orientation: NDArray) -> None:
+    found = triad(force[row], field[row])
+    for part in range(4):
+        orientation[row, part] = found[part]
+
+
+def _inertial_run(
+    run: int,
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+) -> None:
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        elapsed_s = _accumulate(model, state, run, samples, row)
+        if elapsed_s >= model.block_s:
+            _end_block(model, state, run, elapsed_s)
+            elapsed_s = 0.0
+        if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
+            _dead_reckon(model, state, run, elapsed_s, estimates, row)
+
+
+def _accumulate(
+    model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
+) -> float:
+    """Add one sample to the rest and to the block, in place.
+
+    Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
+    A field that is not finite is none, as between two samples of a slower magnetometer.
+    """
+    time_ns, rate = samples.time_ns[row], samples.rate[row]
+    force, field = samples.force[row], samples.field[row]
+    if not all_finite(rate, force, force):
+        return math.nan
+    times = state.time_ns[run]
+    duration_s = (time_ns - times[1]) * _NS
+    if times[0] < 0:
+        times[0] = time_ns
+    if times[1] < 0 or duration_s > model.gap_s:
+        duration_s = 0.0
+        state.concentrations[run] = 0.0
+        _start_block(state, run, time_ns)
+    times[1] = time_ns
+    if (time_ns - times[0]) * _NS < min(model.rest_s, state.rest_s[run]):
+        for i in range(3):
+            state.rate_sum[run, i] += rate[i]
+        state.rest_samples[run] += 1
+    else:
+        bias, count = state.rate_sum[run], max(state.rest_samples[run], 1)
+        increment = state.increment[run]
+        step = turn_quaternion(
+            (rate[0] - bias[0] / count) * duration_s,
+            (rate[1] - bias[1] / count) * duration_s,
+            (rate[2] - bias[2] / count) * duration_s,
+        )
+        compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
+        turn_back(step, state.force[run])
+        turn_back(step, state.field[run])
+    for i in range(3):
+        state.force[run, i] += force[i]
+        if all_finite(field, field, field):
+            state.field[run, i] += field[i]
+    return (time_ns - times[2]) * _NS
+
+
+def _start_block(state: InertialState, run: int, time_ns: int) -> None:
+    state.time_ns[run, 2] = time_ns
+    state.increment[run] = 0.0
+    state.increment[run, 0] = 1.0
+    state.force[run] = 0.0
+    state.field[run] = 0.0
+
+
+def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
+    """Predict once over the block and update once with its attitude, in place."""
+    axes, z = state.axes[run], state.concentrations[run]
+    moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
+    if z[0] < 0.0:
+        turn_columns(axes, state.increment[run])
+        fill_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
+        integrate(noise, moments, work)
+        fill_diagonal(moments, work)
+        predict(axes, z, work)
+    attitude = triad(state.force[run], state.field[run])
+    if math.isfinite(attitude[0]):
+        fill_isotropic(model.attitude_sigma_rad, noise)
+        fill_diagonal(noise, work)
+        update(axes, z, work, attitude)
+    local_moments(axes, z, moments, work)
+    for i in range(3):
+        for j in range(3):
+            # a small rotation vector is twice the vector part of its quaternion
+            state.covariance[run, i, j] = 4.0 * work[i + 1, j + 1]
+    _start_block(state, run, state.time_ns[run, 1])
+
+
+def _dead_reckon(
+    model: InertialModel,
+    state: InertialState,
+    run: int,
+    elapsed_s: float,
+    estimates: OrientationEstimates,
+    row: int,
+) -> None:
+    """Write the orientation that the block's increment leads to, and the error that it adds."""
+    increment, covariance = state.increment[run], estimates.covariance[row]
+    compose(state.axes[run, :, 3], increment, estimates.orientation[row])
+    covariance[:, :] = state.covariance[run]
+    for i in range(3):
+        turn_back(increment, covariance[i])
+    for i in range(3):
+        turn_back(increment, covariance[:, i])
+        covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s

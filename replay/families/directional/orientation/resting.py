@@ -1,0 +1,154 @@
+"""Finds how long a unit rests at its start, by its gyro, its force and its magnetic field.
+
+Over the rest the gyro's mean is its bias. Means over short windows are compared with those of all
+windows before: the rest is over where one differs by more than its noise explains.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Clock, Stream
+from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.replaying.estimator import (
+    Bound,
+    Estimator,
+    Initialization,
+    Initialized,
+    Recursive,
+)
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.families.directional.orientation.magnetometers import with_magnetometer
+from fuselog.replay.inference.run.first_messages import Fact, started
+
+REST = "rest"  # what `start` finds the samples of the rest under
+LONGEST_S, LEAST_S = 20.0, 1.0  # no more is needed, and less says too little of a bias
+WINDOW_S = 0.25
+SIGMAS = 6.0  # of noise, beyond which a window's mean is another one
+LEAST_RATE_RADPS, LEAST_ANGLE_RAD = 0.02, np.radians(2.0)  # what is less is no motion
+LARGEST_BIAS_RADPS = 0.35
+
+
+def resting(stream: Stream) -> int:
+    """Count the samples of a unit's rest at its start, of at most `LONGEST_S`; zero if it moves at once.
+
+    Args:
+        stream: inertial samples in order of time.
+    """
+    since_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[:1])
+    stream = stream.take(since_s < LONGEST_S)
+    since_s = since_s[: len(stream)]
+    of_window = np.floor(since_s / WINDOW_S).astype(np.int64)
+    columns = ("turn_rate_radps", "specific_force_mps2", "magnetic_field_ut")
+    moves = np.zeros(int(of_window.max(initial=-1)) + 1, bool)
+    for name, is_rate in zip(columns, (True, False, False), strict=True):
+        values = stream.columns.get(name)
+        if values is not None and np.isfinite(values).all(axis=1).any():
+            moves |= _differing(values, of_window, len(moves), is_rate=is_rate)
+    if not moves.any():
+        return len(stream)
+    last = int(np.argmax(moves)) - 1  # in which the motion may begin slowly
+    return int(np.count_nonzero(of_window < last))
+
+
+def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> Booleans:
+    """Tell which windows (count,) differ in their mean from all before them."""
+    known = np.isfinite(values).all(axis=1)
+    values, of_window = values[known], of_window[known]
+    sizes = np.bincount(of_window, minlength=count)
+    sums, squares = (
+        np.stack([np.bincount(of_window, each, count) for each in (values**power).T], axis=1)
+        for power in (1, 2)
+    )
+    before, of_before = np.cumsum(sizes) - sizes, np.cumsum(sums, axis=0) - sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, usual = sums / sizes[:, None], of_before / before[:, None]
+        within = np.maximum(squares / sizes[:, None] - mean**2, 0.0).sum(axis=1)
+        # the noise of what rests is that of its quietest windows
+        variance = np.minimum.accumulate(np.where(sizes > 1, within, np.inf))
+        noise = SIGMAS * np.sqrt(variance * (1.0 / sizes + 1.0 / before))
+        apart = np.linalg.norm(mean - usual, axis=1)
+        if is_rate:
+            found = (apart > np.maximum(noise, LEAST_RATE_RADPS)) | (
+                np.linalg.norm(mean, axis=1) > LARGEST_BIAS_RADPS
+            )
+        else:
+            found = apart > np.maximum(noise, LEAST_ANGLE_RAD * np.linalg.norm(usual, axis=1))
+    return np.asarray(found)
+
+
+def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
+    """Return the estimator, which refuses a unit without a magnetometer, and finds how long it rests.
+
+    That is found if it has a parameter `rest_s` that is not set. Its `start` is given the samples of the
+    rest as `REST`.
+    """
+
+    def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
+        seeks_rest = getattr(values, "rest_s", 0.0) is None
+        found = list[Bound]()
+        for each in estimator.bind(name, topics, values):
+            assert isinstance(each, Recursive)
+            find = partial(_find, each.name, seeks_rest)
+            found.append(replace(each, initialization=Initialization(each.streams, find)))
+        return found
+
+    return with_magnetometer(replace(estimator, bind=bind))
+
+
+def _find(
+    name: str,
+    seeks_rest: bool,
+    first: Mapping[str, Ragged],
+    static: Mapping[str, Ragged],
+    clock: Clock,
+) -> Initialized:
+    """Find the rest of every run.
+
+    Raises BadInput if no run has a magnetic field, or a unit moves within `LEAST_S` of its start.
+    """
+    [(topic, samples)] = first.items()
+    field = samples.stream.columns.get("magnetic_field_ut")
+    if len(samples.stream) and (field is None or not np.isfinite(field).all(axis=1).any()):
+        raise BadInput(
+            f"topic {topic}: has no magnetic field, by which the heading is found, and no topic "
+            "magnetic_field has it; import it, as fields.magnetic_field_ut = [...] in the mapping"
+        )
+    if not seeks_rest:
+        return Initialized({}, [])
+    counts, rests_s, facts = [], [], list[Fact]()
+    for run in range(samples.runs):
+        own = samples.of_run(run)
+        counts.append(resting(own) if len(own) else 0)
+        stamps_ns = own.publish_time_ns[: counts[-1] + 1]
+        rests_s.append(1e-9 * float(np.ptp(stamps_ns)) if len(stamps_ns) else 0.0)
+        if len(own) and rests_s[-1] < LEAST_S:
+            raise BadInput(
+                f"topic {topic}: the unit moves within {LEAST_S:g} s of its first sample, and the "
+                "gyro's bias is its mean over a rest; cut the log so that it begins at rest, or state "
+                "with --set rest_s=SECONDS how long the unit rests"
+            )
+    firsts_ns = np.array([_first_ns(samples.of_run(run)) for run in range(samples.runs)], np.int64)
+    for rest_s in dict.fromkeys(round(each, 2) for each in rests_s if each):
+        is_so = np.array([round(each, 2) == rest_s for each in rests_s])
+        facts.append(Fact(f"the unit rests for its first {rest_s:.4g} s (rest_s)", firsts_ns, is_so))
+    rows = [samples.offsets[run] + np.arange(count) for run, count in enumerate(counts)]
+    rest = samples.stream.take(np.concatenate(rows).astype(np.int64))
+    return Initialized({REST: Ragged(rest, np.append(0, np.cumsum(counts)))}, started(name, facts))
+
+
+def _first_ns(samples: Stream) -> int:
+    return int(samples.publish_time_ns[0]) if len(samples) else 0
+
+
+def rests_of(given: Mapping[str, Ragged], runs: int) -> Floats:
+    """Return how long the unit of every run (runs,) rests, in s; infinite where that was not sought."""
+    if REST not in given:
+        return np.full(runs, np.inf)
+    rest = given[REST]
+    stamps = [rest.of_run(run).publish_time_ns for run in range(runs)]
+    return np.array([1e-9 * (float(np.ptp(each)) + 1.0) if len(each) else 0.0 for each in stamps])

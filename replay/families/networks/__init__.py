@@ -1,0 +1,1 @@
+"""Estimates in networks of nodes and robots that share estimates; begin with `estimator`."""

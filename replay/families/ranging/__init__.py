@@ -1,0 +1,1 @@
+"""Locates tags by their ranges to anchors; begin with `model`."""

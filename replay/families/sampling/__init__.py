@@ -1,0 +1,1 @@
+"""Models the systems of the S2KF paper; begin with `reactor`."""

@@ -1,0 +1,1 @@
+"""Judges sets of points and regions by the truth; begin with `distances`."""

@@ -1,0 +1,152 @@
+"""Reads bounded bearings frame by frame, with what their channels state of the bounds."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import Stream
+from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.families.sets.regions.feasible_sets import Arena, Pairs, arena_around, make_pairs
+from fuselog.replay.families.sets.regions.moving_sets import Growth
+
+CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
+FINDINGS = (
+    "the bearings of this frame contradict each other: it is left out",
+    "this frame contradicts what came before it: the sets of both are kept",
+    "this frame contradicts both sets that were kept: they count as one from here on",
+    "the earlier frame that contradicted what came before it was wrong",
+    "what came before the earlier frame that contradicted it was wrong",
+)
+NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
+
+
+class Known(NamedTuple):
+    """Holds what is known beside the bearings: their bound, and where the robot can be.
+
+    `arena_m` is (low x, low y, high x, high y). None where it follows from the sensor's maximum range,
+    which is None where that is the longest that it measured.
+    """
+
+    bound_rad: float
+    least_landmarks: int
+    arena_m: tuple[float, ...] | None
+    maximum_range_m: float | None
+
+    def metadata(self) -> dict[str, str]:
+        """State it as a channel does."""
+        return {name: json.dumps(value) for name, value in self._asdict().items()}
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> "Known":
+        """Read what a channel or parameters state, in the order of STATED."""
+        return cls(*(json.loads(metadata[name]) for name in cls._fields))
+
+
+class Frame(NamedTuple):
+    """Holds the relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
+
+    time_ns: int
+    pairs: Pairs
+    numbers: Integers
+    arena: Arena
+
+
+def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
+    """Yield the frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
+
+    What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
+    where nothing says how far the robot can be from what it sees.
+    """
+    places_m = read_vectors(landmarks, "position_m", PLANE)
+    place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
+    range_m = _maximum_range_m(stream, known) if known.arena_m is None else np.inf
+    cuts = np.flatnonzero(np.diff(stream.publish_time_ns)) + 1
+    for rows in np.split(np.arange(len(stream)), cuts):
+        if "angle_rad" in stream.columns:
+            numbers = np.stack([stream["first_id"][rows], stream["second_id"][rows]], axis=1)
+            angle = stream["angle_rad"][rows]
+        else:
+            first, second = np.triu_indices(len(rows), 1)
+            targets, bearing = stream["target_id"][rows], stream["bearing_rad"][rows]
+            numbers = np.stack([targets[first], targets[second]], axis=1)
+            angle = wrap_angle(bearing[first] - bearing[second])
+        mapped = np.isin(numbers, list(place_of)).all(axis=1) & (numbers[:, 0] != numbers[:, 1])
+        numbers, angle = numbers[mapped].astype(np.int64), angle[mapped]
+        if len(np.unique(numbers)) < known.least_landmarks:
+            continue
+        places = np.array([place_of[number] for number in numbers.ravel().tolist()])
+        pairs = make_pairs(places[0::2], places[1::2], angle, known.bound_rad)
+        arena = _arena(known.arena_m) if known.arena_m else _within(places, range_m)
+        yield Frame(int(stream.publish_time_ns[rows[0]]), pairs, numbers, arena)
+
+
+def _maximum_range_m(stream: Stream, known: Known) -> float:
+    """Tell how far the sensor sees: as stated, else the longest range that it measured."""
+    if known.maximum_range_m is not None:
+        return known.maximum_range_m
+    if "range_m" not in stream.columns:
+        raise BadInput(
+            f"topic {stream.topic}: nothing bounds the robot's position: the topic has no ranges and "
+            "states no maximum_range_m, and /landmarks states no arena_m; give "
+            "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
+        )
+    return float(stream["range_m"].max(initial=0.0))
+
+
+def _arena(corners_m: tuple[float, ...]) -> Arena:
+    return Arena(np.array(corners_m[:2]), np.array(corners_m[2:]))
+
+
+def _within(places: Floats, range_m: float) -> Arena:
+    """Return the rectangle no farther than a range from any of the places (n, 2).
+
+    Where there is none one landmark is misidentified, and the robot no farther from one of them.
+    """
+    low, high = places.max(axis=0) - range_m, places.min(axis=0) + range_m
+    return Arena(low, high) if np.all(low < high) else arena_around(places, range_m)
+
+
+class Bounds(NamedTuple):
+    """Describes how far odometry and bearings err at most."""
+
+    position: Growth
+    heading: Growth
+    bearing_rad: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Bounds":
+        """Read what a channel or parameters state, in the order of STATED."""
+        return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
+
+
+ERRORS = ("position_error_m", "position_error_mps", "heading_error_rad", "heading_error_radps")
+STATED = (*ERRORS, "bearing_bound_rad")
+
+
+class Bearings(NamedTuple):
+    """Holds the bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
+
+    place_m: Floats
+    bearing_rad: Floats
+
+
+def frames_with_bearings(
+    stream: Stream, landmarks: Stream, known: Known
+) -> Iterable[tuple[Frame, Bearings]]:
+    """Yield a stream's frames and the single bearings of each, none of a relative-bearing stream."""
+    places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
+    for frame in frames(stream, landmarks, known):
+        bearings = Bearings(np.empty((0, 2)), np.empty(0))
+        if "bearing_rad" in stream.columns:
+            first, end = np.searchsorted(stream.publish_time_ns, [frame.time_ns, frame.time_ns + 1])
+            rows = [row for row in range(first, end) if int(stream["target_id"][row]) in places]
+            targets = stream["target_id"][rows].tolist()
+            bearings = Bearings(
+                np.array([places[target] for target in targets]), stream["bearing_rad"][rows]
+            )
+        yield frame, bearings

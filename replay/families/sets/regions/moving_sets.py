@@ -1,0 +1,245 @@
+"""Moves sets of positions and headings that hold a robot for certain, by odometry of bounded error.
+
+A position set is a shapely geometry, which may be in several pieces; headings lie in one interval. What
+is computed holds the exact result: disc offsets are polygons around it, and what rounding could lose is
+added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.extras import AtFirstUse
+from fuselog.recorders.models.planar import drive, wrap_angle
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.families.sets.regions.feasible_sets import Arena
+from fuselog.replay.families.sets.regions.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
+
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
+
+ROUNDING_M = 1e-7
+ON_A_LINE_M = 1e-10  # a vertex so near to the line between its neighbours is none
+# Segments of an offset in a quarter of a circle. GEOS rounds their number, so that one may span 1.5
+# times as much, and simplifies what it offsets by up to 1 % of the distance; so offsets are wider.
+QUARTER_SEGMENTS = 8
+WIDER = 1.01 / np.cos(1.5 * 0.25 * np.pi / QUARTER_SEGMENTS)
+L8_NODES = 48
+L8_SAMPLES = 24
+L8_STEPS = 60
+L8_MOST_GROWTH = 3.0
+
+
+class Headings(NamedTuple):
+    """Holds an interval of headings; all of them where the half width is pi."""
+
+    middle_rad: float
+    half_rad: float
+
+
+ALL_HEADINGS = Headings(0.0, np.pi)
+
+
+class Odometry(NamedTuple):
+    """Holds poses (n, 3) that odometry alone leads to, and velocities (n, 2) from their stamps on."""
+
+    time_ns: Integers
+    pose: Floats
+    velocity: Floats
+
+    def pose_at(self, time_ns: Integers) -> Floats:
+        """Return poses (m, 3) at any stamps; before the first the robot stood still."""
+        row = np.maximum(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0)
+        duration_s = np.maximum((time_ns - self.time_ns[row]) * 1e-9, 0.0)
+        return np.stack(drive(self.pose[row].T, self.velocity[row].T, duration_s), axis=1)
+
+
+class Growth(NamedTuple):
+    """Bounds the error of odometry over a span: `offset` + `rate` times its length in s."""
+
+    offset: float
+    rate: float
+
+    def over(self, span_s: Any) -> Any:
+        """Return the largest error over a span, or over each of several."""
+        return self.offset + self.rate * span_s
+
+
+class Motion(NamedTuple):
+    """Describes how a robot moved from one stamp to another, seen from its pose at the first.
+
+    The true `displacement_m` (2,) is within a disc of `position_error_m`, the turn within an interval.
+    """
+
+    displacement_m: Floats
+    position_error_m: float
+    turn_rad: float
+    turn_error_rad: float
+
+
+def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
+    """Compute poses from the origin on, by velocities that each hold until the next stamp.
+
+    Args:
+        time_ns: (n,), the stamps.
+        velocity: (n, 2), forward in m/s and turn in rad/s.
+    """
+    duration_s = np.diff(time_ns, append=time_ns[-1:]) * 1e-9
+    heading = np.concatenate([[0.0], np.cumsum(velocity[:, 1] * duration_s)])[:-1]
+    x, y, _ = drive((0.0, 0.0, heading), velocity.T, duration_s)
+    place = np.cumsum(np.stack([x, y], axis=1), axis=0)
+    return Odometry(
+        time_ns,
+        np.column_stack([np.concatenate([np.zeros((1, 2)), place[:-1]]), heading]),
+        velocity,
+    )
+
+
+def relative_pose(first: Floats, second: Floats) -> Floats:
+    """Return the second of two poses as seen from the first: displacement and turn, not wrapped.
+
+    Args:
+        first: (..., 3), x, y in m and heading in rad.
+        second: (..., 3), likewise.
+
+    Returns:
+        (..., 3), in the axes of the first.
+    """
+    away = second[..., :2] - first[..., :2]
+    cosine, sine = np.cos(first[..., 2]), np.sin(first[..., 2])
+    ahead = cosine * away[..., 0] + sine * away[..., 1]
+    left = cosine * away[..., 1] - sine * away[..., 0]
+    return np.stack([ahead, left, second[..., 2] - first[..., 2]], axis=-1)
+
+
+def common_headings(one: Headings, other: Headings) -> Headings | None:
+    """Return the headings that are in both intervals; None where there are none.
+
+    Where wide intervals meet at both ends, the narrower of them holds what they have in common.
+    """
+    apart = float(wrap_angle(other.middle_rad - one.middle_rad))
+    if one.half_rad + other.half_rad >= 2.0 * np.pi - abs(apart):
+        return min(one, other, key=lambda each: each.half_rad)
+    low = max(-one.half_rad, apart - other.half_rad)
+    high = min(one.half_rad, apart + other.half_rad)
+    if low > high:
+        return None
+    return Headings(float(wrap_angle(one.middle_rad + 0.5 * (low + high))), 0.5 * (high - low))
+
+
+def all_headings_of(one: Headings, other: Headings) -> Headings:
+    """Return the least interval that holds both."""
+    apart = float(wrap_angle(other.middle_rad - one.middle_rad))
+    low = min(-one.half_rad, apart - other.half_rad)
+    high = max(one.half_rad, apart + other.half_rad)
+    if high - low >= 2.0 * np.pi:
+        return ALL_HEADINGS
+    return Headings(float(wrap_angle(one.middle_rad + 0.5 * (low + high))), 0.5 * (high - low))
+
+
+def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
+    """Return headings after a motion, or with the direction -1 before it."""
+    middle = float(wrap_angle(headings.middle_rad + direction * motion.turn_rad))
+    return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
+
+
+def moved(
+    places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
+) -> shapely.Geometry:
+    """Compute where a robot is after a motion, or with the direction -1 where it was before it.
+
+    `headings` are those before the motion. The displacements of all of them lie on an arc, and this in a
+    disc: one around the origin where they span half a circle or more.
+    """
+    half = min(headings.half_rad, 0.5 * np.pi)
+    length = float(np.hypot(*motion.displacement_m))
+    bearing = float(np.arctan2(motion.displacement_m[1], motion.displacement_m[0]))
+    way = headings.middle_rad + bearing
+    along = direction * length * np.cos(half)
+    radius = length * np.sin(half) + motion.position_error_m + ROUNDING_M
+    shifted = shapely.transform(
+        places, lambda points: points + along * np.array([np.cos(way), np.sin(way)])
+    )
+    return shifted.buffer(radius * WIDER, quad_segs=QUARTER_SEGMENTS)
+
+
+def directions(places: shapely.Geometry, target: Floats) -> Headings:
+    """Return directions in which a point is seen from a set; all of them where it is in its hull.
+
+    Args:
+        places: the set.
+        target: the point (2,), in m.
+    """
+    hull = places.convex_hull
+    if hull.covers(shapely.Point(target)):
+        return ALL_HEADINGS
+    away = target - shapely.get_coordinates(hull)
+    middle = float(np.arctan2(*(target - shapely.get_coordinates(hull.centroid)[0])[::-1]))
+    apart = wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - middle)
+    return Headings(
+        float(wrap_angle(middle + 0.5 * (apart.min() + apart.max()))),
+        float(0.5 * (apart.max() - apart.min())) + ROUNDING_M,
+    )
+
+
+def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
+    """Return a set from its borders (n, 2), holes the other way round."""
+    places: shapely.Geometry = shapely.Polygon()
+    for ring in rings:
+        places = places.symmetric_difference(shapely.make_valid(shapely.Polygon(ring)))
+    return places
+
+
+def corners_of(places: shapely.Geometry) -> shapely.Geometry:
+    """Return a set without the vertices on its edges, which are there or not as rounding has it."""
+    return shapely.simplify(places, ON_A_LINE_M)
+
+
+def to_rings(places: shapely.Geometry) -> list[Floats]:
+    """Return the borders (n, 2) of a set: on their left is the set."""
+    found = []
+    for part in shapely.get_parts(corners_of(places)):
+        if isinstance(part, shapely.Polygon) and not part.is_empty:
+            upright = shapely.orient_polygons(part)
+            found += [
+                shapely.get_coordinates(ring)[:-1] for ring in (upright.exterior, *upright.interiors)
+            ]
+    return found
+
+
+def within_l8(places: shapely.Geometry) -> shapely.Geometry:
+    """Return a pseudo-ellipsoid with L = 8 around a set, as a polygon.
+
+    It is the level set of the least ellipsoid around the monomials T of the set's points (by
+    Titterington's weights of 1976, which need no step length), grown until it holds the set. A set that
+    is too thin for the grid that borders are drawn on is left as it is.
+    """
+    low, high = np.reshape(places.bounds, (2, 2))
+    origin, scale_m = 0.5 * (low + high), 0.5 * float(np.max(high - low))
+    arena = Arena(low - scale_m, high + scale_m)
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, L8_SAMPLES).T), axis=-1).reshape(-1, 2)
+    inside = grid[shapely.contains_xy(places, grid[:, 0], grid[:, 1])]
+    points = np.concatenate([shapely.get_coordinates(places), inside])
+    raised = monomials((points - origin) / scale_m, 8)
+    lifted = np.column_stack([raised, np.ones(len(raised))])
+    weights = np.full(len(lifted), 1.0 / len(lifted))
+    for _ in range(L8_STEPS):
+        information = np.linalg.pinv(lifted.T @ (weights[:, None] * lifted), hermitian=True)
+        value = np.einsum("ni,ij,nj->n", lifted, information, lifted)
+        weights *= value
+        weights /= weights.sum()
+    level = float(value.max())
+    while level < L8_MOST_GROWTH * value.max():
+        around = PseudoEllipsoid(
+            information[:8, :8], -information[:8, 8], float(information[8, 8]) - level, origin, scale_m
+        )
+        found = from_rings(outline(around, arena, L8_NODES).rings)
+        if found.covers(places):
+            return found
+        level *= 1.05
+    return places

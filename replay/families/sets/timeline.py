@@ -1,0 +1,103 @@
+"""Draws set-valued fixes: every estimator's set as polygons around the truth, and its area.
+
+A frame whose set is empty shows none; the relative bearing to blame is among the events.
+"""
+
+from functools import partial
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from fuselog.recorders.log import schemas
+from fuselog.replay.families.sets.judging.regions import areas_of, rings_of
+from fuselog.replay.judging.errors.evaluation import Floats
+from fuselog.replay.timeline.drawing.canvas import (
+    TRUTH,
+    Board,
+    Canvas,
+    Scene,
+    Timeline,
+    beside,
+    draw_cases,
+    entity_path,
+    nice,
+)
+from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.plane import (
+    ROOT,
+    Stroke,
+    draw_dots,
+    draw_points,
+    draw_polygons,
+    plane_view,
+    turn_up,
+    with_legend,
+)
+from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
+
+FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
+# The map shows what this share of the sets does not reach beyond.
+SHOWN_SHARE = 0.9
+
+
+def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
+    """Return the plane and events beside the areas, for each robot."""
+    turn_up(canvas)
+    landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
+    if landmarks is not None:
+        draw_points(
+            canvas, f"{ROOT}/landmarks", landmarks["landmark_id"], landmarks["position_m"][:, :2]
+        )
+    return draw_cases(scene, partial(_draw_robot, canvas, scene))
+
+
+def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb.View:
+    root = entity_path(ROOT, robot)
+    shown = [np.empty((0, 2))]
+    for stream in scene.truths_of(robot):
+        places = stream["state"][:, [stream.components.index(name) for name in ("x_m", "y_m")]]
+        draw_dots(canvas, f"{root}/truth", stream.publish_time_ns, places, Stroke(TRUTH, 2.0))
+        shown.append(places)
+    reach, plots = draw_sets(canvas, scene, robot, root)
+    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], np.concatenate([*shown, reach]))
+    board = with_legend(canvas, root, scene.colours(robot), plane)
+    board = above_events(board, draw_events(canvas, scene, robot), 4.0)
+    return beside(board, plots, robot)
+
+
+def draw_sets(
+    canvas: Canvas, scene: Scene, case: str, root: str
+) -> tuple[Floats, list[rrb.TimeSeriesView]]:
+    """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas."""
+    plot, corners, areas = entity_path("plots", case, "area"), [], {}
+    for estimator, sizes in scene.outputs_of(case, schemas.ESTIMATE_SIZE):
+        topic = "/" + entity_path("estimates", estimator, case, "set")
+        if topic not in scene.outputs:
+            continue
+        frames, colour = rings_of(sizes, scene.outputs[topic]), scene.colour(estimator)
+        counts = np.array([len(rings) for rings in frames], np.int64)
+        polygons = [ring for rings in frames for ring in rings]
+        time_ns = sizes.publish_time_ns
+        draw_polygons(canvas, f"{root}/{estimator}", time_ns, counts, polygons, Stroke(colour, 1.5))
+        areas[estimator] = areas_of(frames)
+        draw_curve(canvas, plot, estimator, colour, time_ns, areas[estimator], FRAMES)
+        corners += [[ring.min(axis=0), ring.max(axis=0)] for ring in polygons]
+    if not corners:
+        return np.empty((0, 2)), []
+    tail = 0.5 * (1.0 - SHOWN_SHARE)
+    low, high = np.moveaxis(np.array(corners), 1, 0)
+    reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
+    last = ", ".join(f"{each[-1]:.3g} by {estimator}" for estimator, each in areas.items())
+    largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
+    extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
+    return reach, [plot_view(plot, "Area of the set", "m²", extent, note=note, legend=False)]
+
+
+def draw_areas(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
+    """Draw a case's sets in its plane, and return the plot of their areas."""
+    _, plots = draw_sets(canvas, scene, case, entity_path(ROOT, case))
+    return [*plots]
+
+
+TIMELINE = Timeline(draw)

@@ -1,0 +1,187 @@
+"""Associates the detections of a scan with tracks: by the nearest, the best joint map, or all of them.
+
+A map sends every track to a detection of its own or to none; the detections left over are clutter. With
+Poisson clutter of density lambda it has the weight
+
+    prod over detected tracks (P_D r_i g_ij / lambda)  *  prod over missed ones (1 - P_D P_G r_i),
+
+where g_ij is the density of detection j about track i's prediction and r_i how probable it is that
+track i exists (1 in JPDA). All of what is here takes these weights, 0 outside a gate, and fills in how
+probable it is that each track has each detection: 0 or 1 where one map is chosen.
+
+JPDA: Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Eng. 8(3), 1983. JIPDA: Musicki, Evans, IEEE TAES
+40(3), 2004. Shortest augmenting paths: Crouse, IEEE TAES 52(4), 2016. Belief propagation: Williams, Lau,
+IEEE TAES 50(4), 2014.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fuselog.recorders.errors import BadInput, choices
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.replay.families.tracking.association.clusters import (
+    NONE,
+    AssociationMemory,
+    Weights,
+    choose,
+    jpda,
+    memory_for,
+)
+
+
+def nearest(
+    weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
+) -> int:
+    """Choose one map: the surest pair first, then the surest of the tracks and detections left.
+
+    Args:
+        weights: of pairs and of misses.
+        tracks: how many there are; arrays may be longer.
+        detections: likewise.
+        probability: (tracks, 1 + detections) filled: 1 where a map has a pair, or in the first
+            column no detection.
+        memory: what is worked in.
+
+    Returns:
+        0, as no cluster is approximated.
+    """
+    memory.is_seen[:detections] = False
+    memory.column_of[:tracks] = NONE
+    while True:
+        best, chosen_row, chosen_column = 1.0, NONE, NONE
+        for row in range(tracks):
+            for column in range(detections):
+                gain = weights.detected[row, column] / weights.missed[row]
+                if gain > best and memory.column_of[row] == NONE and not memory.is_seen[column]:
+                    best, chosen_row, chosen_column = gain, row, column
+        if chosen_row == NONE:
+            break
+        memory.column_of[chosen_row] = chosen_column
+        memory.is_seen[chosen_column] = True
+    for row in range(tracks):
+        choose(row, memory.column_of[row], detections, probability)
+    return 0
+
+
+def hungarian(
+    weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
+) -> int:
+    """Choose the map of the greatest weight: successive shortest augmenting paths (Crouse, fig. 3).
+
+    Column j of the assignment is detection j, and column detections + i stands for track i's miss.
+
+    Args:
+        weights: of pairs and of misses.
+        tracks: how many there are; arrays may be longer.
+        detections: likewise.
+        probability: (tracks, 1 + detections) filled, as by `nearest`.
+        memory: what is worked in.
+
+    Returns:
+        0, as no cluster is approximated.
+    """
+    columns = detections + tracks
+    memory.price[:columns], memory.row_of[:columns] = 0.0, NONE
+    memory.potential[:tracks], memory.column_of[:tracks] = 0.0, NONE
+    for first in range(tracks):
+        memory.distance[:columns], memory.is_done[:columns] = np.inf, False
+        row, reached, sink = first, 0.0, NONE
+        while sink == NONE:
+            closest = NONE
+            for column in range(columns):
+                if memory.is_done[column]:
+                    continue
+                cost = cost_of(weights, row, column, detections)
+                length = reached + cost - memory.potential[row] - memory.price[column]
+                if length < memory.distance[column]:
+                    memory.distance[column], memory.before[column] = length, row
+                if closest == NONE or memory.distance[column] < memory.distance[closest]:
+                    closest = column
+            reached = memory.distance[closest]
+            memory.is_done[closest] = True
+            if memory.row_of[closest] == NONE:
+                sink = closest
+            else:
+                row = memory.row_of[closest]
+        memory.potential[first] += reached
+        for column in range(columns):
+            if memory.is_done[column] and column != sink:
+                memory.potential[memory.row_of[column]] += reached - memory.distance[column]
+                memory.price[column] -= reached - memory.distance[column]
+        column = sink
+        while True:
+            row = memory.before[column]
+            memory.row_of[column] = row
+            column, memory.column_of[row] = memory.column_of[row], column
+            if row == first:
+                break
+    for row in range(tracks):
+        column = memory.column_of[row]
+        choose(row, column if column < detections else NONE, detections, probability)
+    return 0
+
+
+def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
+    """Compute what a pair costs beside a miss: minus the log of its weight.
+
+    Infinity where it cannot be.
+    """
+    if column >= detections:
+        return 0.0 if column - detections == row else np.inf
+    return -np.log(weights.detected[row, column] / weights.missed[row])
+
+
+ASSOCIATIONS = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
+
+
+def existence_after(existence: float, none: float, detection_probability: float) -> float:
+    """Compute how probable it is that a track exists, after a scan that gave it no detection by `none`.
+
+    Musicki and Evans' (15): a miss counts against it by as much as its detection was probable.
+    """
+    missed = 1.0 - detection_probability
+    if_missed = missed * existence / (1.0 - detection_probability * existence)
+    return 1.0 - none + none * if_missed
+
+
+def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda") -> Floats:
+    """Compute the probabilities of associations (tracks, 1 + n): of none, the first, the second ...
+
+    Args:
+        detected: (tracks, n), the weights of pairs; 0 outside a gate.
+        missed: (tracks,), those of misses.
+        association: one of ASSOCIATIONS; "nearest" and "hungarian" choose one map.
+
+    Raises BadInput where the weights are none, or there is no such association.
+
+    Two tracks between which a detection lies:
+
+    >>> marginals([[3.0], [1.0]], [1.0, 1.0])
+    array([[0.4, 0.6],
+           [0.8, 0.2]])
+    """
+    weights = Weights(np.array(detected, float, ndmin=2), np.array(missed, float))
+    tracks, detections = weights.detected.shape
+    finite = np.isfinite(weights.detected).all() and np.isfinite(weights.missed).all()
+    if weights.missed.shape != (tracks,) or not finite or (weights.detected < 0.0).any():
+        raise BadInput(
+            "weights: give finite ones of shapes (tracks, detections) for pairs and (tracks,) for misses"
+        )
+    if (weights.missed <= 0.0).any():
+        raise BadInput(
+            "weights: those of misses must be positive, since no track is detected for certain"
+        )
+    if association not in ASSOCIATIONS:
+        raise BadInput(f"no association '{association}'; {choices(association, ASSOCIATIONS)}")
+    probability = np.empty((tracks, 1 + detections))
+    memory = memory_for(tracks, detections)
+    _compiled(association)(weights, tracks, detections, probability, memory)
+    return probability
+
+
+@cache
+def _compiled(association: str) -> Function:
+    return compiled(ASSOCIATIONS[association], allocates=False)

@@ -1,0 +1,168 @@
+"""Begins tracks at detections that belong to none, and ends those of which nothing is left."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.replay.engine.arrays import Function
+from fuselog.replay.families.tracking.association.scanning import (
+    ScanMemory,
+    correlating,
+)
+from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
+from fuselog.replay.families.tracking.association.track_management import MANAGEMENTS
+from fuselog.replay.families.tracking.association.tracker import (
+    Newborn,
+    Tracker,
+    choosing,
+    corner_of,
+    place_of,
+)
+from fuselog.replay.families.tracking.association.tracks import NEVER, Tracks, are_near, drop, expected
+from fuselog.replay.inference.kalman.predict import nothing
+from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
+from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+
+
+class Births(NamedTuple):
+    """Describes how detections begin tracks, by kind of sensors.
+
+    Attributes:
+        begins: whether those of a kind do.
+        number: of a kind that does, its number in `birth`.
+        birth: (number, detection, origin, parameters) -> see `ScanSensor.birth`.
+    """
+
+    begins: tuple[bool, ...]
+    number: tuple[int, ...]
+    birth: Function
+
+
+def births_of(kinds: Sequence[ScanSensor]) -> Births:
+    """Return the births of these kinds of sensors."""
+    begins = tuple(kind.birth is not None for kind in kinds)
+    births = [kind.birth for kind in kinds if kind.birth is not None]
+    number = tuple(sum(begins[:k]) for k in range(len(kinds)))
+    return Births(begins, number, choosing(births))
+
+
+def ending(tracker: Tracker) -> Function:
+    """Make `end_tracks(run, tracks, p)`: which tracks are over."""
+    names = list(tracker.stage.model.state)
+    x, y = place_of(tracker.stage.model)
+    has_velocity = "vx_mps" in names and "vy_mps" in names
+    velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
+    _, _, is_over = MANAGEMENTS[tracker.management]
+
+    def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+        """Tell whether an older confirmed track is about where this one is, and moves alike."""
+        for other in range(place if tracks.is_confirmed[run, place] else 0):
+            if (
+                tracks.is_confirmed[run, other]
+                and are_near(run, place, other, (x, y), p.same_within_m, tracks)
+                and (
+                    not has_velocity or are_near(run, place, other, velocity, p.same_within_mps, tracks)
+                )
+            ):
+                return True
+        return False
+
+    def end_tracks(run: int, tracks: Tracks, p: Any) -> None:
+        """Take out the tracks that are over, and second ones of a target."""
+        place = 0
+        while place < tracks.used[run]:
+            if is_over(run, place, tracks, p) or is_another(run, place, tracks, p):
+                drop(run, place, tracks)
+            else:
+                place += 1
+
+    return end_tracks
+
+
+def beginning(tracker: Tracker) -> Function:
+    """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
+    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
+    begins, birth_number, birth = births_of(kinds)
+    correlate, read_pair = nothing, tuple_of(2)
+    if shared_at < model.size:
+        correlations = [
+            correlating(model, kind, corner, tracker.names) for kind in kinds if kind.birth is not None
+        ]
+        correlate = choosing(correlations)
+
+    def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
+        """Tell whether a confirmed track is too near for another one to begin."""
+        for place in range(tracks.used[run]):
+            apart = np.hypot(
+                at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
+            )
+            if tracks.is_confirmed[run, place] and apart < p.birth_distance_m:
+                return True
+        return False
+
+    def first_existence(
+        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: ScanMemory
+    ) -> float:
+        """Compute the probability that a detection is of a target without a track; 0 to begin none."""
+        if p.undetected_per_m2 > 0.0:
+            share = memory.undetected[detection] / memory.clutter[detection]
+            existence = memory.left[detection] * share
+            return existence if existence >= p.ending_existence else 0.0
+        is_another = not memory.is_free[detection] or is_taken(run, at_x, at_y, tracks, p)
+        return 0.0 if is_another else p.birth_existence
+
+    def begin_tracks(
+        run: int,
+        scan: int,
+        count: int,
+        scans: Scans,
+        tracks: Tracks,
+        newborn: Newborn,
+        p: Any,
+        memory: ScanMemory,
+    ) -> int:
+        """Begin tracks with the detections that may be of no other; returns how many had no room."""
+        kind, turned_away = scans.kind[scan], 0
+        for detection in range(count if begins[kind] else 0):
+            measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])
+            (at_x, at_y), triangle, _ = birth(birth_number[kind], measured, origin, p)
+            existence = first_existence(run, detection, at_x, at_y, tracks, p, memory)
+            if existence == 0.0:
+                continue
+            place = tracks.used[run]
+            if place == tracks.number.shape[1]:
+                turned_away += 1
+                continue
+            tracks.used[run] += 1
+            tracks.met[run] += 1
+            tracks.number[run, place] = tracks.met[run]
+            for mode in range(modes):
+                mean, covariance = tracks.mean[run, place, mode], tracks.covariance[run, place, mode]
+                copy_gaussian(newborn.mean, newborn.covariance, mean, covariance)
+                mean[x], mean[y] = at_x, at_y
+                covariance[corner[0], corner[0]], covariance[corner[1], corner[1]] = (
+                    triangle[0],
+                    triangle[2],
+                )
+                covariance[corner[0], corner[1]] = covariance[corner[1], corner[0]] = triangle[1]
+                for i in range(shared):
+                    mean[shared_at + i] = tracks.shared_mean[run, i]
+                    for j in range(shared):
+                        known = tracks.shared_covariance[run, i, j]
+                        covariance[shared_at + i, shared_at + j] = known
+                number = birth_number[kind]
+                correlate(number, mean, covariance, scans.origin[scan], p, memory.step)
+                probability = newborn.mode[mode]
+                tracks.mode[run, place, mode] = probability
+                tracks.log_mode[run, place, mode] = np.log(probability) if probability > 0.0 else -np.inf
+            tracks.existence[run, place] = existence
+            tracks.is_confirmed[run, place] = existence >= p.confirming_existence
+            tracks.hits[run, place] = tracks.chances[run, place] = 1
+            tracks.score[run, place] = tracks.best_score[run, place] = 0.0
+            tracks.seen_ns[run, place] = tracks.time_ns[run]
+            tracks.updated_ns[run, place] = NEVER
+        return turned_away
+
+    return begin_tracks

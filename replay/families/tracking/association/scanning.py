@@ -1,0 +1,364 @@
+"""Predicts what a scan measures of tracks, and updates them by it: the sensors' part of a tracker.
+
+A kind of sensors says what it measures of a target, how probable a detection is and how dense clutter.
+With probabilities b_j of a scan's detections and b_0 of none, a track's mean moves by the mean of the
+innovations v_j, and its covariance is
+
+    P - (1 - b_0) K S K' + K (sum_j b_j v_j v_j' - v v') K',   v = sum_j b_j v_j
+
+(Bar-Shalom, Fortmann, Tracking and Data Association, 1988, 6.4), which is the Kalman filter's where one
+map is chosen. A track with several modes has a Gaussian for each. A detection's density is the mean of
+theirs, weighed by the modes' probabilities, and given that it is the track's, so is the mode: mode i has
+
+    mu_i b_0 + sum_j b_j mu_i g_ij / sum_k mu_k g_kj
+
+afterwards, and its Gaussian the shares of this for probabilities (Blom, Bloem, IEEE TAC 45(2), 2000).
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers, varying
+from fuselog.replay.families.tracking.association.clusters import AssociationMemory, Weights, memory_for
+from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
+from fuselog.replay.families.tracking.association.shared_bias import Pool, pool_of
+from fuselog.replay.families.tracking.association.tracks import Tracks
+from fuselog.replay.inference.kalman.steps import Workspace, workspace
+from fuselog.replay.inference.kalman.update import sensor_derivative
+from fuselog.replay.inference.linear_algebra.gaussian import Innovation, kalman_step, whiten, wrap
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.model import Model, Sensor
+from fuselog.replay.inference.model.stage import Stage, traced_sensor
+
+
+@varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
+class ScanMemory(NamedTuple):
+    """Holds what one core works in; axes are tracks, their modes, and the detections of a scan.
+
+    Attributes:
+        motion: of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
+        step: of the derivatives of sensors.
+        pool: of what all tracks share.
+        place: (detections, 2), those of a scan, joined.
+        group: (detections,), which ones are joined.
+        clutter: (detections,), how dense it is there, with what has never been detected before.
+        undetected: (detections,), how much of that is targets.
+        difference, spread, cross: (tracks, modes, ...), of innovations; see `Innovation`.
+        predicted: (tracks, modes, 2), what a sensor should measure.
+        detectable: (tracks,), how probable each track's detection is.
+        white: (tracks, modes, detections, 2), whitened innovations.
+        likelihood: (tracks, modes, detections), of a mode and, in it, a detection; relative to clutter.
+        weights, probability, association: see `association.association`.
+        is_free: (detections,), outside all gates; left: (detections,), how probably of no track.
+        given: (1 + detections,), a track's associations in one mode.
+        after: (modes,), how probable each mode of a track is after them.
+        moment: (2, 2), and `shift` (2,), of the weighted innovations.
+    """
+
+    motion: Any
+    step: Workspace
+    pool: Pool
+    place: Floats
+    group: Integers
+    clutter: Floats
+    undetected: Floats
+    difference: Floats
+    spread: Floats
+    cross: Floats
+    predicted: Floats
+    detectable: Floats
+    white: Floats
+    likelihood: Floats
+    weights: Weights
+    probability: Floats
+    association: AssociationMemory
+    is_free: Booleans
+    left: Floats
+    given: Floats
+    after: Floats
+    moment: Floats
+    shift: Floats
+
+
+def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> ScanMemory:
+    """Make memory for so many errors that tracks share, tracks, and detections in a scan."""
+    modes, size = max(1, len(stage.modes)), stage.model.tangent
+    return ScanMemory(
+        motion=motion,
+        step=workspace(stage),
+        pool=pool_of(shared, size, places),
+        place=np.empty((detections, 2)),
+        group=np.empty(detections, np.int64),
+        clutter=np.empty(detections),
+        undetected=np.empty(detections),
+        difference=np.empty((places, modes, 2)),
+        spread=np.empty((places, modes, 2, 2)),
+        cross=np.empty((places, modes, size, 2)),
+        predicted=np.empty((places, modes, 2)),
+        detectable=np.empty(places),
+        white=np.empty((places, modes, detections, 2)),
+        likelihood=np.empty((places, modes, detections)),
+        weights=Weights(np.empty((places, detections)), np.empty(places)),
+        probability=np.empty((places, 1 + detections)),
+        association=memory_for(places, detections),
+        is_free=np.empty(detections, bool),
+        left=np.empty(detections),
+        given=np.empty(1 + detections),
+        after=np.empty(modes),
+        moment=np.empty((2, 2)),
+        shift=np.empty(2),
+    )
+
+
+def target_of(model: Model) -> Function:
+    """Make `target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
+    names = list(model.state)
+    places = tuple(names.index(name) if name in names else -1 for name in PLANE_MOTION)
+
+    def target(state: Any) -> Any:
+        return tuple(state[place] if place >= 0 else 0.0 for place in places)
+
+    return target
+
+
+@lru_cache(maxsize=64)
+def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
+    """Make a model's sensor of a kind of scan sensors, which may read parameters of these names."""
+    target, inner = target_of(model), kind.measure
+
+    def measure(state: Any, reference: Any, parameters: Any) -> Any:
+        return inner(target(state), reference, parameters)
+
+    own = Sensor(kind.leaf, kind.schema, kind.measured, measure, fields={"origin": 2})
+    return traced_sensor(model, own, names)
+
+
+def errors_at(component: int) -> Function:
+    """Make `errors(parameters)`: where errors of a measured component stand in the state.
+
+    -1 for nowhere.
+    """
+    names = (f"registration_at_{component}", f"correlated_at_{component}")
+
+    def errors(parameters: Any) -> tuple[float, ...]:
+        return tuple(getattr(parameters, name) for name in names)
+
+    return errors
+
+
+def adding_errors(components: int) -> Function:
+    """Make `add(rows, predicted, mean, parameters)`: it adds the state's errors of the measurement."""
+    errors = tuple(errors_at(component) for component in range(components))
+
+    def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
+        for i, errors_of in enumerate(errors):
+            for place in errors_of(parameters):
+                if place >= 0.0:
+                    rows[i, int(place)] += 1.0
+                    predicted[i] += mean[int(place)]
+
+    return add
+
+
+def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Function:
+    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
+
+    Fills the prediction of a track's mode and its whitened innovation covariance. Returns the density's
+    factor before exp(-d2 / 2), NaN where the covariance is none.
+    """
+    m, read_state, read_origin = len(kind.measured), tuple_of(model.size), tuple_of(2)
+    linearise, noise = sensor_derivative(model, measuring(model, kind, names)), kind.noise
+    add_noise, target, add_errors = adding_noise(m), target_of(model), adding_errors(m)
+
+    def observe(
+        track: int,
+        mode: int,
+        mean: Floats,
+        covariance: Floats,
+        origin: Floats,
+        parameters: Any,
+        memory: ScanMemory,
+    ) -> float:
+        state, here = read_state(mean), read_origin(origin)
+        linearise(state, here, parameters, memory.step)
+        rows, predicted = memory.step.rows, memory.step.predicted
+        add_errors(rows, predicted, mean, parameters)
+        innovation = Innovation(
+            memory.difference[track, mode], memory.spread[track, mode], memory.cross[track, mode]
+        )
+        spread, cross = innovation.covariance, innovation.cross_covariance
+        for i in range(m):
+            memory.predicted[track, mode, i], innovation.difference[i] = predicted[i], 0.0
+            for row in range(len(covariance)):
+                cross[row, i] = 0.0
+                for k in range(len(covariance)):
+                    cross[row, i] += covariance[row, k] * rows[i, k]
+        for i in range(m):
+            for j in range(m):
+                spread[i, j] = 0.0
+                for k in range(len(covariance)):
+                    spread[i, j] += rows[i, k] * cross[k, j]
+        add_noise(spread, noise(target(state), here, parameters))
+        _, determinant = whiten(innovation, m)
+        kalman_step(innovation, m, memory.step.step)
+        return np.exp(-0.5 * determinant) / (2.0 * np.pi) ** (0.5 * m)
+
+    return observe
+
+
+def correlating(
+    model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
+) -> Function:
+    """Make `correlate(mean, covariance, origin, parameters, work)`: adds sensor errors to a new track.
+
+    The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
+    by the position, whose components stand at `corner`.
+    """
+    x, y = corner
+    read_state, read_origin = tuple_of(model.size), tuple_of(2)
+    of_first, of_second = errors_at(0), errors_at(1)
+    linearise = sensor_derivative(model, measuring(model, kind, names))
+
+    def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
+        """Move the position by so much of an error."""
+        mean[x] += by_x * mean[error]
+        mean[y] += by_y * mean[error]
+        for k in range(len(covariance)):
+            covariance[x, k] += by_x * covariance[error, k]
+            covariance[y, k] += by_y * covariance[error, k]
+        for k in range(len(covariance)):
+            covariance[k, x] += by_x * covariance[k, error]
+            covariance[k, y] += by_y * covariance[k, error]
+
+    def correlate(
+        mean: Floats, covariance: Floats, origin: Floats, parameters: Any, work: Workspace
+    ) -> None:
+        linearise(read_state(mean), read_origin(origin), parameters, work)
+        a, b, c, d = work.rows[0, x], work.rows[0, y], work.rows[1, x], work.rows[1, y]
+        determinant = a * d - b * c
+        for place in of_first(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), -d / determinant, c / determinant)
+        for place in of_second(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), b / determinant, -a / determinant)
+
+    return correlate
+
+
+def comparing(kind: ScanSensor) -> Function:
+    """Make `compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
+    m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
+
+    def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
+        factor, white = memory.spread[track, mode], memory.white[track, mode, detection]
+        squared = 0.0
+        for i in range(m):
+            entry = wrap(memory.place[detection, i] - memory.predicted[track, mode, i], angular[i])
+            for k in range(i):
+                entry -= factor[i, k] * white[k]
+            white[i] = entry / factor[i, i]
+            squared += white[i] * white[i]
+        return squared
+
+    return compare
+
+
+def updating(model: Model, kind: ScanSensor) -> Function:
+    """Make `update(track, mode, detections, mean, covariance, memory)`: by associations in the mode."""
+    m, correct = len(kind.measured), correcting(model.kinds, model.correct)
+    find_slope = sloping(model.kinds, model.correct)
+
+    def update(
+        track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: ScanMemory
+    ) -> None:
+        given, moment, shift, step = memory.given, memory.moment, memory.shift, memory.step.step
+        for i in range(m):
+            shift[i] = 0.0
+            for j in range(m):
+                moment[i, j] = 1.0 - given[0] if i == j else 0.0
+        for detection in range(detections):
+            weight, white = given[1 + detection], memory.white[track, mode, detection]
+            if weight == 0.0:
+                continue
+            for i in range(m):
+                shift[i] += weight * white[i]
+                for j in range(m):
+                    moment[i, j] -= weight * white[i] * white[j]
+        for i in range(m):
+            for j in range(m):
+                moment[i, j] += shift[i] * shift[j]
+        gain = memory.cross[track, mode]
+        for row in range(len(covariance)):
+            step[row] = 0.0
+            for i in range(m):
+                step[row] += gain[row, i] * shift[i]
+            for column in range(row + 1):
+                entry = covariance[row, column]
+                for i in range(m):
+                    for j in range(m):
+                        entry -= gain[row, i] * moment[i, j] * gain[column, j]
+                covariance[row, column] = covariance[column, row] = entry
+        find_slope(mean, covariance, memory.step.slope)
+        correct(mean, covariance, memory.step)
+
+    return update
+
+
+def split_by_mode(
+    run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
+) -> float:
+    """Fill a track's associations in one of its modes; returns how probable the mode is after them."""
+    probability, given = memory.probability[track], memory.given
+    given[0] = probability[0] * tracks.mode[run, track, mode]
+    after = given[0]
+    for detection in range(detections):
+        given[1 + detection] = 0.0
+        if probability[1 + detection] > 0.0:
+            total = 0.0
+            for each in range(tracks.mode.shape[2]):
+                total += memory.likelihood[track, each, detection]
+            share = memory.likelihood[track, mode, detection] / total
+            given[1 + detection] = probability[1 + detection] * share
+            after += given[1 + detection]
+    for entry in range(1 + detections if after > 0.0 else 0):
+        given[entry] /= after
+    return after
+
+
+def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
+    """Fill the detections of a scan, each chain of those within a distance as their mean.
+
+    Chains are in the order of their first detections.
+    """
+    count = end - first
+    for each in range(count):
+        memory.group[each] = each
+    for each in range(count if within > 0.0 else 0):
+        for other in range(each):
+            apart = np.hypot(
+                scans.detection[first + each, 0] - scans.detection[first + other, 0],
+                scans.detection[first + each, 1] - scans.detection[first + other, 1],
+            )
+            if apart <= within and memory.group[each] != memory.group[other]:
+                first_of_both = min(memory.group[each], memory.group[other])
+                joining = max(memory.group[each], memory.group[other])
+                for member in range(each + 1):
+                    if memory.group[member] == joining:
+                        memory.group[member] = first_of_both
+    joined = 0
+    for group in range(count):
+        members, x, y = 0, 0.0, 0.0
+        for member in range(count):
+            if memory.group[member] == group:
+                members += 1
+                x += scans.detection[first + member, 0]
+                y += scans.detection[first + member, 1]
+        if members:
+            memory.place[joined, 0], memory.place[joined, 1] = x / members, y / members
+            joined += 1
+    return joined

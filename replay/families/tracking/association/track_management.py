@@ -1,0 +1,145 @@
+"""Confirms and ends tracks, by counts or by probabilities of existence, for any association.
+
+    existence   how probable it is that the target exists (Musicki, Evans, IEEE TAES 40(3), 2004)
+    hits        detected in M of its first N chances, see Bar-Shalom, Li, Kirubarajan, 2001, 7.8
+    score       the log-likelihood ratio of a target and clutter, tested as Wald does: Blackman, Popoli,
+                Design and Analysis of Modern Tracking Systems, 1999, 6.2
+
+All end a track that has been silent for too long.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.families.tracking.association.association import existence_after
+from fuselog.replay.families.tracking.association.clusters import Weights
+from fuselog.replay.families.tracking.association.tracks import Tracks
+
+# A miss says nothing of a young track where the sensor detects less than every second target.
+CHANCE = 0.5
+
+
+class Management(NamedTuple):
+    """Holds a way to manage tracks.
+
+    Attributes:
+        wait: (run, place, duration_s, tracks, parameters), what time alone changes.
+        judge: (run, place, evidence, tracks, parameters), what a scan changes; it may confirm a track.
+        is_over: (run, place, tracks, parameters) -> whether a track ends.
+    """
+
+    wait: Function
+    judge: Function
+    is_over: Function
+
+
+class Evidence(NamedTuple):
+    """Holds the evidence of a scan for one track.
+
+    Attributes:
+        detectable: how probable its detection in the gate is, if the target exists.
+        probability: (1 + detections,), of no detection and of each, see
+            `fuselog.replay.families.tracking.association.association`.
+        weights: of all tracks.
+    """
+
+    detectable: float
+    probability: Floats
+    weights: Weights
+
+
+def is_silent(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+    """Tell whether no sensor that begins tracks has seen a track for too long."""
+    silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
+    return silent_s > (p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s)
+
+
+def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
+    """Do nothing: time alone changes nothing."""
+    return
+
+
+def confirm(run: int, place: int, tracks: Tracks) -> None:
+    """Take a track for that of a target, for certain."""
+    tracks.is_confirmed[run, place], tracks.existence[run, place] = True, 1.0
+
+
+# Existence
+
+
+def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
+    """Let targets vanish at a steady rate."""
+    tracks.existence[run, place] *= np.exp(-duration_s / p.survival_s)
+
+
+def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+    """Judge by Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
+    before, none = tracks.existence[run, place], evidence.probability[0]
+    tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
+    needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
+    tracks.is_confirmed[run, place] = tracks.existence[run, place] >= needed
+
+
+def does_not_exist(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+    """Tell whether it is silent, or improbable."""
+    return is_silent(run, place, tracks, p) or tracks.existence[run, place] < p.ending_existence
+
+
+# Hits
+
+
+def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+    """Count chances and hits; a miss counts only where a detection was to be expected."""
+    is_hit = evidence.probability[0] < 0.5
+    if is_hit or evidence.detectable >= CHANCE:
+        tracks.chances[run, place] += 1
+    if is_hit:
+        tracks.hits[run, place] += 1
+    if tracks.hits[run, place] >= p.hits_needed:
+        confirm(run, place, tracks)
+
+
+def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+    """Tell whether it is silent, or was not hit often enough in its first chances."""
+    is_young = not tracks.is_confirmed[run, place]
+    return is_silent(run, place, tracks, p) or (is_young and tracks.chances[run, place] >= p.chances)
+
+
+# Score
+
+
+def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+    """Add sum_j b_j log(w_j / b_j), with the weights w of a target that exists.
+
+    Where one map is chosen that is the log of its weight; with all maps of one track, log sum_j w_j.
+    """
+    weights, existence = evidence.weights, tracks.existence[run, place]
+    gain = 0.0
+    for column in range(len(evidence.probability)):
+        probability = evidence.probability[column]
+        if probability > 0.0:
+            weight = 1.0 - evidence.detectable
+            if column > 0:
+                weight = weights.detected[place, column - 1] / existence
+            gain += probability * np.log(weight / probability)
+    tracks.score[run, place] += gain
+    if tracks.score[run, place] > tracks.best_score[run, place]:
+        tracks.best_score[run, place] = tracks.score[run, place]
+    if tracks.score[run, place] >= np.log((1.0 - p.missed_confirmation) / p.false_confirmation):
+        confirm(run, place, tracks)
+
+
+def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+    """Tell whether it is silent, or clutter explains it better since its birth or highest score."""
+    begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
+    lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
+    return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest
+
+
+MANAGEMENTS = {
+    "existence": Management(may_vanish, judge_existence, does_not_exist),
+    "hits": Management(wait_unchanged, judge_hits, was_hit_too_seldom),
+    "score": Management(wait_unchanged, judge_score, has_lost_its_score),
+}

@@ -1,0 +1,99 @@
+"""Puts a tracker together: the model of its targets, the kinds of its sensors, how tracks move."""
+
+from typing import Any, NamedTuple
+
+from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.families.tracking.association.scans import ScanSensor
+from fuselog.replay.families.tracking.association.tracks import Tracks
+from fuselog.replay.inference.kalman.predict import linear_motion
+from fuselog.replay.inference.kalman.steps import Gaussian, Steps, gaussian_filter
+from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.modes.imm import interacting_steps
+from fuselog.replay.inference.modes.mixture import ModeBelief
+
+
+class Tracker(NamedTuple):
+    """Holds a tracker put together.
+
+    Attributes:
+        stage: the targets' model, with one of its motions or all modes.
+        kinds: of sensors.
+        association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
+        names: the parameters that the parts read, in the order of the columns of the settings.
+        shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
+            `fuselog.replay.families.tracking.association.shared_bias`.
+    """
+
+    stage: Stage
+    kinds: tuple[ScanSensor, ...]
+    association: str
+    management: str
+    names: tuple[str, ...]
+    shared: tuple[int, int]
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Count how many modes the model has, and how many components its state and tangent space."""
+        return max(1, len(self.stage.modes)), self.stage.model.size, self.stage.model.tangent
+
+
+class Newborn(NamedTuple):
+    """Holds a target of which only the position is known.
+
+    Attributes:
+        mean, covariance: (n,), (t, t); their entries of the position stand for none.
+        mode: (modes,), the modes' probabilities.
+    """
+
+    mean: Floats
+    covariance: Floats
+    mode: Floats
+
+
+def moving(stage: Stage) -> Steps:
+    """Describe how tracks move: those of several modes as interacting multiple models do."""
+    if not stage.modes:
+        return gaussian_filter(stage, linear_motion(stage), ())
+    alone = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
+    return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
+
+
+def believing(stage: Stage) -> Function:
+    """Make `belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
+
+    def of_one(run: int, tracks: Tracks) -> Gaussian:
+        return Gaussian(tracks.mean[run, :, 0], tracks.covariance[run, :, 0])
+
+    def of_modes(run: int, tracks: Tracks) -> ModeBelief:
+        return ModeBelief(
+            tracks.mean[run], tracks.covariance[run], tracks.mode[run], tracks.log_mode[run]
+        )
+
+    return of_modes if stage.modes else of_one
+
+
+def choosing(functions: list[Function]) -> Function:
+    """Make `call(kind, ...)`: the function of this number."""
+
+    def call(kind: int, *arguments: Any) -> Any:
+        for number in range_of(1, len(functions)):
+            if kind == number:
+                return functions[number](*arguments)
+        return functions[0](*arguments)
+
+    return call
+
+
+def place_of(model: Model) -> tuple[int, int]:
+    """Find where the position stands in the state."""
+    names = list(model.state)
+    return names.index("x_m"), names.index("y_m")
+
+
+def corner_of(model: Model) -> tuple[int, int]:
+    """Find where the position stands in the tangent space."""
+    tangent = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+    return tangent.index("x_m"), tangent.index("y_m")

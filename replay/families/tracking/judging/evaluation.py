@@ -1,0 +1,236 @@
+"""Evaluates the tracks of a replay by the targets that its log has truths of, block by block.
+
+Instants, pairs and distances are those of `errors`, by which experiments judge trackers, too. A target
+is there from the first to the last stamp of its truth. Judged is what the tracker tells of: from a while
+after the log's begin to the last scan that it took.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.planes import frame_of
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
+from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.families.tracking.judging.clear_mot import NONE
+from fuselog.replay.families.tracking.judging.errors import (
+    BURN_IN_S,
+    PERIOD_S,
+    SOME_ARE_KNOWN,
+    VELOCITY,
+    Judged,
+    TracksAt,
+    figures_of_whole_tracks,
+    target_topics,
+    track_errors,
+    track_figures,
+    tracks_at,
+    unreferenced_m,
+)
+from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.frames import not_comparable, seen_in
+from fuselog.replay.judging.errors.truths import Truths
+from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
+from fuselog.replay.judging.metrics.measuring import Metric
+
+# Of a run that is shorter than four burn-ins, tracks have a quarter to begin.
+BURN_IN_SHARE = 0.25
+
+
+class TrackBlock(NamedTuple):
+    """Holds a block of a tracker's sets of tracks: their sizes, the tracks, and each run's targets."""
+
+    estimator: str
+    case: str
+    sizes: Ragged
+    tracks: Ragged
+    targets: Sequence[Judged | None]
+    first_run: int = 0
+
+
+def targets_of(source: Source, frame: str) -> Judged | None:
+    """Return a run's targets in a frame at its instants, NaN where one is not there; None without any.
+
+    Instants are PERIOD_S apart, from BURN_IN_S after the epoch to the end of the last truth.
+    """
+    topics = target_topics(source.topics)
+    truths = {topic: truth for topic, truth in source.read(topics).items() if len(truth)}
+    if not truths:
+        return None
+    last_ns = max(int(truth.publish_time_ns[-1]) for truth in truths.values())
+    span_s = (last_ns - source.epoch_ns) * 1e-9
+    burn_in_s = min(BURN_IN_S, BURN_IN_SHARE * span_s)
+    first_ns = source.epoch_ns + round(burn_in_s * 1e9)
+    at_ns = np.arange(first_ns, last_ns + 1, round(PERIOD_S * 1e9))
+    places = [
+        seen_in(frame, Truths(source), topic, _places(truth, at_ns), at_ns, span_s)
+        for topic, truth in truths.items()
+    ]
+    return Judged(at_ns, np.stack(places), unreferenced_m(truths.values()))
+
+
+def unjudged_tracks(tracks: Stream, sources: Sequence[Source]) -> str:
+    """Explain why tracks cannot be compared with the targets of some run; empty if they can."""
+    reasons = (
+        not_comparable(tracks.metadata, target_topics(source.topics), source.topics)
+        for source in sources
+    )
+    return next(filter(None, reasons), "")
+
+
+def _places(truth: Stream, at_ns: Integers) -> Floats:
+    """Find where a target is at instants, (k, 2); NaN before its first stamp and after its last one."""
+    place, begin_ns = read_vectors(truth, "state", PLANE), truth.publish_time_ns[0]
+    stamps = truth.publish_time_ns - begin_ns
+    axes = [np.interp(at_ns - begin_ns, stamps, axis, left=np.nan, right=np.nan) for axis in place.T]
+    return np.stack(axes, axis=1)
+
+
+def track_blocks(
+    outputs: Mapping[str, Ragged], targets: Mapping[str, Sequence[Judged | None]], first_run: int
+) -> dict[str, TrackBlock]:
+    """Return the sets of tracks among a replay's outputs, or a block of them, by the topic of tracks.
+
+    `targets` are those of the runs, by the frame that they are seen in; tracks in no such frame are left
+    out.
+    """
+    found = {}
+    for topic, tracks in outputs.items():
+        sizes = outputs.get(f"{topic.rpartition('/')[0]}/set")
+        is_track = tracks.stream.schema.full_name == schemas.TRACK_ESTIMATE.full_name
+        if not is_track or sizes is None or not {*PLANE, *VELOCITY} <= {*tracks.stream.components}:
+            continue
+        if (seen := targets.get(frame_of(tracks.stream.metadata))) is not None:
+            found[topic] = TrackBlock(*split_topic(topic), sizes, tracks, seen, first_run)
+    return found
+
+
+class TracksJudge(KindJudge):
+    """Judges sets of tracks by the targets of each run, which are read once for every frame."""
+
+    def __init__(self, runs: JudgedRuns) -> None:
+        super().__init__(runs)
+        self._targets: dict[str, list[Judged | None]] = {}
+
+    def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
+        """Judge a block; see `KindJudge`."""
+        for topic, rows in outputs.items():
+            is_track = rows.stream.schema.full_name == schemas.TRACK_ESTIMATE.full_name
+            if is_track and topic not in self.unjudged:
+                self._find_targets(topic, rows.stream)
+        return [*track_blocks(outputs, self._targets, self.runs.first_run).items()]
+
+    def _find_targets(self, topic: str, tracks: Stream) -> None:
+        """Find what new tracks are judged by, and whether they can be judged."""
+        self.unjudged[topic] = unjudged_tracks(tracks, self.runs.sources)
+        frame = frame_of(tracks.metadata)
+        if self.unjudged[topic] or frame in self._targets:
+            return
+        self._targets[frame] = [targets_of(source, frame) for source in self.runs.sources]
+        if any(targets is not None and targets.is_partial for targets in self._targets[frame]):
+            self.notes = [SOME_ARE_KNOWN]
+
+
+@dataclass
+class Followed:
+    """Holds the tracks of one run as they were told at its instants.
+
+    Attributes:
+        targets: the instants, and where the targets are then.
+        sets: the tracks at the first of these.
+        first: how many instants were over before the first set of tracks; they are not judged.
+        last: the last set of tracks.
+    """
+
+    targets: Judged
+    sets: list[TracksAt] = field(default_factory=list)
+    first: int | None = None
+    last: tuple[Stream, Stream] | None = None
+
+    def add(self, sizes: Stream, tracks: Stream) -> None:
+        """Take in the next sets of tracks."""
+        if not len(sizes):
+            return
+        at_ns = self.targets.time_ns
+        if self.first is None:
+            self.first = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
+        begin = self.first + len(self.sets)
+        # an instant before the block is told by the last set before it
+        before = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
+        if self.last is not None:
+            self.sets += tracks_at(*self.last, at_ns[begin:before])
+        end = int(np.searchsorted(at_ns, sizes.publish_time_ns[-1], side="right"))
+        self.sets += tracks_at(sizes, tracks, at_ns[max(begin, before) : end])
+        count = int(sizes["elements"][-1])
+        self.last = (
+            sizes.take(slice(len(sizes) - 1, None)),
+            tracks.take(slice(len(tracks) - count, None)),
+        )
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Return what the tracks are worth, at the instants told of; {} without tracks or a target."""
+        begin = self.first or 0
+        truths = self.targets.truths[:, begin : begin + len(self.sets)]
+        if not self.sets or not np.isfinite(truths).any():
+            return {}
+        limit_m = self.targets.unreferenced_m
+        errors = track_errors(self.sets, truths, unreferenced_m=limit_m)
+        found = {
+            name: value
+            for name, value in track_figures(errors).items()
+            if not name.startswith("target")  # one by one they are of an experiment's own targets
+        }
+        followed = errors.track != NONE
+        squared = errors.distance[followed] ** 2
+        return found | {
+            "followed_share": float(followed.sum() / errors.present.sum()),
+            "followed_rmse_m": float(np.sqrt(squared.mean())) if len(squared) else np.nan,
+            **figures_of_whole_tracks(self.sets, truths, limit_m),
+        }
+
+
+# What is kept of a run: its tracks while there may be more, then their figures alone.
+State = dict[int, Followed | dict[str, float]]
+
+
+def _add(state: State, block: TrackBlock) -> State:
+    for number, targets in enumerate(block.targets):
+        if targets is not None:
+            followed = state.setdefault(block.first_run + number, Followed(targets))
+            assert isinstance(followed, Followed)
+            followed.add(block.sizes.of_run(number), block.tracks.of_run(number))
+    return state
+
+
+def _merge(first: State, second: State) -> State:
+    return {**_figures(first), **_figures(second)}
+
+
+def _figures(state: State) -> dict[int, dict[str, float]]:
+    return {run: of.figures if isinstance(of, Followed) else of for run, of in sorted(state.items())}
+
+
+def _finish(state: State) -> dict[str, float]:
+    """Return the means over the runs of which they are known."""
+    runs = [figures for figures in _figures(state).values() if figures]
+    found = {}
+    for name in dict.fromkeys(name for figures in runs for name in figures):
+        known = [figures[name] for figures in runs if np.isfinite(figures.get(name, np.nan))]
+        found[name] = float(np.mean(known)) if known else np.nan
+    return found
+
+
+FOLLOWING = Metric(
+    "GOSPA of tracks, cutoff 20 m, HOTA and IDF1 against the truths of targets",
+    TrackBlock,
+    dict,
+    _add,
+    _merge,
+    _finish,
+)

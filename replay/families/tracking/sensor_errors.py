@@ -1,0 +1,126 @@
+"""Describes errors of sensors that stay: components of every track's state beside the target's.
+
+A registration error is constant and that of all tracks; a correlated one is each track's own, such as
+where on a hull a box lies, and another one after `correlation_s`: a first-order Gauss-Markov process.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.vectors.components import Components
+from fuselog.replay.families.tracking.association.scans import ScanSensor
+from fuselog.replay.families.tracking.association.tracker import Newborn
+from fuselog.replay.families.tracking.targets import Targets
+from fuselog.replay.inference.linear_algebra.manifold import is_flat
+from fuselog.replay.inference.model.model import Model, Motion
+from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.validation import trial_state
+
+BY_SORT = ("registration", "correlated")
+
+
+class Errors(NamedTuple):
+    """Describes the errors of sensors, the registration errors first.
+
+    Attributes:
+        names: of the components.
+        sigma, correlation_s: of each, (errors,); a constant has infinity for the second.
+        shared: how many are registration errors.
+        places: by sensor, where its errors stand among them: of a sort and a measured component, as
+            `registration_at_0`; -1 for nowhere.
+    """
+
+    names: tuple[str, ...]
+    sigma: Floats
+    correlation_s: Floats
+    shared: int
+    places: list[dict[str, float]]
+
+
+def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
+    """Return the errors that settings give their sensors a sigma for."""
+    names: list[str] = []
+    sigmas, times, shared = [], [], 0
+    places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]
+    for sort in BY_SORT:
+        is_constant = sort == "registration"
+        for sensor, kind, values, own in zip(sensors, kinds, settings, places, strict=True):
+            for i, (component, of_kind) in enumerate(kind.measured.items()):
+                sigma = values[f"{sort}_sigma_{'rad' if of_kind == 'angle' else 'm'}"]
+                if sigma > 0.0:
+                    own[f"{sort}_at_{i}"] = len(names)
+                    names.append(f"{sensor.replace('-', '_')}_{sort}_{component}")
+                    sigmas.append(sigma)
+                    times.append(np.inf if is_constant else values["correlation_s"])
+                    shared += is_constant
+    return Errors(tuple(names), np.array(sigmas), np.array(times), shared, places)
+
+
+def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
+    """Return targets whose state has the errors too.
+
+    Raises BadInput that begins with `where` where the model cannot be joined with them.
+    """
+    if not errors.names:
+        return targets
+    stage, (mean, covariance, mode) = targets.stage, targets.newborn
+    if not is_flat(stage.model.kinds) or any(each.noises for each in stage.modes or (stage.motion,)):
+        raise BadInput(
+            f"{where}: errors of sensors need a model without rotations in its state and with additive "
+            "noise; take another"
+        )
+    if errors.shared and stage.modes:
+        raise BadInput(
+            f"{where}: registration errors need targets of one motion; give mode=..., or "
+            "correlated errors"
+        )
+    size, longer = len(mean), len(mean) + len(errors.names)
+    wider = np.zeros((longer, longer))
+    wider[:size, :size], wider[range(size, longer), range(size, longer)] = covariance, errors.sigma**2
+    newborn = Newborn(np.append(mean, np.zeros(longer - size)), wider, mode)
+    lengths = tuple(
+        len(each.noise(trial_state(stage.model.kinds), 1.0, targets.parameters))
+        for each in (stage.motion, *stage.modes)
+        if each.noise is not None
+    )
+    return Targets(_longer(stage, errors.names, lengths), targets.parameters, newborn)
+
+
+@lru_cache(maxsize=64)
+def _longer(stage: Stage, names: tuple[str, ...], lengths: tuple[int, ...]) -> Stage:
+    motion, *modes = (
+        _moving(stage.model, each, names, length)
+        for each, length in zip((stage.motion, *stage.modes), lengths, strict=True)
+    )
+    state: Components = {**stage.model.state, **dict.fromkeys(names, "linear")}
+    model = Model(stage.model.summary, state, stage.model.parameters, (), motion, stage.model.modes)
+    return Stage(model, motion, (), tuple(modes))
+
+
+def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:
+    """Return a motion beside which the errors fade and are renewed; its noise has `noises` numbers."""
+    n, is_triangle = model.size, noises > model.size
+    move_own, noise_own = motion.move, motion.noise
+    assert noise_own is not None
+
+    def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+        moved = list(move_own(state[:n], control, duration_s, parameters))
+        for row, name in enumerate(names):
+            share = np.exp(-duration_s / getattr(parameters, f"{name}_s"))
+            moved.append(state[n + row] * share)
+        return tuple(moved)
+
+    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        found = list(noise_own(state[:n], duration_s, parameters))
+        for row, name in enumerate(names):
+            found += [0.0] * (n + row) if is_triangle else []
+            variance = getattr(parameters, f"{name}_sigma") ** 2
+            found.append(-variance * np.expm1(-2.0 * duration_s / getattr(parameters, f"{name}_s")))
+        return tuple(found)
+
+    return Motion(move, noise, linear=motion.linear)

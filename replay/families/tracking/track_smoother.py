@@ -1,0 +1,50 @@
+"""Smooths a tracker's tracks: says at the end what all detections say of every state."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.families.tracking.association.track_smoothing import smooth_tracks
+from fuselog.replay.families.tracking.targets import Targets
+
+
+def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
+    """Raise BadInput where tracks cannot be smoothed: of several motions, or with errors of sensors.
+
+    Args:
+        name: the estimator's.
+        targets: how they move.
+        errors: the names of sensors' errors in the tracks' states.
+    """
+    if errors:
+        raise BadInput(
+            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
+            "of sensors"
+        )
+    if targets.stage.modes or not targets.stage.motion.linear:
+        raise BadInput(
+            f"estimator {name}: smoothed tracks need a model with one linear motion; leave "
+            "out smoothed, or take another model, or one of its modes"
+        )
+
+
+def smoothed(tracks: Ragged, targets: Targets) -> Ragged:
+    """Return the stream of tracks with smoothed states."""
+    stream, size = tracks.stream, targets.stage.model.size
+    run = run_of_rows(tracks.offsets)
+    _, track = np.unique(
+        np.stack([run, stream["track_id"].astype(np.int64)]), axis=1, return_inverse=True
+    )
+    mean, covariance = smooth_tracks(
+        targets.stage,
+        targets.parameters,
+        track.ravel(),
+        stream.publish_time_ns,
+        stream["mean"],
+        stream["covariance"].reshape(-1, size, size),
+    )
+    columns = {**stream.columns, "mean": mean, "covariance": covariance.reshape(-1, size**2)}
+    return Ragged(replace(stream, columns=columns), tracks.offsets)

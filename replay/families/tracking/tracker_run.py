@@ -1,0 +1,190 @@
+"""Runs a tracker over its scans, in order or going back for late ones, and smooths tracks at the end."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fuselog.replay.engine.api.inputs import Given
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, join, of_runs
+from fuselog.replay.families.tracking.association.outputs import TrackOutputs, of_last
+from fuselog.replay.families.tracking.association.scans import Scans, in_time, take_scans
+from fuselog.replay.families.tracking.association.tracker import Tracker
+from fuselog.replay.families.tracking.association.tracking import track_scans
+from fuselog.replay.families.tracking.association.tracks import Tracks, no_tracks
+from fuselog.replay.families.tracking.scan_sensors import KINDS
+from fuselog.replay.families.tracking.scans import Fixes, SensorTopics, latest_fixes, scans_of
+from fuselog.replay.families.tracking.targets import Targets
+from fuselog.replay.families.tracking.track_outputs import track_outputs
+from fuselog.replay.families.tracking.track_smoother import smoothed
+
+
+class TrackerSetup(NamedTuple):
+    """Holds a tracker as bound to a log.
+
+    Attributes:
+        name: the estimator's.
+        found: its sensors.
+        tracker: what it is made of.
+        settings: (sensors, names), the parameters for each sensor.
+        targets: how they move, and what one is like of which only the position is known.
+        most_tracks: room for so many.
+        smoothed: whether tracks are smoothed at the end.
+    """
+
+    name: str
+    found: SensorTopics
+    tracker: Tracker
+    settings: Floats
+    targets: Targets
+    most_tracks: int
+    smoothed: bool
+
+    def no_tracks(self, runs: int) -> Tracks:
+        """Return the tracks of runs in which nothing was met yet."""
+        first, count = self.tracker.shared
+        shared = self.targets.newborn.covariance[first : first + count, first : first + count]
+        return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
+
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
+        """Return the tracks after some scans, and what is said of them."""
+        return track_scans(self.tracker, scans, self.settings, self.targets.newborn, tracks)
+
+    def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
+        """Return the streams of what is said of these scans; see `track_outputs`."""
+        return track_outputs(
+            self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
+        )
+
+
+class OutOfSequenceState(NamedTuple):
+    """Holds one run whose scans may come late.
+
+    Attributes:
+        base: the tracks after all scans that no late one can precede any more.
+        pending: the scans after those, in time order.
+        head: the tracks after all scans.
+    """
+
+    base: Tracks
+    pending: Scans
+    head: Tracks
+
+
+class TrackerState(NamedTuple):
+    """Carries the last own positions and the tracks from block to block.
+
+    Attributes:
+        fixes: by topic and run.
+        tracks: of all runs, after all scans; where scans may come late as before all of them.
+        late: where scans may come late, what each run carries.
+        outputs: where tracks are smoothed, what is said at the end, by block.
+    """
+
+    fixes: Fixes
+    tracks: Tracks
+    late: tuple[OutOfSequenceState, ...] = ()
+    outputs: tuple[list[Ragged], ...] = ()
+
+
+def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
+    """Start where nothing was met yet."""
+    setup, runs = given.setup, given.runs
+    unknown: list[Any] = [None] * runs
+    fixes: Fixes = {topic: unknown for topic in setup.found.origins if topic}
+    return setup, TrackerState(fixes, setup.no_tracks(runs))
+
+
+def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[TrackerState, list[Ragged]]:
+    """Track a block; see `fuselog.replay.engine.api.functions.recursive`."""
+    scans, fixes = _scans(state, block, setup)
+    tracks, batches = setup.track(state.tracks, scans)
+    outputs = _joined([setup.outputs(batch, tracked) for batch, tracked in batches])
+    after = state._replace(fixes=fixes, tracks=tracks)
+    if setup.smoothed:
+        return after._replace(outputs=(*state.outputs, outputs)), []
+    return after, outputs
+
+
+def finish(setup: TrackerSetup, state: TrackerState) -> list[Ragged]:
+    """Return what was kept until the end, with the tracks smoothed."""
+    outputs = _joined([each for each in state.outputs if each])
+    return [
+        smoothed(each, setup.targets) if each.stream.topic.endswith("/track") else each
+        for each in outputs
+    ]
+
+
+def _joined(outputs: Sequence[Sequence[Ragged]]) -> list[Ragged]:
+    """Join the topics of one part after the other."""
+    return [join(parts) for parts in zip(*outputs, strict=True)]
+
+
+def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
+    """Return a block's scans, and the last own positions after it."""
+    scans = scans_of(block, setup.found, KINDS, state.fixes)
+    fixes = state.fixes.items()
+    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
+
+
+def advance_out_of_sequence(
+    setup: TrackerSetup, state: TrackerState, block: Block, *, back_ns: int
+) -> tuple[TrackerState, list[Ragged]]:
+    """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
+
+    A late scan is put in its place and those after it are used again; what was said stays, and is said
+    again at the latest stamp.
+    """
+    scans, fixes = _scans(state, block, setup)
+    after, outputs = [], []
+    for number, late in enumerate(state.late or _before_all(state.tracks, scans)):
+        batches = list[list[Ragged]]()
+        for rows in _stretches(late, scans, *scans.offsets[number : number + 2]):
+            late, tracked = _take(late, take_scans(scans, rows), setup, back_ns)
+            batches += tracked
+        after.append(late)
+        outputs.append(_joined(batches))
+    filled = next((each for each in outputs if each), [])
+    empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
+    by_topic = zip(*(each or empty for each in outputs), strict=True)
+    said = [gather([each.stream for each in parts]) for parts in by_topic]
+    return state._replace(fixes=fixes, late=tuple(after)), said
+
+
+def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
+    """Yield every run as it is before its first scan."""
+    none = take_scans(scans, np.empty(0, np.int64))
+    for run in range(len(tracks.used)):
+        own = of_runs(tracks, slice(run, run + 1))
+        yield OutOfSequenceState(own, none, own)
+
+
+def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+    """Yield rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
+    newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
+    late = scans.time_ns[first:end] < newest_ns
+    cuts = np.flatnonzero(late | np.append(False, late[:-1]))
+    return (first + rows for rows in np.split(np.arange(end - first), cuts) if len(rows))
+
+
+def _take(
+    out_of_sequence: OutOfSequenceState, arrived: Scans, setup: TrackerSetup, back_ns: int
+) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
+    """Take one run through scans that go on in time, or one that is late; also what is said then."""
+    base, pending, head = out_of_sequence
+    repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
+    pending = in_time(pending, arrived)
+    if repeated:
+        head, batches = setup.track(base, pending)
+        outputs = [setup.outputs(*of_last(*batches[-1]), repeated=repeated)]
+    else:
+        head, batches = setup.track(head, arrived)
+        outputs = [setup.outputs(batch, tracked) for batch, tracked in batches]
+    rows = np.arange(len(pending.time_ns))
+    settled = pending.time_ns < pending.time_ns[-1] - back_ns
+    if settled.any():
+        base, _ = setup.track(base, take_scans(pending, rows[settled]))
+        pending = take_scans(pending, rows[~settled])
+    return OutOfSequenceState(base, pending, head), outputs

@@ -1,0 +1,126 @@
+"""Tracks one vehicle by its own fixes: the paper's reference, association known.
+
+Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
+symmetric measurement equation filter", 2016, section 4.1. Each vehicle is an estimate of its own.
+
+Not of the paper: the modes of a vehicle that turns and stops, for an interacting multiple model. It
+drives as the paper says, manoeuvres with larger accelerations, or stands; between driving and standing
+it brakes or starts, which is a manoeuvre.
+"""
+
+from typing import Any
+
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from fuselog.recorders.families.vehicles.models import noise_moments, turn
+from fuselog.recorders.log import schemas
+from fuselog.recorders.models.planar import Components
+from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.model.model import Model, Motion, Sensor, Switching
+from fuselog.replay.inference.model.parameters import ModelParameters
+
+
+class VehicleParameters(ModelParameters):
+    """States how the vehicle moves, and the rates of change between its modes.
+
+    Attributes:
+        turn_rate_radps: turn rate that the vehicle keeps.
+        acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
+        manoeuvring_sigma_mps2: standard deviation of the acceleration of a time step in a manoeuvre, per
+            axis.
+        standing_sigma_mps: standard deviation of the velocity of a vehicle that stands, per axis.
+        manoeuvres_per_s: rate of changes from driving to a manoeuvre.
+        settles_per_s: rate of changes from a manoeuvre to driving.
+        stops_per_s: rate of changes from a manoeuvre to standing.
+        starts_per_s: rate of changes from standing to a manoeuvre.
+    """
+
+    turn_rate_radps: float | None = None
+    acceleration_sigma_mps2: NonNegativeFloat | None = None
+    sigma_fix_m: PositiveFloat | None = None
+    manoeuvring_sigma_mps2: NonNegativeFloat = 3.0
+    standing_sigma_mps: NonNegativeFloat = 0.05
+    manoeuvres_per_s: NonNegativeFloat = 0.1
+    settles_per_s: NonNegativeFloat = 0.2
+    stops_per_s: NonNegativeFloat = 0.1
+    starts_per_s: NonNegativeFloat = 0.1
+
+
+def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
+    """Move by a coordinated turn."""
+    return turn(state, parameters.turn_rate_radps, duration_s)
+
+
+def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """Return the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    place, mixed, velocity = noise_moments(parameters.acceleration_sigma_mps2, duration_s)
+    return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
+
+
+def manoeuvring_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """Compute noise as `acceleration_noise`, of larger accelerations."""
+    place, mixed, velocity = noise_moments(parameters.manoeuvring_sigma_mps2, duration_s)
+    return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
+
+
+def stand(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
+    """Return the state, which stays where it is."""
+    return state[0], 0.0 * state[1], state[2], 0.0 * state[3]
+
+
+def standing_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """Return the variances of what little a standing vehicle moves."""
+    velocity = parameters.standing_sigma_mps**2
+    return velocity * duration_s**2, velocity, velocity * duration_s**2, velocity
+
+
+def mode_rates(parameters: Any) -> Components:
+    """Return the rates from driving, manoeuvring and standing to the others, in this order."""
+    return (
+        parameters.manoeuvres_per_s,
+        0.0,
+        parameters.settles_per_s,
+        parameters.stops_per_s,
+        0.0,
+        parameters.starts_per_s,
+    )
+
+
+def position(state: Components, reference: Any, parameters: Any) -> Components:
+    """Return where the vehicle is."""
+    return state[0], state[2]
+
+
+def fix_noise(parameters: Any) -> Components:
+    """Return the variances of a fix that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
+
+
+DRIVE = Motion(move, acceleration_noise, linear=True)
+VEHICLE = Model(
+    "vehicle in the plane from its own fixes",
+    dict.fromkeys(PLANE_MOTION, "linear"),
+    VehicleParameters,
+    (
+        Sensor(
+            "fix",
+            schemas.POSITION_FIX,
+            PLANE,
+            position,
+            fix_noise,
+            vector="position_m",
+            covariance="covariance_m2",
+            linear=True,
+        ),
+    ),
+    DRIVE,
+    {
+        "drive": DRIVE,
+        "manoeuvre": Motion(move, manoeuvring_noise, linear=True),
+        "stand": Motion(stand, standing_noise, linear=True),
+    },
+    Switching(mode_rates),
+)
+VEHICLE_KALMAN = modelled(VEHICLE, "ekf")

@@ -1,0 +1,352 @@
+"""Filters several vehicles as one joint Gaussian, all runs of an ensemble at once.
+
+Sources: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
+the symmetric measurement equation filter", 2016; Bar-Shalom, Li, "Multitarget-Multisensor Tracking",
+1995, 6.2 (the collapse over associations). The state is (x, vx, y, vy) of every vehicle and then,
+where it is estimated along, the infrastructure sensor's pose (x, y, heading).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fuselog.recorders.families.vehicles.models import noise_moments, turn
+from fuselog.recorders.models.planar import into_frame
+from fuselog.replay.engine import chi2
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.families.vehicles.association import Hypotheses
+
+STATES = 4  # of a vehicle
+POSE = 3  # components of the sensor's pose
+# A topology so improbable, chi-square with one degree of freedom, is of other things than the vehicles.
+TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
+
+
+class Joint(NamedTuple):
+    """Holds Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
+
+    mean: Floats
+    covariance: Floats
+
+    def of(self, rows: Integers) -> "Joint":
+        """Return some of the runs."""
+        return Joint(self.mean[rows], self.covariance[rows])
+
+
+class Motion(NamedTuple):
+    """Describes how the vehicles move: turn rates and sigmas of the acceleration, (vehicles,) each."""
+
+    turn_rate_radps: Floats
+    acceleration_sigma_mps2: Floats
+
+    @property
+    def vehicles(self) -> int:
+        """Return how many there are."""
+        return len(self.turn_rate_radps)
+
+
+def positions(motion: Motion, mean: Floats) -> Floats:
+    """Return the vehicles' positions (runs, vehicles, 2).
+
+    Args:
+        motion: for how many vehicles there are.
+        mean: (runs, n), see above.
+    """
+    count = motion.vehicles
+    return mean[:, : STATES * count].reshape(-1, count, STATES)[..., 0::2]
+
+
+def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) -> Floats:
+    """Make the matrix (axes * vehicles, states) that takes these axes of all positions from a state."""
+    rows = np.zeros((vehicles, len(axes), states))
+    for place, axis in enumerate(axes):
+        rows[np.arange(vehicles), place, STATES * np.arange(vehicles) + 2 * axis] = 1.0
+    return rows.reshape(-1, states)
+
+
+def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
+    """Return the joint state after `duration_s`: coordinated turns and white accelerations."""
+    states = joint.mean.shape[1]
+    transition, noise = np.eye(states), np.zeros((states, states))
+    for vehicle in range(motion.vehicles):
+        own = slice(STATES * vehicle, STATES * (vehicle + 1))
+        transition[own, own] = np.stack(
+            turn(np.eye(STATES), motion.turn_rate_radps[vehicle], duration_s)
+        )
+        first, cross, second = noise_moments(motion.acceleration_sigma_mps2[vehicle], duration_s)
+        noise[own, own] = np.kron(np.eye(2), [[first, cross], [cross, second]])
+    half = joint.covariance @ transition.T
+    return Joint(joint.mean @ transition.T, half.swapaxes(1, 2) @ transition.T + noise)
+
+
+class Gain(NamedTuple):
+    """Holds what a linear measurement does to a covariance; S is the innovation's covariance.
+
+    inverse: S^-1 (runs, m, m); log_determinant (runs,) of S; gain (runs, n, m); covariance after.
+    """
+
+    inverse: Floats
+    log_determinant: Floats
+    gain: Floats
+    covariance: Floats
+
+
+def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
+    """Compute Kalman's gain, and what it makes of the covariance.
+
+    Args:
+        covariance: (runs, n, n).
+        rows: (m, n), or (runs, m, n).
+        noise: (runs, m, m).
+    """
+    cross = covariance @ rows.swapaxes(-1, -2)
+    innovation = rows @ cross + noise
+    inverse: Floats = np.asarray(np.linalg.inv(innovation), np.float64)
+    gain = cross @ inverse
+    after = covariance - gain @ cross.swapaxes(1, 2)
+    log_determinant = np.asarray(np.linalg.slogdet(innovation)[1], np.float64)
+    return Gain(inverse, log_determinant, gain, 0.5 * (after + after.swapaxes(1, 2)))
+
+
+def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joint:
+    """Update by Kalman's filter; an innovation of NaN was not measured.
+
+    Args:
+        joint: the Gaussians of all runs.
+        rows: (m, n), or (runs, m, n).
+        innovation: (runs, m), NaN where not measured.
+        noise: (runs, m, m).
+    """
+    missing = np.isnan(innovation)
+    if missing.any():
+        there = ~missing
+        rows = np.where(there[..., None], rows, 0.0)
+        unit = np.eye(innovation.shape[1])
+        noise = np.where(there[:, :, None] & there[:, None, :], noise, unit)
+        innovation = np.where(there, innovation, 0.0)
+    found = gain_of(joint.covariance, rows, noise)
+    return Joint(joint.mean + (found.gain @ innovation[..., None])[..., 0], found.covariance)
+
+
+class Weighed(NamedTuple):
+    """Holds hypotheses with scores: log weight and likelihood of the innovations, zero where missed.
+
+    `group` (h,) says which row of the gains a hypothesis has; those of a run that miss the same vehicles
+    share one. `group_run` is the run of each row.
+    """
+
+    score: Floats
+    innovations: Floats
+    group: Integers
+    group_run: Integers
+    gains: Gain
+
+
+def weigh(
+    joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
+) -> Weighed:
+    """Return the likelihood of every hypothesis, by all vehicles together.
+
+    Args:
+        joint: before the measurement.
+        rows: takes the measured components of all vehicles from the state, (m, n).
+        innovations: of every hypothesis, (h, m), NaN for a vehicle that was not detected.
+        noise: the variance of every measured component, (m,).
+        hypotheses: sorted by run, at least one for every run.
+    """
+    there = ~np.isnan(innovations)
+    innovations = np.where(there, innovations, 0.0)
+    groups, group = _distinct(np.concatenate([hypotheses.run[:, None], there], axis=1))
+    run, seen = groups[:, 0], groups[:, 1:].astype(bool)
+    masked = rows if seen.all() else rows * seen[:, :, None]
+    matrices = np.where(seen, noise, 1.0)[:, :, None] * np.eye(len(noise))
+    gains = gain_of(joint.covariance[run], masked, matrices)
+    distance = np.einsum("hi,hij,hj->h", innovations, gains.inverse[group], innovations)
+    counted = np.log(2.0 * np.pi) * there.sum(axis=1)
+    likelihood = -0.5 * (distance + gains.log_determinant[group] + counted)
+    return Weighed(hypotheses.log_weight + likelihood, innovations, group, run, gains)
+
+
+def collapse(
+    joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
+) -> Joint:
+    """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
+
+    Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
+    is what an exact symmetric measurement equation filter collapses to.
+
+    Args:
+        joint, rows, innovations, noise, hypotheses: as for `weigh`.
+    """
+    score, innovations, group, run, gains = weigh(joint, rows, innovations, noise, hypotheses)
+    weight = normalised(score, hypotheses.run)
+    total = _sums(weight, group, len(run))
+    first = _sums(weight[:, None] * innovations, group, len(run))
+    squares = innovations[:, :, None] * innovations[:, None, :]
+    second = _sums(weight[:, None, None] * squares, group, len(run))
+    moved = (gains.gain @ first[..., None])[..., 0]
+    spread = gains.gain @ second @ gains.gain.swapaxes(1, 2) + total[:, None, None] * gains.covariance
+    shift = _sums(moved, run, len(joint.mean))
+    covariance = _sums(spread, run, len(joint.mean)) - shift[:, :, None] * shift[:, None, :]
+    return Joint(joint.mean + shift, covariance)
+
+
+def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
+    """Find a pattern's distinct rows, its first column being sorted, and which of them each row is."""
+    if len(pattern) == 0 or pattern[:, 1:].all():
+        runs, group = np.unique(pattern[:, 0], return_inverse=True)
+        return np.concatenate([runs[:, None], np.ones_like(pattern[: len(runs), 1:])], axis=1), group
+    groups, group = np.unique(pattern, axis=0, return_inverse=True)
+    return groups, group.reshape(-1)
+
+
+def _sums(values: Floats, group: Integers, groups: int) -> Floats:
+    """Sum rows by group; groups are mostly of a single row."""
+    out = np.zeros((groups, *values.shape[1:]))
+    if len(values) == groups and np.array_equal(group, np.arange(groups)):
+        return values
+    np.add.at(out, group, values)
+    return out
+
+
+def normalised(score: Floats, run: Integers) -> Floats:
+    """Return exp(score), scaled to sum one in each run.
+
+    Args:
+        score, run: (h,), the latter sorted.
+    """
+    first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
+    count = np.diff(np.append(first, len(run)))
+    weight = np.exp(score - np.repeat(np.maximum.reduceat(score, first), count))
+    return weight / np.repeat(np.add.reduceat(weight, first), count)
+
+
+def spread_of(places: Floats) -> Floats:
+    """Return the sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
+    return np.sum((places - places.mean(axis=-2, keepdims=True)) ** 2, axis=(-2, -1))
+
+
+def topology(places: Floats) -> Floats:
+    """Compute the paper's (18), all squared distances between pairs, (...,) of (..., vehicles, 2)."""
+    return places.shape[-2] * spread_of(places)
+
+
+def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats]:
+    """Compute mean and variance (...,) of what noise adds to the measured topology of places.
+
+    Args:
+        places: (..., vehicles, 2), in m.
+        variance_m2: of the noise, per axis.
+    """
+    count = places.shape[-2]
+    added = 2.0 * count * (count - 1) * variance_m2
+    variance = 4.0 * count**2 * variance_m2 * (spread_of(places) + (count - 1) * variance_m2)
+    return np.full(places.shape[:-2], added), variance
+
+
+class Scalar(NamedTuple):
+    """Holds a linearised scalar measurement: rows (runs, 1, n), innovations (runs,), their variances.
+
+    `noise` (runs,) is the measurement's part of the variance.
+    """
+
+    rows: Floats
+    innovation: Floats
+    variance: Floats
+    noise: Floats
+
+
+def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
+    """Return the topology of scans, whatever their frame and order.
+
+    The innovation is NaN where it is too improbable: something was missed and something else taken for
+    a vehicle.
+
+    Args:
+        motion, joint: of the vehicles in all runs.
+        detections: full scans, (runs, vehicles, 2), in m.
+        variance_m2: of a detection, per axis.
+    """
+    places = positions(motion, joint.mean)
+    added, noise = topology_moments(places, variance_m2)
+    innovation = topology(detections) - added - topology(places)
+    count, states = motion.vehicles, joint.mean.shape[1]
+    gradient = 2.0 * count * (places - places.mean(axis=1, keepdims=True))
+    rows = gradient.reshape(-1, 1, 2 * count) @ position_rows(count, states)
+    variance = (rows @ joint.covariance @ rows.swapaxes(1, 2))[:, 0, 0] + noise
+    innovation[innovation**2 > TOPOLOGY_GATE * variance] = np.nan
+    return Scalar(rows, innovation, variance, noise)
+
+
+def update_by_scalar(joint: Joint, measured: Scalar) -> Joint:
+    """Apply Kalman's update by a scalar measurement."""
+    return update(joint, measured.rows, measured.innovation[:, None], measured.noise[:, None, None])
+
+
+class Sight(NamedTuple):
+    """Holds what the infrastructure sensor should see: places (runs, m), Jacobian (runs, m, n)."""
+
+    predicted: Floats
+    rows: Floats
+
+
+def sight_of(motion: Motion, joint: Joint) -> Sight:
+    """Predict what the sensor with the estimated pose should see of the estimated vehicles."""
+    count, states = motion.vehicles, joint.mean.shape[1]
+    places, pose = positions(motion, joint.mean), joint.mean[:, -POSE:]
+    seen = np.stack(into_frame(pose.T[:, :, None], np.moveaxis(places, -1, 0)), axis=-1)
+    cosine, sine = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turned = np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], axis=1)
+    rows = np.zeros((len(seen), count, 2, states))
+    for vehicle in range(count):
+        first = STATES * vehicle
+        rows[:, vehicle, :, first] = turned[:, :, 0]
+        rows[:, vehicle, :, first + 2] = turned[:, :, 1]
+    rows[:, :, :, -POSE : -POSE + 2] = -turned[:, None]
+    rows[:, :, 0, -1], rows[:, :, 1, -1] = seen[..., 1], -seen[..., 0]
+    return Sight(seen.reshape(len(seen), -1), rows.reshape(len(seen), 2 * count, states))
+
+
+def update_by_shape(
+    motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
+) -> Joint:
+    """Update by what a sensor sees from a pose of which nothing is known before.
+
+    What any change of the pose would change is left out of the update of the vehicles; then the pose
+    follows from them.
+
+    Args:
+        motion, joint: of the vehicles in all runs.
+        pose: (runs, 3), x, y, heading, where to linearise and no more.
+        seen: (runs, vehicles, 2) in the sensor's frame, NaN where not seen.
+        variance_m2: of a detection, per axis.
+    """
+    own = slice(0, STATES * motion.vehicles)
+    mean = joint.mean.copy()
+    mean[:, -POSE:] = pose
+    sight = sight_of(motion, Joint(mean, joint.covariance))
+    innovation = seen.reshape(len(seen), -1) - sight.predicted
+    there = np.isfinite(innovation)
+    innovation = np.where(there, innovation, 0.0)
+    rows = np.where(there[..., None], sight.rows, 0.0)
+    by_place, by_pose = rows[..., own], rows[..., -POSE:]
+    turned, triangle = np.linalg.qr(by_pose, mode="complete")
+    shape = np.swapaxes(turned[..., POSE:], 1, 2)
+    solve = np.linalg.solve(triangle[:, :POSE], np.swapaxes(turned[..., :POSE], 1, 2))
+    vehicles = update(
+        Joint(mean[:, own], joint.covariance[:, own, own]),
+        shape @ by_place,
+        (shape @ innovation[..., None])[..., 0],
+        variance_m2 * np.eye(shape.shape[1]),
+    )
+    shift = (vehicles.mean - mean[:, own])[..., None]
+    follows = -solve @ by_place
+    cross = vehicles.covariance @ np.swapaxes(follows, 1, 2)
+    covariance = np.empty_like(joint.covariance)
+    covariance[:, own, own] = vehicles.covariance
+    covariance[:, own, -POSE:] = cross
+    covariance[:, -POSE:, own] = np.swapaxes(cross, 1, 2)
+    covariance[:, -POSE:, -POSE:] = follows @ cross + variance_m2 * solve @ np.swapaxes(solve, 1, 2)
+    moved = (solve @ innovation[..., None] + follows @ shift)[..., 0]
+    return Joint(np.concatenate([vehicles.mean, pose + moved], axis=1), covariance)

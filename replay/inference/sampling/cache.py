@@ -1,0 +1,98 @@
+"""Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
+
+A file (see `fuselog.replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named
+after their sets. Common sets ship with the package (see `sampling.ship`); others are kept
+in the user's cache.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+import numpy as np
+
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.compiling.cache import cache_folder, is_private, read_checked, write_checked
+from fuselog.replay.inference.sampling.distance import Array
+from fuselog.replay.inference.sampling.lcd import (
+    Report,
+    check_count,
+    lcd_samples,
+    moment_corrected,
+    silent,
+)
+
+SHIPPED = files("fuselog_data") / "lcd-samples.bin"
+
+
+@dataclass(frozen=True)
+class SetName:
+    """Identifies one moment-corrected LCD set."""
+
+    dimension: int
+    count: int
+    symmetric: bool = False
+    seed: int = 0
+
+    def __str__(self) -> str:
+        """Return the name in an archive; raise its version whenever another set is to come out."""
+        kind = "symmetric" if self.symmetric else "free"
+        return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
+
+
+def cached_set(name: SetName, report: Report = silent) -> Array:
+    """Return one set (count, dimension), from the shipped file, the user's cache, or computed now.
+
+    Args:
+        name: the set.
+        report: told when the set is computed, how far that is, and where it could not be kept.
+
+    Raises:
+        BadInput: no such set exists, see `check_count`.
+    """
+    check_count(name.dimension, name.count, name.symmetric)
+    path = cache_folder() / "samples" / f"{name}.bin"
+    points = read_set(SHIPPED, name)
+    if points is not None:
+        return points
+    if not is_private(path.parent):
+        return compute_set(name, report)
+    points = read_set(path, name)
+    if points is not None:
+        return points
+    if path.exists():
+        report(f"{path} is damaged or not ours; its samples are computed again")
+    points = compute_set(name, report)
+    try:
+        write_sets(path, {name: points}, "fuselog on demand")
+    except BadInput as error:
+        report(f"{error}; its samples are not kept")
+    return points
+
+
+def compute_set(name: SetName, report: Report = silent) -> Array:
+    """Compute one set; the same name gives the same bytes on one machine."""
+    generator = np.random.default_rng(name.seed)
+    return moment_corrected(
+        lcd_samples(name.dimension, name.count, generator, symmetric=name.symmetric, report=report)
+    )
+
+
+def read_set(source: Path | Traversable, name: SetName) -> Array | None:
+    """Return one set of a file, or None where the file is damaged or one of them is not there."""
+    archive = read_checked(source)
+    if archive is None:
+        return None
+    with np.load(io.BytesIO(archive)) as sets:
+        return sets.get(str(name))
+
+
+def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:
+    """Write sets to one file, which appears whole or not at all; raises BadInput."""
+    archive = io.BytesIO()
+    members = {str(name): points for name, points in sets.items()}
+    np.savez(archive, **members)  # type: ignore[arg-type]
+    write_checked(path, archive.getvalue(), f"LCD samples of N(0, I), made by {made_by}")

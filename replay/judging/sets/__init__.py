@@ -1,1 +1,0 @@
-"""Judges sets of points and regions against the truth; begin with `distances`."""

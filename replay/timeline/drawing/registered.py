@@ -1,0 +1,22 @@
+"""Draws messages of schemas for which a family has registered a drawing, in the scenes of others."""
+
+from collections.abc import Callable, Iterable
+
+from fuselog.recorders.log import Stream
+from fuselog.recorders.registry import available, load
+from fuselog.replay.timeline.drawing.canvas import Board, Canvas, Scene
+
+Draw = Callable[[Canvas, Scene, str], list[Board]]
+
+
+def draw_registered(canvas: Canvas, scene: Scene, case: str, streams: Iterable[Stream]) -> list[Board]:
+    """Draw what entry points `fuselog.drawings` draw of a case, and return their boards.
+
+    The name of such an entry point is that of a schema. It is loaded if one of `streams` has the schema.
+    """
+    found = dict.fromkeys(stream.schema.full_name for stream in streams)
+    drawn: list[Board] = []
+    for name in [each for each in found if each in available("drawings")]:
+        draw: Draw = load("drawings", name)
+        drawn += draw(canvas, scene, case)
+    return drawn

@@ -1,0 +1,48 @@
+"""Draws orientations in space as triads about one origin."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.timeline.drawing.canvas import Canvas, Colour, Times, escaped
+
+
+def draw_triads(
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    quaternions: Floats,
+    colours: Sequence[Colour],
+    length: float,
+    radius: float,
+) -> None:
+    """Draw the axes x, y and z, turned, at each time.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        time_ns: (n,).
+        quaternions: (n, 4), w first.
+        colours: of x, y and z.
+        length, radius: of the axes, in the unit of the scene.
+    """
+    turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
+    canvas.send(entity, time_ns, turned)
+    labels = [f"{entity.rpartition('/')[2]} {axis}" for axis in "xyz"]
+    arrows = rr.Arrows3D(
+        vectors=length * np.eye(3), colors=colours, radii=radius, labels=labels, show_labels=False
+    )
+    canvas.fix(f"{entity}/axes", arrows)
+
+
+def space_view(root: str, name: str) -> rrb.Spatial3DView:
+    """Return a view of triads about one origin, x towards the eye."""
+    return rrb.Spatial3DView(
+        origin=escaped(root),
+        name=name,
+        eye_controls=rrb.EyeControls3D(
+            position=(2.4, 1.4, 1.2), look_target=(0, 0, 0), eye_up=(0, 0, 1)
+        ),
+    )
