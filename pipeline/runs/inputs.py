@@ -99,7 +99,7 @@ SHIPPED = resources.files("fuselog_data")
 def shipped(kind: str) -> dict[str, Path]:
     """Return the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
-        return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+        return {path.stem: path for path in sorted(folder.rglob("*.toml"), key=lambda path: path.name)}
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:

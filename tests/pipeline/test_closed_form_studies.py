@@ -114,7 +114,7 @@ def test_a_vehicle_has_its_share_of_the_total_error(monkeypatch: pytest.MonkeyPa
     for name, made in (
         ("time", SimpleNamespace(process_time=lambda: next(times))),
         ("replay_in_memory", lambda *_: {}),
-        ("judge", lambda *_: SimpleNamespace(sets=[])),
+        ("judge", lambda *_: SimpleNamespace(others=[])),
         ("scores_of", lambda *_: {"kf": scores}),
     ):
         monkeypatch.setattr(scaling, name, made)

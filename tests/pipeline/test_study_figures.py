@@ -11,10 +11,10 @@ from scipy.stats import chi2, norm
 from fuselog.pipeline.families.acoustic import figures as acoustic
 from fuselog.pipeline.families.acoustic.cases import Mode
 from fuselog.pipeline.families.directional.bingham import error_figure
+from fuselog.pipeline.families.directional.inertial import trials_figure
 from fuselog.pipeline.families.directional.torus import filter_figure
 from fuselog.pipeline.families.los import figures as optical
 from fuselog.pipeline.output.charts import Band, Series
-from fuselog.pipeline.studies.navigation.inertial import trials_figure
 from fuselog.recorders.families.los.models import ANGLES
 
 RUNS = 7

@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
+from fuselog.pipeline.families.directional.inertial import is_moving
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curves
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.navigation.inertial import is_moving
 from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream

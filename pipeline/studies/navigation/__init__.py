@@ -1,1 +1,1 @@
-"""Studies inertial units: navigation, outages, orientation; begin with `gnss_ins`."""
+"""Studies inertial units: navigation, outages; begin with `gnss_ins`."""
