@@ -26,6 +26,12 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
+# (run, *arguments): does the work of one run; what it takes is up to the kernel.
+RunOnce = Callable[..., None]  # type: ignore[explicit-any]
+# What a kernel takes: arrays, numbers, and tuples of them.
+KernelArgument = Any  # type: ignore[explicit-any]
+
+
 class Loop(Protocol):
     """Represents a compiled loop over runs."""
 
@@ -73,9 +79,7 @@ def compiled(
     return call
 
 
-def compile_over_runs(
-    run_once: Callable[..., None], *, allocates: bool = True, title: str = ""
-) -> Callable[..., None]:
+def compile_over_runs(run_once: RunOnce, *, allocates: bool = True, title: str = "") -> "OverRuns":
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
@@ -121,7 +125,7 @@ class OverRuns:
         compiled_loop: makes the compiled loop; None for one that is always plain Python.
     """
 
-    run_once: Callable[..., None]
+    run_once: RunOnce
     compiled_loop: Callable[[], Loop] | None = None
 
     def __call__(

@@ -281,6 +281,10 @@ def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     return estimator.specified(label, values), {**values, **variant}
 
 
+# An estimator of any parameters, which a registry has by its name.
+AnyEstimator = Estimator[Any]  # type: ignore[explicit-any]
+
+
 @contextmanager
 def code_of(name: str) -> Iterator[None]:
     """Name the estimator in what its code raises, and what does not compile, while this is entered."""
