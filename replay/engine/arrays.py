@@ -17,6 +17,8 @@ Settings = Any  # type: ignore[explicit-any]
 AnyArgument = Any  # type: ignore[explicit-any]
 # Columns of several types, which a NamedTuple of arrays is made of.
 Columns = Any  # type: ignore[explicit-any]
+# An array of whatever kind a column is.
+AnyArray = NDArray[Any]  # type: ignore[explicit-any]
 RowSlice: TypeAlias = "slice[int, int, int]"  # of rows; unless told, its parameters are Any
 Kind = TypeVar("Kind", bound=type)
 

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from functools import cache, lru_cache, wraps
 from itertools import pairwise
 from types import FunctionType
-from typing import Any, ParamSpec, Protocol, TypeVar, cast
+from typing import ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
 from fuselog.recorders import environment
+from fuselog.replay.engine.compiling.kinds import KernelArgument, RunOnce
 from fuselog.replay.engine.compiling.notices import done_once
 from fuselog.replay.engine.compiling.scratch import Memory, Scratch
 
@@ -26,16 +27,12 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-# (run, *arguments): does the work of one run; what it takes is up to the kernel.
-RunOnce = Callable[..., None]  # type: ignore[explicit-any]
-# What a kernel takes: arrays, numbers, and tuples of them.
-KernelArgument = Any  # type: ignore[explicit-any]
-
-
 class Loop(Protocol):
     """Represents a compiled loop over runs."""
 
-    def of(self, arguments: Sequence[Any], memory: Memory | None = None) -> Callable[[int, int], None]:
+    def of(
+        self, arguments: Sequence[KernelArgument], memory: Memory | None = None
+    ) -> Callable[[int, int], None]:
         """Return what goes through the runs from a first one up to an end, with these arguments.
 
         Their last is the memory, where there is one.
@@ -131,9 +128,9 @@ class OverRuns:
     def __call__(
         self,
         runs: int,
-        *arguments: Any,
-        scratch: Callable[[], Any] | None = None,
-        per_run: Sequence[Any] | None = None,
+        *arguments: KernelArgument,
+        scratch: Callable[[], KernelArgument] | None = None,
+        per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
         """Go through the runs; in plain Python, too, NaN and infinity raise nothing."""
         if self.compiled_loop is not None and not is_uncompiled():
@@ -153,9 +150,9 @@ class OverRuns:
 def _share(
     loop: Loop,
     runs: int,
-    *arguments: Any,
-    scratch: Callable[[], Any] | None = None,
-    per_run: Sequence[Any] | None = None,
+    *arguments: KernelArgument,
+    scratch: Callable[[], KernelArgument] | None = None,
+    per_run: Sequence[KernelArgument] | None = None,
 ) -> None:
     """Share the runs among the cores."""
     cores, lent = min(runs, core_count()), list[Memory]()
@@ -177,7 +174,7 @@ def _share(
 
 
 def _one_by_one(
-    loop: Loop, arguments: Sequence[Any], per_run: Sequence[Any]
+    loop: Loop, arguments: Sequence[KernelArgument], per_run: Sequence[KernelArgument]
 ) -> Callable[[int, int], None]:
     """Return what goes through the runs with a last argument for each."""
     by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}
