@@ -1,7 +1,7 @@
 """Names the types of arrays and functions, and marks NamedTuples of arrays whose sizes vary."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
-Function = Callable[..., Any]
+Numbers = tuple[float, ...]
+# The numbers that a model's functions read, by name: a NamedTuple that is made for each model, see
+# `fuselog.replay.inference.model.parameters.settings_type`.
+Settings = Any  # type: ignore[explicit-any]
+# An argument of a function whose number of arguments is not known here: numbers, arrays, tuples of them.
+AnyArgument = Any  # type: ignore[explicit-any]
+# Columns of several types, which a NamedTuple of arrays is made of.
+Columns = Any  # type: ignore[explicit-any]
+# An array of whatever kind a column is.
+AnyArray = NDArray[Any]  # type: ignore[explicit-any]
+RowSlice: TypeAlias = "slice[int, int, int]"  # of rows; unless told, its parameters are Any
 Kind = TypeVar("Kind", bound=type)
 
 

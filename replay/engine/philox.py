@@ -12,7 +12,7 @@ from hashlib import sha256
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import AnyArray, Floats
 
 Words = NDArray[np.uint64]
 
@@ -26,7 +26,7 @@ _LAYERS, _TAIL = 256, 3.6541528853610088  # of the ziggurat, and where its tail 
 _BEYOND = 0.00025803248765390125
 
 
-def run_key(seed: int, first: Iterable[NDArray]) -> Words:
+def run_key(seed: int, first: Iterable[AnyArray]) -> Words:
     """Return a run's own key (2,): of a seed and its first data.
 
     So its numbers are the same on any number of cores, and whatever other runs there are.

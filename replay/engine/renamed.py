@@ -6,7 +6,9 @@ from functools import wraps
 from operator import attrgetter
 from typing import Any, TypeVar
 
-Target = TypeVar("Target", bound=Callable[..., Any])
+# A function or a class of any arguments.
+Taking = Callable[..., Any]  # type: ignore[explicit-any]
+Target = TypeVar("Target", bound=Taking)
 
 
 def renamed(**names: str) -> Callable[[Target], Target]:
@@ -27,9 +29,9 @@ def renamed(**names: str) -> Callable[[Target], Target]:
     area: 'length' is called 'length_m' now; the old name goes in the next release
     """
 
-    def accepting(function: Callable[..., Any], owner: str) -> Callable[..., Any]:
+    def accepting(function: Taking, owner: str) -> Taking:
         @wraps(function)
-        def call(*arguments: Any, **given: Any) -> Any:
+        def call(*arguments: object, **given: object) -> object:
             for old in names.keys() & given.keys():
                 notice = f"'{old}' is called '{names[old]}' now; the old name goes in the next release"
                 warnings.warn(f"{owner}: {notice}", FutureWarning, stacklevel=2)
@@ -39,7 +41,7 @@ def renamed(**names: str) -> Callable[[Target], Target]:
         return call
 
     def mark(target: Target) -> Target:
-        marked: Any = target
+        marked: Any = target  # type: ignore[explicit-any]  # whose __init__ is replaced
         if not isinstance(target, type):
             return accepting(target, target.__name__)  # type: ignore[return-value]
         marked.__init__ = accepting(marked.__init__, target.__name__)

@@ -6,10 +6,9 @@ method, as `fuselog.replay.inference.all_methods:ekf`.
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.replay.engine.replaying.estimator import Estimator, set_by_variant
+from fuselog.replay.engine.replaying.estimator import AnyEstimator, set_by_variant
 from fuselog.replay.inference.estimators import modelled_by, of_any_model
 from fuselog.replay.inference.kalman.methods import FILTERS, Method
 from fuselog.replay.inference.model.model import Model
@@ -29,7 +28,7 @@ METHODS: Mapping[str, Method] = {
 }
 
 
-def modelled(model: Model, method: str) -> Estimator[Any]:
+def modelled(model: Model, method: str) -> AnyEstimator:
     """Make the estimator of the state of one model by one method, named as on the command line.
 
     Args:
@@ -53,7 +52,7 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
 
 
 @cache
-def __getattr__(method: str) -> Estimator[Any]:
+def __getattr__(method: str) -> AnyEstimator:
     """Make the estimator of any model by a method: what an entry point and `-e ekf` mean."""
     if method not in METHODS:
         raise AttributeError(method)

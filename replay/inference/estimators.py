@@ -13,7 +13,8 @@ from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import Topic
 from fuselog.recorders.parameters import Parameters, build, meanings
 from fuselog.recorders.registry import available, load
-from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from fuselog.replay.engine.arrays import AnyArgument
+from fuselog.replay.engine.replaying.estimator import AnyEstimator, Bound, Estimator, Recursive
 from fuselog.replay.engine.replaying.truth import refuse_named_truths
 from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.model.augmentation import (
@@ -35,7 +36,7 @@ from fuselog.replay.inference.model.binding import (
 )
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.own_parameters import check_tables, with_own_parameters
-from fuselog.replay.inference.model.parameters import ModelParameters
+from fuselog.replay.inference.model.parameters import CombinedParameters, ModelParameters
 from fuselog.replay.inference.model.settings import (
     assumed_of,
     settings_of,
@@ -62,30 +63,31 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 
 def _created(
-    name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
-) -> type[Any]:
+    name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, AnyArgument] | None = None
+) -> type[CombinedParameters]:
     """Make a type of parameters that has the meanings of its bases."""
-    return create_model(name, __base__=bases, **(fields or {}))
+    made: type[CombinedParameters] = create_model(name, __base__=bases, **(fields or {}))
+    return made
 
 
-def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
+def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, object]) -> type[ModelParameters]:
     """Make a type of parameters with other defaults for some of them."""
-    fields: Any = {}
+    fields: dict[str, AnyArgument] = {}
     for name, value in defaults.items():
         field = kind.model_fields[name]
         fields[name] = (_accepted(field), Field(value, description=field.description))
     return _created(kind.__name__, (kind,), fields) if fields else kind
 
 
-def _accepted(field: FieldInfo) -> Any:
+def _accepted(field: FieldInfo) -> AnyArgument:
     """Return what a parameter accepts: its type with its bounds."""
     bounds = tuple(field.metadata)
     return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
 
 def modelled_by(
-    model: Model, method: Method, name: str, settings: Mapping[str, Any] | None = None
-) -> Estimator[Any]:
+    model: Model, method: Method, name: str, settings: Mapping[str, object] | None = None
+) -> AnyEstimator:
     """Make the estimator of one model by a method of that name; `settings` are its own defaults.
 
     Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
@@ -109,18 +111,18 @@ def modelled_by(
     )
 
 
-def model_of(estimator: Estimator[Any]) -> Model | None:
+def model_of(estimator: AnyEstimator) -> Model | None:
     """Find the model of which `modelled_by` made an estimator; None where another made it."""
     made = estimator.bind
     return made.keywords["model"] if isinstance(made, partial) and made.func is bind_model else None
 
 
-def of_any_model(method: Method) -> Estimator[Any]:
+def of_any_model(method: Method) -> AnyEstimator:
     """Make the estimator that estimates, by one method, the registered model that fits a log."""
     return _OfAnyModel(method)
 
 
-class _OfAnyModel(Estimator[Any]):
+class _OfAnyModel(AnyEstimator):
     """Makes its requirements and parameters from all models when they are asked for."""
 
     def __init__(self, method: Method) -> None:
@@ -143,17 +145,19 @@ class _OfAnyModel(Estimator[Any]):
         """Return those of all models, and of the method."""
         return _any_parameters(vars(self)["_method"])
 
-    def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:
+    def parameters_with(self, name: str, variant: Mapping[str, object]) -> type[Parameters]:
         """Return those of all models, and of the method that the variant of a name chooses."""
         return _any_parameters(self._made(name, variant))
 
-    def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:
+    def parameters_by_model(
+        self, name: str, variant: Mapping[str, object]
+    ) -> dict[str, type[Parameters]]:
         """Return those of each model that the method can estimate, and of the method."""
         method = self._made(name, variant)
         models = registered_models().items()
         return {each: combined(model, method) for each, model in models if not method.lacks(model)}
 
-    def _made(self, name: str, variant: Mapping[str, Any]) -> Method:
+    def _made(self, name: str, variant: Mapping[str, object]) -> Method:
         where, method = f"estimator {name}", vars(self)["_method"]
         return _made_for(where, method, build(method.parameters, variant, where))
 
@@ -173,7 +177,7 @@ def _any_parameters(method: Method) -> type[Parameters]:
 
     What one model wants of a parameter is checked when it is known which model fits the log.
     """
-    fields: dict[str, Any] = {"model": (str | None, Field(None, description=_MODEL))}
+    fields: dict[str, AnyArgument] = {"model": (str | None, Field(None, description=_MODEL))}
     models_of: dict[str, dict[str, list[str]]] = {}
     for model_name, model in registered_models().items():
         meaning_of = meanings(model.parameters)
@@ -255,7 +259,12 @@ def _bind_fitting(
 
 
 def bind_model(
-    label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
+    label: str,
+    topics: Mapping[str, Topic],
+    parameters: CombinedParameters,
+    *,
+    model: Model,
+    method: Method,
 ) -> list[Bound]:
     """Return a filter for everything in the log that is of this model."""
     method = _made_for(f"estimator {label}", method, parameters)
@@ -354,7 +363,7 @@ def _reprocessing(
     return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
 
 
-def _made_for(where: str, method: Method, parameters: Any) -> Method:
+def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Method:
     """Choose the method that the parameters name.
 
     BadInput that begins with `where`, if there is none.

@@ -1,16 +1,16 @@
 """Writes a model's functions and their derivatives as formulas, by its components' names."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from fuselog.recorders.registry import load
+from fuselog.replay.engine.arrays import AnyArgument
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.stage import stage_of
 from fuselog.replay.tracing.formulas import formulas_of
-from fuselog.replay.tracing.functions import Shape, TracedFunction
+from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Names = Sequence[str]
 # What a function is given, by the argument's name: the names of a tuple's entries or of an array's
@@ -140,7 +140,9 @@ def _spread(axes: Names, block: int = 0) -> list[str]:
     return names + [f"variance of {name}" for name in axes[block:]]
 
 
-def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFERENTIATED) -> list[str]:
+def _lines(
+    function: object, given: Given, returned: Names = (), by: Names = DIFFERENTIATED
+) -> list[str]:
     """Write the formulas of a traced function.
 
     Where it returns less than is named, these are variances.
@@ -152,7 +154,7 @@ def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFER
     result = function.result
     if len(returned) > len(result.returned):
         returned = [name for name in returned if name.startswith("variance")]
-    names: dict[Any, str] = {}
+    names: dict[tuple[int, object], str] = {}
     for number, (argument, kind) in enumerate(zip(given, function.arguments, strict=True)):
         for entry, name in _entries(argument, given[argument], kind):
             names[number, entry] = f"{argument}.{name}" if name in names.values() else name
@@ -164,7 +166,7 @@ def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFER
     )
 
 
-def _entries(argument: str, named: Any, kind: Any) -> Iterator[tuple[Any, str]]:
+def _entries(argument: str, named: AnyArgument, kind: Argument) -> Iterator[tuple[object, str]]:
     """Return the places within an argument, and their names."""
     if isinstance(kind, Shape):
         for place in np.ndindex(kind.sizes):

@@ -11,16 +11,16 @@ Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import PositiveFloat
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.engine.replaying.estimator import Estimator
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+from fuselog.replay.engine.replaying.estimator import AnyEstimator
 from fuselog.replay.engine.streams.blocks import Ragged, copied, run_of_rows
 from fuselog.replay.engine.vectors.tangent import named_now, tangent_components
 from fuselog.replay.inference.estimators import modelled_by, of_any_model
@@ -31,7 +31,9 @@ from fuselog.replay.inference.kalman.steps import (
     InnovationRecord,
     Interval,
     Measurement,
+    PredictRun,
     Steps,
+    UpdateRun,
     Workspace,
     workspace,
 )
@@ -70,7 +72,7 @@ RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors
 
 
-class ObservabilityParameters(MethodParameters):
+class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
     """States windows and scales of the Gramian.
 
     Attributes:
@@ -103,7 +105,7 @@ def gramian_steps(stage: Stage) -> Steps:
     motion = _carried_by_motion(stage)
     sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
 
-    def estimate(run: int, belief: Gramian, found: Estimates, row: int, _: Any) -> None:
+    def estimate(run: int, belief: Gramian, found: Estimates, row: int, _: Workspace) -> None:
         """Note the Gramian, and as the mean how many messages are in it; begin anew."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
@@ -115,7 +117,7 @@ def gramian_steps(stage: Stage) -> Steps:
     return Steps(lambda sets: workspace(stage, sets), motion, sensors, estimate)
 
 
-def _carried_by_motion(stage: Stage) -> Function:
+def _carried_by_motion(stage: Stage) -> PredictRun:
     model = stage.model
     linearise = motion_derivative(model, stage.motion, by_state=True)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
@@ -137,7 +139,7 @@ def _carried_by_motion(stage: Stage) -> Function:
     return predict
 
 
-def _added_by_sensor(stage: Stage, number: int) -> Function:
+def _added_by_sensor(stage: Stage, number: int) -> UpdateRun:
     model, sensor = stage.model, stage.sensors[number]
     m, t = len(sensor.measured), model.tangent
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
@@ -178,7 +180,7 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
 
 
 @lru_cache(maxsize=64)
-def _summing(stage: Stage) -> tuple[Function, Steps]:
+def _summing(stage: Stage) -> tuple[OverRuns, Steps]:
     steps = gramian_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "observability")
@@ -226,7 +228,7 @@ class Observability(IteratedSmoother):
 
     def _scales(self, state: FilterState) -> Floats:
         """Return what a scaled component of one stands for (runs, t)."""
-        scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
+        scales: Floats = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
         model = self.stage.model
         for name, scale in named_now(self.parameters.scales, list(model.state), model.kinds).items():
             if name not in self.components:
@@ -246,7 +248,8 @@ class Observability(IteratedSmoother):
         length_ns = max(round(self.parameters.window_s * 1e9), 1)
         span_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1] - start_ns
         last = np.maximum(span_ns // length_ns - 1, 0)
-        return np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
+        windows: Integers = np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
+        return windows
 
     def _gramians(self, state: FilterState, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
         """Return the Gramians at the last stamps of windows, and how many messages are in each."""
@@ -271,8 +274,10 @@ class Observability(IteratedSmoother):
         )
         settings = self.settings_of_runs(state.context, runs)
 
-        def memory() -> Any:
-            return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))
+        def memory() -> Workspace:
+            trajectory = LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t)))
+            work: Workspace = steps.memory((trajectory,))
+            return work
 
         inputs, results = RunInputs(events, settings, self.gates), RunResults(found, innovations)
         loop(runs, inputs, carried, results, scratch=memory)
@@ -337,6 +342,6 @@ METHOD = Method(
 OBSERVABILITY = of_any_model(METHOD)
 
 
-def observability_of(model: Model) -> Estimator[Any]:
+def observability_of(model: Model) -> AnyEstimator:
     """Return the same of one model; raises BadInput where that lacks what it needs."""
     return modelled_by(model, METHOD, "observability")

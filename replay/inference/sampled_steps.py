@@ -4,11 +4,11 @@ Samples and rounds are left to loops: a graph is of one sample, or of one round 
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.tangent import WIDTHS
 from fuselog.replay.inference.kalman.wide_angles import turning, unsuspected_rad
 from fuselog.replay.inference.linear_algebra.manifold import (
@@ -20,7 +20,7 @@ from fuselog.replay.inference.linear_algebra.manifold import (
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 from fuselog.replay.inference.sampling.sets import SampleSets
-from fuselog.replay.inference.step_graphs import Step, traced_step
+from fuselog.replay.inference.step_graphs import Step, StepFunction, TracedValue, traced_step
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Kinds = tuple[str, ...]
@@ -91,9 +91,9 @@ class Sampled(NamedTuple):
     """
 
     what: str
-    function: Function
-    variances: Function
-    arguments: Function
+    function: StepFunction
+    variances: StepFunction
+    arguments: StepFunction
     kinds: Kinds
     outputs: Kinds
 
@@ -113,24 +113,24 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
     add_state, add = boxplus(kinds), boxplus(outputs)
     gaussian = given[:2]
 
-    def spread(mean: Any, _: Any, *others: Any) -> Any:
+    def spread(mean: TracedValue, _: TracedValue, *others: TracedValue) -> TracedValue:
         return {"variance": variances(read_state(mean), others)}
 
-    def at_mean(mean: Any, _: Any, *others: Any) -> Any:
+    def at_mean(mean: TracedValue, _: TracedValue, *others: TracedValue) -> TracedValue:
         return {"centre": function(read_state(mean), (0.0,) * (size - t), arguments(others))}
 
-    def at_sample(mean: Any, _: Any, *others: Any) -> Any:
+    def at_sample(mean: TracedValue, _: TracedValue, *others: TracedValue) -> TracedValue:
         *own, away, centre = others
         add_state(mean, away)
         value = function(read_state(mean), tuple(away[t:]), arguments(own))
         return {"value": _by_block(_difference, outputs, value, centre)}
 
-    def move(_: Any, __: Any, shift: Any, centre: Any) -> Any:
+    def move(_: TracedValue, __: TracedValue, shift: TracedValue, centre: TracedValue) -> TracedValue:
         add(centre, shift)
         return {"centre": centre}
 
-    def recentre(_: Any, __: Any, shift: Any, value: Any) -> Any:
-        found, again = list[Any](), False
+    def recentre(_: TracedValue, __: TracedValue, shift: TracedValue, value: TracedValue) -> TracedValue:
+        found, again = list[TracedValue](), False
         for kind, _component, first, width in manifold_blocks(outputs):
             own = slice(first, first + width)
             still, *moved = _recentred(kind)(tuple(value[own]), tuple(shift[own]))
@@ -155,9 +155,11 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
     )
 
 
-def _by_block(function_of: Function, kinds: Kinds, first: Any, second: Any) -> list[Any]:
+def _by_block(
+    function_of: StepFunction, kinds: Kinds, first: TracedValue, second: TracedValue
+) -> list[TracedValue]:
     """Apply a function to every number, angle, axis and orientation of two states."""
-    found: list[Any] = []
+    found: list[TracedValue] = []
     for kind, component, _, _ in manifold_blocks(kinds):
         own = slice(component, component + WIDTHS[kind])
         found += function_of(kind)(tuple(first[own]), tuple(second[own]))
@@ -170,7 +172,7 @@ def _difference(kind: str) -> TracedFunction:
     width = WIDTHS[kind]
     subtract = boxminus((kind,) * width)
 
-    def difference(first: Any, second: Any) -> Any:
+    def difference(first: TracedValue, second: TracedValue) -> TracedValue:
         row = np.empty((1, tangent_size((kind,) * width)), object)
         subtract(first, second, row, 0)
         return tuple(row[0])
@@ -184,7 +186,7 @@ def _recentred(kind: str) -> TracedFunction:
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 
-    def recentred(value: Any, shift: Any) -> Any:
+    def recentred(value: TracedValue, shift: TracedValue) -> TracedValue:
         values = np.array([value], object)
         again = move(values, shift)
         return (again, *values[0])

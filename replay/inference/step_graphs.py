@@ -4,15 +4,19 @@ They are called with traced numbers, so that a graph has their operations in the
 known to be zero stands in none of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.arrays import Function
 from fuselog.replay.tracing.functions import Argument, trace
 from fuselog.replay.tracing.graph import Graph, Node
+
+# An array, a tuple or a number, of traced numbers.
+TracedValue = Any  # type: ignore[explicit-any]
+# Gives traced values of such, often by name; what it takes is up to the step.
+StepFunction = Callable[..., TracedValue]  # type: ignore[explicit-any]
 
 _SPARSE = ("F", "H", "G", "N")
 
@@ -38,7 +42,7 @@ class Step(NamedTuple):
         return [[place[1] for place in places if place[0] == row] for row in range(rows)]
 
 
-def traced_step(what: str, function: Function, arguments: tuple[Argument, ...]) -> Step:
+def traced_step(what: str, function: StepFunction, arguments: tuple[Argument, ...]) -> Step:
     """Trace a function that returns arrays by name.
 
     Args:
@@ -50,7 +54,7 @@ def traced_step(what: str, function: Function, arguments: tuple[Argument, ...]) 
     """
     graph, places = Graph(), list[tuple[str, tuple[int, ...]]]()
 
-    def flat(*given: Any) -> Any:
+    def flat(*given: TracedValue) -> TracedValue:
         arrays = {name: np.array(array, object) for name, array in function(*given).items()}
         places[:] = [
             (name, place) for name, array in arrays.items() for place in np.ndindex(array.shape)
@@ -69,6 +73,6 @@ def traced_step(what: str, function: Function, arguments: tuple[Argument, ...]) 
     return Step(graph, outputs)
 
 
-def zeros(*sizes: int) -> Any:
+def zeros(*sizes: int) -> TracedValue:
     """Make an array of zeros that takes traced numbers."""
     return np.zeros(sizes).astype(object)

@@ -6,11 +6,10 @@ are samples, see `sampled_steps`.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Function
 from fuselog.replay.inference.kalman.predict import motion_derivative
 from fuselog.replay.inference.kalman.regression import (
     measured_with_noise,
@@ -26,7 +25,7 @@ from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.run.filtering import Filter
 from fuselog.replay.inference.run.samples import sample_sets
 from fuselog.replay.inference.sampled_steps import Sampled, SampledFunction, sampled_function
-from fuselog.replay.inference.step_graphs import Step, traced_step, zeros
+from fuselog.replay.inference.step_graphs import Step, StepFunction, TracedValue, traced_step, zeros
 from fuselog.replay.tracing.functions import Argument, Shape, traced
 
 
@@ -92,7 +91,7 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
     [(_, sets)] = sample_sets(filtering.samplers, (), np.zeros(1, np.int64))
     drawn = iter(sets)
 
-    def memory() -> Any:
+    def memory() -> TracedValue:
         return _of_objects(filtering.steps.memory(sets))
 
     given = (*gaussian, Shape((model.controls,)), None, names)
@@ -131,15 +130,23 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 # --- what is traced: functions that return arrays by name -------------------------------------------
 
 
-def _motion(model: Model, motion: Motion, memory: Callable[[], Any], *, is_sampled: bool) -> Function:
+def _motion(
+    model: Model, motion: Motion, memory: Callable[[], TracedValue], *, is_sampled: bool
+) -> StepFunction:
     """Make the motion's derivatives, or where it is sampled what is added to it alone."""
     linearise = motion_derivative(model, motion, by_state=not is_sampled)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     t, add = model.tangent, adding_noise(model.tangent, motion.noise_block)
 
-    def predict(mean: Any, _: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    def predict(
+        mean: TracedValue,
+        _: TracedValue,
+        control: TracedValue,
+        duration_s: TracedValue,
+        parameters: TracedValue,
+    ) -> TracedValue:
         work, state, noise = memory(), read_state(mean), zeros(t, t)
-        gains, variances = [zeros(t, 0)], list[Any]()
+        gains, variances = [zeros(t, 0)], list[TracedValue]()
         if is_sampled and motion.noises:
             return {"G": gains[0], "u": variances, "N": noise}
         if motion.control_noise is not None or not is_sampled:
@@ -160,12 +167,18 @@ def _motion(model: Model, motion: Motion, memory: Callable[[], Any], *, is_sampl
     return predict
 
 
-def _gap_noise(model: Model, motion: Motion) -> Function:
+def _gap_noise(model: Model, motion: Motion) -> StepFunction:
     noise_of, read_state, t = motion.gap_noise, tuple_of(model.size), model.tangent
     assert noise_of is not None
     add = adding_noise(t)
 
-    def widen(mean: Any, _: Any, __: Any, duration_s: Any, parameters: Any) -> Any:
+    def widen(
+        mean: TracedValue,
+        _: TracedValue,
+        __: TracedValue,
+        duration_s: TracedValue,
+        parameters: TracedValue,
+    ) -> TracedValue:
         noise = zeros(t, t)
         add(noise, noise_of(read_state(mean), duration_s, parameters))
         return {"N": noise}
@@ -200,13 +213,19 @@ def _of_sensor(model: Model, sensor: Sensor) -> Sampled:
 
 
 def _linear_sensor(
-    model: Model, sensor: Sensor, memory: Callable[[], Any], *, is_iterated: bool
-) -> Function:
+    model: Model, sensor: Sensor, memory: Callable[[], TracedValue], *, is_iterated: bool
+) -> StepFunction:
     linearise, layout = sensor_derivative(model, sensor), message_layout(sensor)
     m, read_state, add = len(sensor.measured), tuple_of(model.size), adding_noise(len(sensor.measured))
     subtract, (step_to, chain) = residual_of(sensor), relinearising(model)
 
-    def innovate(mean: Any, _: Any, data: Any, parameters: Any, *moved: Any) -> Any:
+    def innovate(
+        mean: TracedValue,
+        _: TracedValue,
+        data: TracedValue,
+        parameters: TracedValue,
+        *moved: TracedValue,
+    ) -> TracedValue:
         work, noise, state = memory(), zeros(m, m), mean
         rows = work.rows[:m]
         if is_iterated:
@@ -216,11 +235,11 @@ def _linear_sensor(
         linearise(read_state(state), layout.reference(data), parameters, work)
         if is_iterated:
             chain(rows, work)
-        gain, variances = zeros(m, 0), []
+        gain, variances = zeros(m, 0), list[TracedValue]()
         if sensor.covariance:
             add(noise, layout.noise(data))
         elif sensor.noise is not None and sensor.noises:
-            gain, variances = work.noise_gain[:m, : sensor.noises], sensor.noise(parameters)
+            gain, variances = work.noise_gain[:m, : sensor.noises], [*sensor.noise(parameters)]
         elif sensor.noise is not None:
             add(noise, sensor.noise(parameters))
         difference = zeros(m)
@@ -233,11 +252,13 @@ def _linear_sensor(
     return innovate
 
 
-def _sampled_sensor(sensor: Sensor) -> Function:
+def _sampled_sensor(sensor: Sensor) -> StepFunction:
     layout, m = message_layout(sensor), len(sensor.measured)
     subtract, add = residual_of(sensor), adding_noise(m)
 
-    def innovate(_: Any, __: Any, data: Any, parameters: Any, centre: Any) -> Any:
+    def innovate(
+        _: TracedValue, __: TracedValue, data: TracedValue, parameters: TracedValue, centre: TracedValue
+    ) -> TracedValue:
         difference, noise = zeros(m), zeros(m, m)
         subtract(data, centre, difference)
         if sensor.covariance and not sensor.noises:
@@ -249,11 +270,13 @@ def _sampled_sensor(sensor: Sensor) -> Function:
     return innovate
 
 
-def _correcting(model: Model, memory: Callable[[], Any]) -> Function:
+def _correcting(model: Model, memory: Callable[[], TracedValue]) -> StepFunction:
     if model.correct is not None:
         step_to = stepping(model.kinds, model.correct.move)
 
-        def step_together(mean: Any, _: Any, step: Any, slope: Any) -> Any:
+        def step_together(
+            mean: TracedValue, _: TracedValue, step: TracedValue, slope: TracedValue
+        ) -> TracedValue:
             work = memory()._replace(step=step, slope=slope)
             step_to(mean, work)
             return {"mean": work.state, "F": work.transition}
@@ -261,14 +284,14 @@ def _correcting(model: Model, memory: Callable[[], Any]) -> Function:
         return step_together
     add = boxplus(model.kinds)
 
-    def step_each(mean: Any, _: Any, step: Any, __: Any) -> Any:
+    def step_each(mean: TracedValue, _: TracedValue, step: TracedValue, __: TracedValue) -> TracedValue:
         add(mean, step)
         return {"mean": mean}
 
     return step_each
 
 
-def _of_objects(value: Any) -> Any:
+def _of_objects(value: TracedValue) -> TracedValue:
     """Make a workspace that takes traced numbers."""
     if isinstance(value, np.ndarray):
         return value.astype(object) if value.dtype == float else value

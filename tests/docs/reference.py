@@ -17,6 +17,7 @@ from tests.bench.__main__ import COLUMNS
 from tests.claims.pages import SPEED
 
 STUB = Path(__file__).parents[2] / "fuselog" / "__init__.pyi"
+KALMAN = "fuselog.replay.inference.kalman.reference"
 COMMANDS = """# Commands
 
 ::: mkdocs-click
@@ -90,6 +91,8 @@ def _python() -> str:
         names = [alias.name for node in nodes for alias in node.names if alias.name != "schemas"]
         names.sort(key=lambda name: (name[0].isupper(), name))  # functions first
         lines += ["", f"## {ROOMS[room]}", "", *(f"::: fuselog.{name}\n" for name in names)]
+    lines += ["", "## The Kalman filter in two functions", ""]
+    lines += [f"::: {KALMAN}.{name}\n" for name in ("predict", "update")]
     return "\n".join([*lines, "## Tests", "", "::: fuselog.testing.assert_golden", ""])
 
 

@@ -1,16 +1,15 @@
 """Binds estimators from functions to the topics of a log, and says in words what they need of one."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Any
 
 from fuselog.recorders.log import Schema, Topic, schemas
 from fuselog.recorders.parameters import Parameters, ParametersType
-from fuselog.replay.engine.api.inputs import Binding
+from fuselog.replay.engine.api.inputs import AnyParameters, Binding
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator
 from fuselog.replay.engine.streams.channels import bindings, resolved
 from fuselog.replay.engine.vectors.components import Components
 
-Find = Callable[[str, Mapping[str, Topic], Any], Iterable[Binding]]
+Find = Callable[[str, Mapping[str, Topic], AnyParameters], Iterable[Binding]]
 
 
 def bindings_by_name(

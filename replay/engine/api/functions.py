@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,21 @@ from fuselog.replay.engine.api.binding import (
     requirements_of,
     topics_of,
 )
-from fuselog.replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
+from fuselog.replay.engine.api.inputs import (
+    AnyParameters,
+    Binding,
+    Given,
+    Messages,
+    OneRun,
+    generator_of,
+    messages_of,
+)
 from fuselog.replay.engine.api.outputs import Estimates, Outputs, Solved
+from fuselog.replay.engine.arrays import AnyArgument
 from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.engine.renamed import renamed
-from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
+from fuselog.replay.engine.replaying.estimator import Batch, Bound, Carried, Estimator, Recursive
 from fuselog.replay.engine.streams.blocks import Block, Ragged
 from fuselog.replay.engine.streams.channels import resolved
 from fuselog.replay.engine.streams.failures import Failure, reason_of
@@ -38,7 +48,8 @@ from fuselog.replay.engine.streams.measurements import Vectors
 from fuselog.replay.engine.vectors.components import Components
 
 Generators = tuple[np.random.Generator | None, ...]
-Advance = Callable[[Any, Any, Block], tuple[Any, list[Ragged]]]
+# (settings, state, block) -> the state after it, and the output streams.
+Advance = Callable[[Carried, Carried, Block], tuple[Carried, list[Ragged]]]
 
 
 @renamed(whole="static")
@@ -58,12 +69,12 @@ def recursive(
     optional: Collection[str] = (),
     outputs: Mapping[str, Schema] = MappingProxyType({}),
     draws: bool = False,
-    start: Callable[[Given[ParametersType]], tuple[Any, Any]],
-    follow: Callable[..., None] | None = None,
-    follow_all: Callable[..., None] | None = None,
+    start: Callable[[Given[ParametersType]], tuple[Carried, Carried]],
+    follow: RunOnce | None = None,
+    follow_all: RunOnce | None = None,
     advance: Advance | None = None,
     out_of_sequence: Callable[[ParametersType, int], Advance] | None = None,
-    finish: Callable[[Any, Any], list[Ragged]] | None = None,
+    finish: Callable[[Carried, Carried], list[Ragged]] | None = None,
     compiled: bool = True,
     allocates: bool = True,
 ) -> Estimator[ParametersType]:
@@ -151,13 +162,13 @@ def recursive(
         _require_numbers(summary, leaf, schema)
 
     @cache
-    def loop() -> Callable[..., None]:
+    def loop() -> OverRuns:
         assert follow is not None
         if not compiled:
             return OverRuns(follow)
         return compile_over_runs(follow, allocates=allocates)
 
-    def advance_all(arguments: tuple[Any, ...], generators: Generators) -> None:
+    def advance_all(arguments: tuple[AnyArgument, ...], generators: Generators) -> None:
         if follow_all is not None:
             follow_all(*arguments, *([generators] if draws else []))
         else:
@@ -244,7 +255,7 @@ def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
             )
 
 
-def _drawn_on(generators: Generators, messages: Messages, parameters: Any) -> Generators:
+def _drawn_on(generators: Generators, messages: Messages, parameters: AnyParameters) -> Generators:
     """Copy the runs' generators for one block, since a block may have to be processed again.
 
     A run that has none yet gets one at its first message.
@@ -388,7 +399,7 @@ class _Carried(NamedTuple):
     A run's generator is None until there is a message, or where none is wanted.
     """
 
-    settings: Any
-    state: Any
+    settings: Carried
+    state: Carried
     reported: NDArray[np.bool_]
     generators: Generators

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, Topic
 from fuselog.recorders.parameters import ParametersType
+from fuselog.replay.engine.arrays import AnyArray
 from fuselog.replay.engine.philox import run_key
 from fuselog.replay.engine.streams.blocks import Block, Ragged, ragged_rows
 from fuselog.replay.engine.streams.channels import given_or_stated
@@ -20,6 +21,10 @@ from fuselog.replay.engine.vectors.components import Components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+# What else the functions of an estimator get, and their parameters: of the estimator's own types.
+Setup = Any  # type: ignore[explicit-any]
+AnyParameters = Any  # type: ignore[explicit-any]
 
 
 class Binding(NamedTuple):
@@ -36,7 +41,7 @@ class Binding(NamedTuple):
     static: Mapping[str, Topic] = MappingProxyType({})
     suffix: str = ""
     priors: Mapping[str, Components] = MappingProxyType({})
-    setup: Any = None
+    setup: Setup = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,7 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     static: Mapping[str, Ragged]
     runs: int
     name: str = ""
-    setup: Any = None
+    setup: Setup = None
 
     def stated(self, topic: str, name: str) -> float:
         """Return the parameter `name`, or where it is None the number that `topic`'s channel states.
@@ -90,6 +95,9 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
         return len(self.static)
 
 
+AnyGiven = Given[Any]  # type: ignore[explicit-any]
+
+
 @dataclass(frozen=True, eq=False)
 class OneRun(Mapping[str, Stream]):
     """Holds what is given of one run, stream by stream; see `Given` and `each_run`.
@@ -99,7 +107,7 @@ class OneRun(Mapping[str, Stream]):
         run: its number among them.
     """
 
-    given: Given[Any]
+    given: AnyGiven
     run: int
 
     def stated(self, topic: str, name: str) -> float:
@@ -134,7 +142,7 @@ class OneRun(Mapping[str, Stream]):
         return len(self.given)
 
 
-def generator_of(parameters: Any, first: Iterable[NDArray]) -> np.random.Generator:
+def generator_of(parameters: AnyParameters, first: Iterable[AnyArray]) -> np.random.Generator:
     """Return a counter-based generator (Philox), keyed by a seed and a run's first data.
 
     Args:
@@ -172,7 +180,7 @@ class Skipped(NamedTuple):
 
 
 def messages_of(
-    block: Block, vectors: Mapping[str, Vectors], parameters: Any
+    block: Block, vectors: Mapping[str, Vectors], parameters: AnyParameters
 ) -> tuple[Messages, Skipped]:
     """Return a block's messages, their fields as numbers; and those that lack a covariance.
 

@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Schema, Stream, make_stream, schemas
 from fuselog.replay.engine.api.inputs import Floats, Integers, Messages, Skipped
+from fuselog.replay.engine.arrays import AnyArray, Columns
 from fuselog.replay.engine.streams.blocks import Ragged, gather, last_of_equals
 from fuselog.replay.engine.streams.failures import Failure, reason_stream
 from fuselog.replay.engine.streams.results import (
@@ -77,7 +77,7 @@ class Diagnostics(NamedTuple):
     """
 
     time_ns: Integers
-    columns: Mapping[str, NDArray]
+    columns: Mapping[str, AnyArray]
 
 
 class Measured(NamedTuple):
@@ -247,7 +247,7 @@ class Outputs:
         for name, schema in self.further.items():
             if name in estimates.further:
                 further = estimates.further[name]
-                columns: dict[str, Any] = dict(further.columns)
+                columns: dict[str, Columns] = dict(further.columns)
                 yield make_stream(f"{self.topic}/{name}", schema, further.time_ns, **columns)
 
     def _innovations_of_run(self, innovations: Measured | None) -> Stream:
@@ -266,7 +266,7 @@ class Outputs:
         return innovation_stream(f"{self.topic}/innovation", self.measured, self.truth, columns)
 
     def _checked(
-        self, part: str, arrays: Sequence[Any], shapes: Sequence[tuple[int, ...]]
+        self, part: str, arrays: Sequence[Columns], shapes: Sequence[tuple[int, ...]]
     ) -> tuple[Integers, Floats, Floats]:
         """Return stamps, means and covariances as arrays; raises BadInput where a shape is wrong."""
         time_ns, mean, covariance = (np.asarray(array) for array in arrays)

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from functools import cache, lru_cache, wraps
 from itertools import pairwise
 from types import FunctionType
-from typing import Any, ParamSpec, Protocol, TypeVar, cast
+from typing import ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
 from fuselog.recorders import environment
+from fuselog.replay.engine.compiling.kinds import KernelArgument, RunOnce
 from fuselog.replay.engine.compiling.notices import done_once
 from fuselog.replay.engine.compiling.scratch import Memory, Scratch
 
@@ -29,7 +30,9 @@ Result = TypeVar("Result")
 class Loop(Protocol):
     """Represents a compiled loop over runs."""
 
-    def of(self, arguments: Sequence[Any], memory: Memory | None = None) -> Callable[[int, int], None]:
+    def of(
+        self, arguments: Sequence[KernelArgument], memory: Memory | None = None
+    ) -> Callable[[int, int], None]:
         """Return what goes through the runs from a first one up to an end, with these arguments.
 
         Their last is the memory, where there is one.
@@ -73,9 +76,7 @@ def compiled(
     return call
 
 
-def compile_over_runs(
-    run_once: Callable[..., None], *, allocates: bool = True, title: str = ""
-) -> Callable[..., None]:
+def compile_over_runs(run_once: RunOnce, *, allocates: bool = True, title: str = "") -> "OverRuns":
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
@@ -121,15 +122,15 @@ class OverRuns:
         compiled_loop: makes the compiled loop; None for one that is always plain Python.
     """
 
-    run_once: Callable[..., None]
+    run_once: RunOnce
     compiled_loop: Callable[[], Loop] | None = None
 
     def __call__(
         self,
         runs: int,
-        *arguments: Any,
-        scratch: Callable[[], Any] | None = None,
-        per_run: Sequence[Any] | None = None,
+        *arguments: KernelArgument,
+        scratch: Callable[[], KernelArgument] | None = None,
+        per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
         """Go through the runs; in plain Python, too, NaN and infinity raise nothing."""
         if self.compiled_loop is not None and not is_uncompiled():
@@ -149,9 +150,9 @@ class OverRuns:
 def _share(
     loop: Loop,
     runs: int,
-    *arguments: Any,
-    scratch: Callable[[], Any] | None = None,
-    per_run: Sequence[Any] | None = None,
+    *arguments: KernelArgument,
+    scratch: Callable[[], KernelArgument] | None = None,
+    per_run: Sequence[KernelArgument] | None = None,
 ) -> None:
     """Share the runs among the cores."""
     cores, lent = min(runs, core_count()), list[Memory]()
@@ -173,7 +174,7 @@ def _share(
 
 
 def _one_by_one(
-    loop: Loop, arguments: Sequence[Any], per_run: Sequence[Any]
+    loop: Loop, arguments: Sequence[KernelArgument], per_run: Sequence[KernelArgument]
 ) -> Callable[[int, int], None]:
     """Return what goes through the runs with a last argument for each."""
     by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}

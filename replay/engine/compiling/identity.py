@@ -10,9 +10,10 @@ from functools import cache
 from hashlib import sha256
 from importlib.resources import files
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
 
 import numpy as np
+
+from fuselog.replay.engine.compiling.kinds import Value
 
 # Whose parts are known by their names alone.
 _OF_PYTHON = {"numpy", *sys.stdlib_module_names}
@@ -21,7 +22,7 @@ _OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 def identity(function: FunctionType) -> str:
     """Return the words of a function, each thing that it needs described once."""
     known: dict[int, int] = {}
-    kept: list[Any] = []  # whose ids are keys
+    kept: list[Value] = []  # whose ids are keys
     return "\n".join(_words(function, known, kept, ()))
 
 
@@ -33,10 +34,12 @@ def digest_of(room: str) -> str:
     return sha256(b"".join(sources)).hexdigest()
 
 
-def _words(value: Any, known: dict[int, int], kept: list[Any], names: Sequence[str]) -> Iterator[str]:
+def _words(
+    value: Value, known: dict[int, int], kept: list[Value], names: Sequence[str]
+) -> Iterator[str]:
     """Return the words of what is used by code that has these names, among them its attributes."""
 
-    def of(part: Any) -> Iterator[str]:
+    def of(part: Value) -> Iterator[str]:
         return _words(part, known, kept, names)
 
     own = getattr(value, "kernel_identity", None)
@@ -89,7 +92,7 @@ def _words(value: Any, known: dict[int, int], kept: list[Any], names: Sequence[s
         yield repr(value)
 
 
-def _is_known(value: Any, known: dict[int, int], kept: list[Any]) -> bool:
+def _is_known(value: Value, known: dict[int, int], kept: list[Value]) -> bool:
     """Tell whether it was described before, which it is from now on."""
     if id(value) in known:
         return True

@@ -3,13 +3,13 @@
 The text of this file is part of the key of every kernel that is kept: what it changes is compiled anew.
 """
 
-from typing import Any
-
 from numba._dynfunc import make_function
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
+
+from fuselog.replay.engine.compiling.kinds import OfNumba
 
 
 class _InlinedLibrary(JITCodeLibrary):
@@ -20,7 +20,7 @@ class _InlinedLibrary(JITCodeLibrary):
     it, which takes a quarter.
     """
 
-    def _optimize_functions(self, module: Any) -> None:
+    def _optimize_functions(self, module: OfNumba) -> None:
         """Make the code small for what links it; what takes longer is done where it ends up."""
         module.data_layout = self._codegen._data_layout
         passes, builder = self._codegen._function_pass_manager(opt=1)
@@ -43,7 +43,7 @@ class _InlinedLowering(NativeLowering):
 
     _name = "inlined_lowering"
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: OfNumba) -> bool:
         """Lower without the ways in from Python."""
         flags = state.flags
         flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.no_compile = True
@@ -59,7 +59,7 @@ class _InlinedLowering(NativeLowering):
 class Inlined(Compiler):
     """Compiles functions that end up in another kernel, see `numba.njit(pipeline_class=...)`."""
 
-    def define_pipelines(self) -> Any:
+    def define_pipelines(self) -> OfNumba:
         """Return the usual passes, but for the last, into a library of another kind."""
         codegen = self.state.targetctx.codegen()
         library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]

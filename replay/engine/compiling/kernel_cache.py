@@ -17,7 +17,6 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import numba
 from numba.core import errors, types
@@ -34,6 +33,7 @@ from fuselog.replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
+from fuselog.replay.engine.compiling.kinds import KernelFunction, OfNumba
 from fuselog.replay.engine.compiling.notices import compiling, done_once
 
 # In place of the colours in which numba sets its error messages.
@@ -43,7 +43,7 @@ _COLOURLESS = SimpleNamespace(
 
 
 @lru_cache(maxsize=64)
-def load(text: str, title: str) -> Callable[..., Any]:
+def load(text: str, title: str) -> KernelFunction:
     """Make the function `kernel` of a module with this text; `title` is what to call it to a user.
 
     Args:
@@ -57,7 +57,8 @@ def load(text: str, title: str) -> Callable[..., Any]:
     if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         module.kernel._cache = code = _CompiledCode(name, title)
         module.kernel.compile = partial(code.compile, module.kernel.compile)
-    return module.kernel
+    kernel: KernelFunction = module.kernel
+    return kernel
 
 
 @cache
@@ -94,12 +95,12 @@ class _CompiledCode:
         # what holds while it is compiled
         self._meanwhile = ExitStack()
 
-    def compile(self, by_numba: Callable[[Any], Any], signature: Any) -> Any:
+    def compile(self, by_numba: Callable[[OfNumba], OfNumba], signature: OfNumba) -> OfNumba:
         """Load or compile the kernel for these types of arguments; numba asks the methods below."""
         with done_once(), global_compiler_lock, self._meanwhile:
             return by_numba(signature)
 
-    def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
+    def load_overload(self, signature: OfNumba, target: OfNumba) -> CompileResult | None:
         """Return the code, or None: it is compiled then, which is said where it takes long.
 
         Of several processes that want it one compiles, and the others load what that one has kept.
@@ -116,7 +117,7 @@ class _CompiledCode:
                 found = _loaded(path, target)
         return found
 
-    def save_overload(self, signature: Any, result: Any) -> None:
+    def save_overload(self, signature: OfNumba, result: OfNumba) -> None:
         """Keep the code."""
         path = self._path(signature, result.target_context)
         # an address in the code is worth nothing in another process
@@ -128,7 +129,7 @@ class _CompiledCode:
             why = str(error).removeprefix(f"{path}: ")
             say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
 
-    def _path(self, signature: Any, target: Any) -> Path | None:
+    def _path(self, signature: OfNumba, target: OfNumba) -> Path | None:
         """Return the file for one processor and these types of arguments."""
         key = "\n".join([*map(str, target.codegen().magic_tuple()), *map(_described, signature)])
         try:
@@ -138,7 +139,7 @@ class _CompiledCode:
         return folder / "kernels" / f"{self._name}-{sha256(key.encode()).hexdigest()[:24]}.bin"
 
 
-def _loaded(path: Path, target: Any) -> CompileResult | None:
+def _loaded(path: Path, target: OfNumba) -> CompileResult | None:
     content = read_checked(path)
     if content is None:
         return None
@@ -170,7 +171,7 @@ def _compiling(title: str) -> Iterator[None]:
             gc.enable()
 
 
-def _described(kind: Any) -> str:
+def _described(kind: OfNumba) -> str:
     """Describe a type by its name, and the fields of a named tuple, which numba knows by its class."""
     if not isinstance(kind, types.BaseTuple):
         return str(kind)

@@ -7,13 +7,14 @@ import sys
 from collections.abc import Mapping
 from hashlib import sha256
 from types import FunctionType, ModuleType
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 
 from fuselog.recorders import environment
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.compiling.kernels.program import definition_of
+from fuselog.replay.engine.compiling.kinds import Value
 
 # What a version names, which is part of every key; of any other module the sources are needed.
 _VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}
@@ -42,9 +43,9 @@ class KernelSource:
         self.definitions: dict[str, str] = {}
         # where a definition's lines come from, in words
         self.places: dict[tuple[str, int], str] = {}
-        self._names: dict[Any, str] = {}
+        self._names: dict[Value, str] = {}
 
-    def add(self, name: str, value: Any) -> str:
+    def add(self, name: str, value: Value) -> str:
         """Define a value, called `name` where it is used, and before it what it needs; its own name."""
         value = inspect.unwrap(value)  # what has been compiled already is compiled with the rest
         literal = _literal(value)
@@ -60,7 +61,7 @@ class KernelSource:
             self._names[key] = self._define(name, value, origin, literal)
         return self._names[key]
 
-    def _define(self, name: str, value: Any, origin: str, literal: str | None) -> str:
+    def _define(self, name: str, value: Value, origin: str, literal: str | None) -> str:
         lines: dict[int, str] = {}
         if isinstance(value, FunctionType) and not _is_known_to_numba(value):
             name = value.__name__
@@ -113,7 +114,7 @@ class KernelSource:
         }
 
 
-def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast.expr]:
+def _is_global_random(node: ast.AST, needed: Mapping[str, Value]) -> TypeGuard[ast.expr]:
     """Tell whether an expression is NumPy's module of generators that are nobody's own."""
     if isinstance(node, ast.Attribute) and node.attr == "random":
         return isinstance(node.value, ast.Name) and needed.get(node.value.id) is np
@@ -123,7 +124,7 @@ def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast
     return False
 
 
-def _is_made_here(value: Any) -> bool:
+def _is_made_here(value: Value) -> bool:
     """Tell whether it is a NamedTuple that was made at run time, which no import by name finds."""
     made = isinstance(value, type) and issubclass(value, tuple) and hasattr(value, "_fields")
     return made and getattr(sys.modules.get(value.__module__), value.__name__, None) is not value
@@ -142,7 +143,7 @@ def _is_known_to_numba(function: FunctionType) -> bool:
     return True
 
 
-def _stamp(value: Any) -> str:
+def _stamp(value: Value) -> str:
     """Return what changes with a thing that is imported by name, and so makes another kernel.
 
     Of a NamedTuple the order of its fields; of what numba has an implementation of, the module's source.
@@ -157,7 +158,7 @@ def _stamp(value: Any) -> str:
         return ""
 
 
-def _literal(value: Any) -> str | None:
+def _literal(value: Value) -> str | None:
     """Return a number, text, tuple of these or read-only array as source; None for anything else."""
     if isinstance(value, float):
         return f"float('{float(value)!r}')"  # infinity and NaN too

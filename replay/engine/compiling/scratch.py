@@ -1,7 +1,8 @@
 """Holds what cores work in while they go through a loop, and keeps it for the next time."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+
+from fuselog.replay.engine.compiling.kinds import KernelArgument
 
 
 class Memory:
@@ -9,9 +10,9 @@ class Memory:
 
     __slots__ = ("described", "value")
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self, value: KernelArgument) -> None:
         self.value = value
-        self.described: Any = None
+        self.described: KernelArgument = None
 
 
 class Scratch:
@@ -20,11 +21,11 @@ class Scratch:
     For one loop with arguments of the same sizes.
     """
 
-    def __init__(self, make: Callable[[], Any]) -> None:
+    def __init__(self, make: Callable[[], KernelArgument]) -> None:
         self._make = make
         self._free: list[Memory] = []
 
-    def __call__(self) -> Any:
+    def __call__(self) -> KernelArgument:
         """Make new memory."""
         return self._make()
 

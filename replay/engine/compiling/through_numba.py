@@ -14,7 +14,6 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
 
 import numba
 import numpy as np
@@ -23,6 +22,7 @@ from numba.core.errors import NumbaError
 from fuselog.replay.engine.compiling.inlining import Inlined
 from fuselog.replay.engine.compiling.kernel_cache import execute, load
 from fuselog.replay.engine.compiling.kernel_source import DoesNotCompile, KernelSource
+from fuselog.replay.engine.compiling.kinds import KernelFunction, RunOnce, Value
 from fuselog.replay.engine.compiling.scratch import Memory
 
 # Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
@@ -30,7 +30,7 @@ _PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
 vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inlined)
 
 
-def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
+def function_of(function: KernelFunction) -> KernelFunction:
     """Make a function as numba compiles it."""
     source = KernelSource()
     name = source.add(function.__name__, function)
@@ -42,7 +42,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 class _Loop:
     """Represents a function of one run as a loop over runs."""
 
-    def __init__(self, run_once: Callable[..., None], title: str = "") -> None:
+    def __init__(self, run_once: RunOnce, title: str = "") -> None:
         source = KernelSource()
         kernel = source.add("run_once", run_once)
         names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
@@ -55,7 +55,7 @@ class _Loop:
         title = title or f"{run_once.__module__}.{run_once.__name__}"
         self._loop = _compile(source, kernel, text, title)
 
-    def of(self, arguments: Sequence[Any], memory: Memory | None = None) -> Callable[[int, int], None]:
+    def of(self, arguments: Sequence[Value], memory: Memory | None = None) -> Callable[[int, int], None]:
         """Make the loop for these arguments."""
         everything = arguments if memory is None else (*arguments, memory.value)
 
@@ -79,7 +79,7 @@ class _Loop:
 loop_of = _Loop
 
 
-def _compile(source: KernelSource, called: str, definition: str, title: str) -> Callable[..., Any]:
+def _compile(source: KernelSource, called: str, definition: str, title: str) -> KernelFunction:
     """Make the function `kernel` that calls one of a source; `title` names it."""
     for name, defined in source.definitions.items():
         if name not in vars(_PARTS):

@@ -125,4 +125,5 @@ def _topic_of(there: _Messages, run: Integers, time_ns: Integers) -> Integers | 
     before = (np.cumsum(innovations) - innovations)[of_innovation[by_moment]]
     place = np.empty(len(run), np.int64)
     place[by_moment] = np.arange(len(run)) - before
-    return topic[begin[of_innovation] + np.where(are_several[of_innovation], place, 0)]
+    found: Integers = topic[begin[of_innovation] + np.where(are_several[of_innovation], place, 0)]
+    return found

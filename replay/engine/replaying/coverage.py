@@ -64,7 +64,8 @@ class Coverage:
         """Compute for how long (runs,) there were estimates, gaps left out."""
         self._count()
         is_gap = np.arange(self.BINS)[:, None] > self._longest()
-        return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
+        seconds: Floats = np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
+        return seconds
 
     def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
         """Tell whether the time (runs,) since each run's last estimate is a gap."""
@@ -77,11 +78,13 @@ class Coverage:
         self._count()
         reached = np.cumsum(self._counts, axis=0)
         median = np.argmax(2 * reached >= reached[-1], axis=0)
-        return np.maximum(median + self.GAP, self.SECOND)
+        longest: Integers = np.maximum(median + self.GAP, self.SECOND)
+        return longest
 
 
 def _bin_of(interval_ns: Integers) -> Integers:
-    return np.frexp(np.maximum(interval_ns, 1).astype(float))[1].astype(np.int64) - 1
+    power: Integers = np.frexp(np.maximum(interval_ns, 1).astype(float))[1].astype(np.int64) - 1
+    return power
 
 
 def count_intervals(

@@ -93,6 +93,12 @@ class Reading:
     control_noise: Callable[[float], Mapping[tuple[str, int], float]]
 
 
+# What a recursion carries from block to block: its own.
+Carried = Any  # type: ignore[explicit-any]
+# What a parameter is set to: a number, a text, a list or a table.
+Setting = Any  # type: ignore[explicit-any]
+
+
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True, eq=False)
 class Recursive:
@@ -128,11 +134,11 @@ class Recursive:
     name: str
     streams: tuple[str, ...]
     static: tuple[str, ...]
-    start: Callable[[dict[str, Ragged]], Any]
-    run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
+    start: Callable[[dict[str, Ragged]], Carried]
+    run: Callable[[Carried, Block], tuple[Carried, list[Ragged]]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
-    finish: Callable[[Any], list[Ragged]] | None = None
+    finish: Callable[[Carried], list[Ragged]] | None = None
     parameters: Parameters | None = None
     out_of_sequence: "Callable[[int], Recursive] | None" = None
     initialization: Initialization | None = None
@@ -200,31 +206,39 @@ class Estimator(Generic[ParametersType]):
     def __str__(self) -> str:
         return self.summary
 
-    def specified(self, label: str, settings: Mapping[str, Any]) -> "Estimator[Any]":  # noqa: ARG002
+    def specified(self, label: str, settings: Mapping[str, Setting]) -> "AnyEstimator":  # noqa: ARG002
         """Return what `settings` of `label` make of it: another where they name a foreign filter."""
         return self
 
     # one of any model has these by what the name says: `_OfAnyModel`
-    def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
+    def parameters_with(self, name: str, variant: Mapping[str, Setting]) -> type[Parameters]:  # noqa: ARG002
         """Return the parameters that count under `name` with `variant`, as `smoother:iterated`."""
         return self.parameters
 
-    def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:  # noqa: ARG002
+    def parameters_by_model(
+        self,
+        name: str,  # noqa: ARG002
+        variant: Mapping[str, Setting],  # noqa: ARG002
+    ) -> dict[str, type[Parameters]]:
         """Return by model the parameters under `name` with `variant`; none where it is of no model."""
         return {}
 
 
-def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
+# An estimator of any parameters, which a registry has by its name.
+AnyEstimator = Estimator[Any]  # type: ignore[explicit-any]
+
+
+def find_estimator(name: str) -> tuple[AnyEstimator, dict[str, Setting]]:
     """Return the registered estimator of `name`, and the parameter that a `name:variant` sets.
 
     Raises BadInput where there is none, or it has no variants.
     """
     kind, _, variant = name.partition(":")
-    estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    estimator: AnyEstimator = load("estimators", kind, Estimator)
     return estimator, set_by_variant("estimator", kind, variant, estimator.variant)
 
 
-def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Any]:
+def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Setting]:
     """Return the parameter that the variant of a name sets; nothing where the name has none.
 
     Raises BadInput where what is named, an estimator or a method of this kind, has no variants.
@@ -236,7 +250,7 @@ def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) ->
     return {parameter: variant}
 
 
-def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
+def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, Parameters]:
     """Make the estimator of a label, and its parameters.
 
     `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
@@ -258,7 +272,7 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     return estimator, build(estimator.parameters, values, f"estimator {label}")
 
 
-def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], dict[str, Any]]:
+def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, dict[str, Setting]]:
     """Return the estimator of a label and the values of its parameters, which are not checked yet.
 
     Raises BadInput where the name is unknown or sets what a setting sets otherwise, or a foreign filter
@@ -292,7 +306,7 @@ def code_of(name: str) -> Iterator[None]:
 
 
 def bound_to(
-    estimator: Estimator[Any], label: str, topics: Mapping[str, Topic], parameters: Parameters
+    estimator: AnyEstimator, label: str, topics: Mapping[str, Topic], parameters: Parameters
 ) -> list[Bound]:
     """Bind an estimator to topics; raises BadInput where it would read a truth."""
     bound = estimator.bind(label, topics, parameters)
@@ -303,7 +317,7 @@ def bound_to(
     return bound
 
 
-def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
     An ensemble keeps what was bound to it last, which is bound with the same settings again.
@@ -325,7 +339,7 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     return list(ensemble.findings.once(key, lambda: _bound(label, ensemble, settings)))
 
 
-def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Any]) -> list[Bound]:
+def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Setting]) -> list[Bound]:
     estimator, parameters = configure(label, settings)
     first = ensemble[0]
     try:

@@ -18,14 +18,14 @@ models, `fuselog.replay.inference.run.out_of_sequence`, for those of libraries
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Booleans, Integers
-from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.replaying.estimator import Bound, Carried, Recursive
 from fuselog.replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals, run_of_rows
 from fuselog.replay.engine.streams.failures import reason_stream
 
@@ -117,7 +117,7 @@ class _State(NamedTuple):
             before the first block.
     """
 
-    inner: Any
+    inner: Carried
     waiting: Mapping[str, Ragged]
     newest_ns: Integers | None = None
     arrived_ns: Integers | None = None
@@ -216,7 +216,8 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
         last = np.maximum(ragged.offsets[1:], 1) - 1
         arrived = np.append(ragged.stream.log_time_ns, 0)[last]
         reached.append(np.where(np.diff(ragged.offsets) > 0, arrived, 0))
-    return np.max(reached, axis=0)
+    newest: Integers = np.max(reached, axis=0)
+    return newest
 
 
 def _find_behind(

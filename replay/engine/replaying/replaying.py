@@ -7,14 +7,21 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from math import inf, isqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock
 from fuselog.recorders.log.planes import Origin, common_origin
-from fuselog.replay.engine.replaying.estimator import Batch, Bound, Initialized, Recursive, code_of
+from fuselog.replay.engine.replaying.estimator import (
+    Batch,
+    Bound,
+    Carried,
+    Initialized,
+    Recursive,
+    code_of,
+)
 from fuselog.replay.engine.replaying.late import Late, taking_late
 from fuselog.replay.engine.replaying.monitor import RunMonitor
 from fuselog.replay.engine.replaying.usage import Usage
@@ -161,7 +168,7 @@ class _Start(NamedTuple):
         streams: those of what it begins with.
     """
 
-    state: Any
+    state: Carried
     unable: Mapping[int, str] = {}
     why: BadInput | None = None
     streams: Sequence[Ragged] = ()
@@ -185,7 +192,7 @@ def _kept_start(
     return start
 
 
-def _bytes_of(state: Any) -> float:
+def _bytes_of(state: Carried) -> float:
     """Count the bytes of a state that is made of arrays; of any other they are unknown: infinite."""
     if isinstance(state, np.ndarray):
         return state.nbytes
@@ -255,7 +262,7 @@ def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str,
     }
 
 
-def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
+def _solve(bound: Batch, given: Carried, streams: dict[str, Ragged]) -> list[Ragged]:
     if given is _REFUSED:
         return []
     with code_of(bound.name):
@@ -264,10 +271,10 @@ def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]
 
 def _advance(
     bound: Recursive,
-    state: Any,
+    state: Carried,
     block_of: Callable[[dict[str, Ragged]], Block],
     streams: dict[str, Ragged],
-) -> tuple[Any, list[Ragged]]:
+) -> tuple[Carried, list[Ragged]]:
     if state is _REFUSED:
         return state, []
     block = block_of(streams)
@@ -277,8 +284,8 @@ def _advance(
 
 def _finish(
     bound: Recursive,
-    finish: Callable[[Any], list[Ragged]],
-    state: Any,
+    finish: Callable[[Carried], list[Ragged]],
+    state: Carried,
     _: dict[str, Ragged],
 ) -> list[Ragged]:
     with code_of(bound.name):

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fuselog.recorders.log import Clock, Stream, schemas
+from fuselog.replay.engine.arrays import AnyArray
 from fuselog.replay.engine.replaying.attribution import Attribution
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import sentences_of
@@ -87,7 +88,7 @@ class Usage:
     speaks: bool = False
     doubtful: dict[str, str] = field(default_factory=dict)
     shares: Attribution = field(default_factory=Attribution)
-    begins_ns: np.ndarray | None = None
+    begins_ns: AnyArray | None = None
 
     def note_start(self, static: Mapping[str, Ragged]) -> None:
         """Look at the streams that the estimator begins with."""
@@ -210,7 +211,7 @@ def _topic_in(why: str, topics: Iterable[str]) -> bool:
     return any(why.startswith(f"topic {topic}:") for topic in topics)
 
 
-def _repeated(stream: Stream) -> np.ndarray:
+def _repeated(stream: Stream) -> AnyArray:
     """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:

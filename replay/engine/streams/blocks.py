@@ -4,19 +4,20 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import compress
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Clock, Stream
+from fuselog.replay.engine.arrays import AnyArray, Columns, RowSlice
 from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.failures import join_streams
 
 Found = TypeVar("Found")
 
 
-class Findings(dict[Hashable, Any]):
+class Findings(dict[Hashable, Columns]):
     """Keeps what was worked out of columns, which never change: the last few things."""
 
     def __init__(self, most: int = 16) -> None:
@@ -26,12 +27,14 @@ class Findings(dict[Hashable, Any]):
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
         """Return what `find` gives; it is called where the key is none of the last few."""
         try:
-            return self[key]
+            known: Found = self[key]
+            return known
         except KeyError:
             found = find()
         while len(self) >= self._most:
             self.pop(list(self)[0], None)  # noqa: RUF015 other threads add to it meanwhile
-        return self.setdefault(key, found)
+        kept: Found = self.setdefault(key, found)
+        return kept
 
     def __reduce__(self) -> tuple[type["Findings"], tuple[int]]:
         return Findings, (self._most,)  # another process finds it again
@@ -54,7 +57,7 @@ class Ragged:
         """Keep what is found of these messages alone, such as the priors that they are."""
         return Findings()
 
-    def __getitem__(self, name: str) -> NDArray:
+    def __getitem__(self, name: str) -> AnyArray:
         """Return the column of one field, all runs end to end."""
         return self.stream.columns[name]
 
@@ -85,7 +88,7 @@ class Events(NamedTuple):
     is_last: NDArray[np.bool_]
 
 
-CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
+CarriedType = TypeVar("CarriedType", bound=tuple[Columns, ...])
 
 
 class Block(NamedTuple):
@@ -108,7 +111,7 @@ class Block(NamedTuple):
         """Return what `find` finds of these messages, or an earlier replay has kept under `key`."""
         return find() if self.findings is None else self.findings.once(key, find)
 
-    def column(self, *names: str, missing: float = np.nan) -> NDArray:
+    def column(self, *names: str, missing: float = np.nan) -> AnyArray:
         """Return one field of every event: the first of `names` that its topic has, else `missing`."""
         parts = []
         for ragged in self.streams.values():
@@ -119,12 +122,12 @@ class Block(NamedTuple):
 
 def copied(carried: CarriedType) -> CarriedType:
     """Return a NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
-    columns: Any = carried
-    made: Any = type(carried)
+    columns: Columns = carried
+    made: type[CarriedType] = type(carried)
     return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
 
 
-def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
+def of_runs(carried: CarriedType, runs: RowSlice) -> CarriedType:
     """View the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
 
     An entry may be such a NamedTuple itself.
@@ -133,8 +136,8 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
         carried: a NamedTuple of arrays (runs, ...), or of such NamedTuples.
         runs: which.
     """
-    columns: Any = carried
-    made: Any = type(carried)
+    columns: Columns = carried
+    made: type[CarriedType] = type(carried)
     return made(
         *(of_runs(column, runs) if isinstance(column, tuple) else column[runs] for column in columns)
     )
@@ -172,7 +175,7 @@ def by_runs(parts: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDAr
 
 def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
-) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
+) -> tuple["NDArray[np.int64] | RowSlice", NDArray[np.int64]]:
     """Find the filled rows of ragged columns.
 
     Args:

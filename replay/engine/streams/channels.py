@@ -32,7 +32,8 @@ def stated(
             return _number(topic.name, name, topic.metadata[name], parameters, stands_for or name)
         other, power = _POWERS.get(name, ("", 1.0))
         if other in topic.metadata:
-            return _number(topic.name, other, topic.metadata[other], _Noise, other) ** power
+            number: float = _number(topic.name, other, topic.metadata[other], _Noise, other) ** power
+            return number
     if needed:
         mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
         raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
@@ -43,7 +44,7 @@ def stated(
 _POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
 
 
-class _Noise(Parameters):
+class _Noise(Parameters):  # type: ignore[explicit-any]
     """States what these are: positive numbers."""
 
     sigma_m: PositiveFloat = 1.0

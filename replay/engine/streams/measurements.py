@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
+from fuselog.replay.engine.arrays import Booleans
 from fuselog.replay.engine.vectors.components import Components, match_components, match_tangent
 
 Floats = NDArray[np.float64]
@@ -108,7 +109,8 @@ def read_fixes(
 def unknown(covariance: Floats) -> NDArray[np.bool_]:
     """Find which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
     smallest: Floats = np.diagonal(covariance, axis1=1, axis2=2).min(axis=1)
-    return ~(smallest > 0.0) | np.isnan(covariance.sum(axis=(1, 2)))
+    is_none: Booleans = ~(smallest > 0.0) | np.isnan(covariance.sum(axis=(1, 2)))
+    return is_none
 
 
 def matrices(stream: Stream, field: str, covariance: str) -> Floats:

@@ -158,7 +158,8 @@ def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
 def _below(place_m: Floats, movement: Movement) -> Floats:
     """Return what flat places (n, 2) lack in another plane, since the earth falls off below theirs."""
     fall_m = np.sum(place_m**2, axis=1) / (2.0 * SEMI_MAJOR_M)
-    return -fall_m[:, None] * movement.rotation[:2, 2]
+    moved_m: Floats = -fall_m[:, None] * movement.rotation[:2, 2]
+    return moved_m
 
 
 def _turned(covariance: Floats, jacobian: Floats) -> Floats:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.log.streams import stream_of
 from fuselog.recorders.models.planar import wrap_angle
+from fuselog.replay.engine.arrays import AnyArray
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import Failure, failure_stream, reason_stream
 from fuselog.replay.engine.vectors.components import Components
@@ -123,8 +124,8 @@ class InnovationColumns(NamedTuple):
     """
 
     time_ns: Integers
-    target_id: NDArray
-    accepted: NDArray
+    target_id: AnyArray
+    accepted: AnyArray
     innovation: Floats
     covariance: Floats
     squared: Floats

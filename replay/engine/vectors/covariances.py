@@ -57,13 +57,15 @@ def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
         _factors(np.where(both, covariance, np.eye(error.shape[-1]))), axis1=-2, axis2=-1
     )
     determinant = 2.0 * np.sum(np.log(pivots), axis=-1)
-    return -0.5 * (squared + determinant + known.sum(axis=-1) * np.log(2.0 * np.pi))
+    logarithm: Array = -0.5 * (squared + determinant + known.sum(axis=-1) * np.log(2.0 * np.pi))
+    return logarithm
 
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
     """Tell whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
     pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
-    return np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
+    are_definite: NDArray[np.bool_] = np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
+    return are_definite
 
 
 def _factors(covariance: Array) -> Array:

@@ -36,7 +36,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
     return True
 
 
-def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
+def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, "slice[int, int, int]"]]:
     """Yield kind and columns of every number, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):

@@ -5,7 +5,7 @@ differences are independent given it. A source of microphones that all are at on
 there, for nothing tells by how much it is above or below.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.inertial import distance
 from fuselog.recorders.models.planar import Components
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.measurements import SPACE
 from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
@@ -123,7 +123,10 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def _settled(
-    residuals: Function, slopes: Function, place: Floats, near_m: float
+    residuals: Callable[[Floats], Floats],
+    slopes: Callable[[Floats], Floats],
+    place: Floats,
+    near_m: float,
 ) -> tuple[Floats, Floats]:
     """Find where a soft_l1 cost's gradient is zero, near a place (n,), and the information (n, n) there.
 

@@ -20,7 +20,7 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.api.functions import recursive
 from fuselog.replay.engine.api.inputs import Given, Messages
 from fuselog.replay.engine.api.outputs import Results
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import Estimator
 from fuselog.replay.engine.streams.measurements import Vectors
 from fuselog.replay.engine.vectors.components import Components
@@ -250,8 +250,11 @@ def _of_unit_vectors(
     )
 
 
+HeadingFilter = partial[tuple[WrappedNormal, WrappedNormal]]
+
+
 def _of_headings(
-    summary: str, parameters: type[Any], filter_of: Callable[[Any], Function]
+    summary: str, parameters: type[Any], filter_of: Callable[[Any], HeadingFilter]
 ) -> Estimator[Any]:
     components: Components = {"heading1_rad": "angle", "heading2_rad": "angle"}
     return recursive(
@@ -267,11 +270,11 @@ def _of_headings(
     )
 
 
-def _toroidal(parameters: TorusParameters) -> Function:
+def _toroidal(parameters: TorusParameters) -> HeadingFilter:
     return partial(run_toroidal_filter, central_weight=parameters.central_weight)
 
 
-def _unscented(parameters: UnscentedTorusParameters) -> Function:
+def _unscented(parameters: UnscentedTorusParameters) -> HeadingFilter:
     return partial(run_unscented_filter, wrapped=parameters.wrapped)
 
 

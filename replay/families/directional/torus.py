@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.families.directional.headings import turn_together
 from fuselog.recorders.models.planar import Component, wrap_angle
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.families.directional.distributions.gaussian_kernels import condition
 from fuselog.replay.families.directional.distributions.wrapped_normal import (
@@ -35,7 +35,7 @@ from fuselog.replay.families.directional.distributions.wrapped_normal_kernels im
     fit_samples,
     five_samples,
 )
-from fuselog.replay.inference.run.loops import over_events
+from fuselog.replay.inference.run.loops import OnEvent, over_events
 
 # A variance (rad^2) of a measurement that moves a Gaussian by less than its rounding.
 _VAGUE = 1e18
@@ -147,8 +147,12 @@ def run_unscented_filter(
     return _run(_unscented_step, motion, model, state, offsets, measurement, wrapped)
 
 
+# (motion) -> what processes a row.
+MakeStep = Callable[[Motion], OnEvent]
+
+
 def _run(
-    step: Function,
+    step: MakeStep,
     motion: Motion,
     model: HeadingModel,
     state: WrappedNormal,
@@ -169,7 +173,7 @@ def _run(
 
 
 @cache
-def _over_runs(step: Function, motion: Motion) -> Function:
+def _over_runs(step: MakeStep, motion: Motion) -> OverRuns:
     """Compile the loop of a filter: what `step` makes processes a row, whose state is written down."""
     loop = over_events(step(motion), _write, fails=False)
     return compile_over_runs(loop, allocates=False, title="a filter of headings")
@@ -183,7 +187,7 @@ def _write(
     return ALL_WELL
 
 
-def _toroidal_step(motion: Motion) -> Function:
+def _toroidal_step(motion: Motion) -> OnEvent:
     def step(
         run: int, row: int, inputs: HeadingInputs, state: WrappedNormal, _: WrappedNormal, work: Mixture
     ) -> int:
@@ -233,7 +237,7 @@ def _store(
     covariance[1, 0] = covariance[0, 1]
 
 
-def _unscented_step(motion: Motion) -> Function:
+def _unscented_step(motion: Motion) -> OnEvent:
     def step(
         run: int, row: int, inputs: HeadingInputs, state: WrappedNormal, _: WrappedNormal, __: Mixture
     ) -> int:

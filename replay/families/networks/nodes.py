@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fuselog.recorders.models.constant_velocity import noise_moments
-from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.families.networks.covariance_intersection import (
     FusionMemory,
     fuse_by,
@@ -20,7 +20,7 @@ from fuselog.replay.families.networks.estimates import (
     one_of,
 )
 from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
-from fuselog.replay.inference.run.loops import over_stamps
+from fuselog.replay.inference.run.loops import Follow, over_stamps
 
 
 class Activities(NamedTuple):
@@ -264,7 +264,7 @@ def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) ->
     return squared_distance(difference, most) <= gate
 
 
-def following() -> Function:
+def following() -> Follow:
     """Make the loop over the activities of one run, until these end or a fusion fails.
 
     Returns `follow(run, inputs, failed_ns, results, work)`, which fills in when the run failed.

@@ -1,13 +1,13 @@
 """Hands messages to the filters of a library: one loop, which calls its functions by address."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers, varying
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats, Integers, varying
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import copied, filled_rows
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.foreign.description import Description
@@ -204,7 +204,7 @@ def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made
 
 
 @lru_cache(maxsize=1)
-def _loop() -> Function:
+def _loop() -> OverRuns:
     return compile_over_runs(follow, allocates=False, title="filters of a library")
 
 
@@ -274,7 +274,7 @@ def copies_of(library: Library, filters: Filters) -> Filters:
     return found
 
 
-def work_of(description: Description) -> Function:
+def work_of(description: Description) -> Callable[[], tuple[Innovation, Innovation]]:
     """Return what makes the kernels' working memory."""
     return partial(_work, max(len(description.innovation), 1))
 

@@ -4,12 +4,21 @@ What a filter carries is a mean and what stands for its covariance, see `Form`. 
 covariance itself; the parts of square-root forms are in `fuselog.replay.inference.kalman.square_root`.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
-from fuselog.replay.engine.arrays import Function
 from fuselog.replay.inference.kalman.predict import linear_motion
 from fuselog.replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
-from fuselog.replay.inference.kalman.steps import Steps, Workspace, gaussian_filter, keeping, workspace
+from fuselog.replay.inference.kalman.steps import (
+    Predict,
+    Samples,
+    Steps,
+    Update,
+    Workspace,
+    gaussian_filter,
+    keeping,
+    workspace,
+)
 from fuselog.replay.inference.kalman.update import kalman_update, linear_sensor
 from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from fuselog.replay.inference.model.stage import Stage
@@ -26,18 +35,18 @@ class Parts(NamedTuple):
     """
 
     form: Form
-    linear_motion: Function
-    sampled_motion: Function
-    linear_update: Function
-    sampled_update: Function
-    gap_motion: Function
+    linear_motion: Callable[[Stage], Predict]
+    sampled_motion: Callable[[Stage, int], Predict]
+    linear_update: Callable[[Stage, int], Update]
+    sampled_update: Callable[[Stage, int, int], Update]
+    gap_motion: Callable[[Stage], Predict]
 
 
-def _linear_update(stage: Stage, number: int) -> Function:
+def _linear_update(stage: Stage, number: int) -> Update:
     return kalman_update(stage, number, linear_sensor(stage, number))
 
 
-def _sampled_update(stage: Stage, number: int, samples: int) -> Function:
+def _sampled_update(stage: Stage, number: int, samples: int) -> Update:
     return kalman_update(stage, number, sampled_sensor(stage, number, samples))
 
 
@@ -72,7 +81,7 @@ def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
             dimensions.append(model.tangent + sensor.noises)
             shapes.append((sensor.noises, tuple(sensor.measured.values())))
 
-    def memory(sets: tuple[Any, ...]) -> Workspace:
+    def memory(sets: tuple[Samples, ...]) -> Workspace:
         made = (
             sample_memory(each, model.kinds, noises, outputs)
             for each, (noises, outputs) in zip(sets, shapes, strict=True)

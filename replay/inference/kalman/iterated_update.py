@@ -1,16 +1,15 @@
 """Updates a Gaussian by a sensor that is linearised again at every iterate, until it settles."""
 
-from typing import Any
-
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
     Measurement,
+    Update,
     Workspace,
 )
 from fuselog.replay.inference.kalman.update import (
@@ -36,7 +35,7 @@ ITERATIONS = 50
 SETTLED = 1e-12  # the largest component of the last step
 
 
-def iterated_update(stage: Stage, number: int) -> Function:
+def iterated_update(stage: Stage, number: int) -> Update:
     """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
@@ -56,7 +55,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
     step_to, chain = relinearising(model)
 
     def relinearise(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
+        mean: Floats, covariance: Floats, data: Floats, parameters: Settings, work: Workspace
     ) -> None:
         """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
         innovation, step, rows = work.innovations[number], work.step, work.rows

@@ -15,14 +15,16 @@ from pydantic import BeforeValidator, NonNegativeFloat, NonNegativeInt, Positive
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters, build
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.kalman.forms import extended, sampled
 from fuselog.replay.inference.kalman.iterated_update import iterated_update
 from fuselog.replay.inference.kalman.predict import linear_motion, motion_noise
 from fuselog.replay.inference.kalman.square_root import FACTORED
 from fuselog.replay.inference.kalman.steps import (
+    Innovate,
     Interval,
     Measurement,
+    Predict,
     Steps,
     Workspace,
     gaussian_filter,
@@ -36,19 +38,22 @@ from fuselog.replay.inference.kalman.update import (
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
 from fuselog.replay.inference.model.settings import trial_parameters
 from fuselog.replay.inference.model.stage import Stage, traced_sensor
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.sampling import parse_sampling
 from fuselog.replay.inference.sampling.names import Sampling, Unscented
 
+# Makes what goes through a log, a `fuselog.replay.inference.run.filtering.Filter`, which stands above.
+MakeFilter = Callable[..., Any]  # type: ignore[explicit-any]
+
 
 def _as_list(value: object) -> object:
     return [each.strip() for each in value.split(",")] if isinstance(value, str) else value
 
 
-class MethodParameters(Parameters):
+class MethodParameters(Parameters):  # type: ignore[explicit-any]
     """Defines the options of every method.
 
     Attributes:
@@ -74,7 +79,7 @@ class MethodParameters(Parameters):
     of_topics: dict[str, dict[str, float]] | None = None
 
 
-class UnscentedParameters(MethodParameters):
+class UnscentedParameters(MethodParameters):  # type: ignore[explicit-any]
     """Defines options of methods that may use the unscented transform.
 
     Attributes:
@@ -86,7 +91,7 @@ class UnscentedParameters(MethodParameters):
     kappa: float = 0.0
 
 
-class RegressionParameters(MethodParameters):
+class RegressionParameters(MethodParameters):  # type: ignore[explicit-any]
     """Defines options of methods that may use samples.
 
     Attributes:
@@ -98,7 +103,7 @@ class RegressionParameters(MethodParameters):
     seed: NonNegativeInt = 0
 
 
-class SquareRootParameters(UnscentedParameters):
+class SquareRootParameters(UnscentedParameters):  # type: ignore[explicit-any]
     """Chooses the filter that carries factors of its covariances.
 
     Attributes:
@@ -130,11 +135,11 @@ class Method:
     summary: str
     parameters: type[MethodParameters]
     steps: Callable[[Stage], Steps]
-    sampling: Callable[[Any], Sampling] | None = None
+    sampling: Callable[[CombinedParameters], Sampling] | None = None
     lacks: Callable[[Model], str] = lambda _: ""
     variant: str | None = None
-    made_for: Callable[[Any], "Method"] | None = None
-    filtering: Callable[..., Any] | None = None
+    made_for: Callable[[CombinedParameters], "Method"] | None = None
+    filtering: MakeFilter | None = None
     takes_all_modes: bool = False
     is_random: bool = False
 
@@ -169,7 +174,7 @@ def _square_root(parameters: SquareRootParameters) -> Method:
     return _SQUARE_ROOTS[parameters.filter]
 
 
-def _exact_motion(stage: Stage) -> Function:
+def _exact_motion(stage: Stage) -> Predict:
     model, motion = stage.model, stage.motion
     moments, add_noise = motion.moments, motion_noise(model, motion)
     assert moments is not None
@@ -185,8 +190,7 @@ def _exact_motion(stage: Stage) -> Function:
     return predict
 
 
-def _exact_sensor(stage: Stage, number: int) -> Function:
-
+def _exact_sensor(stage: Stage, number: int) -> Innovate:
     sensor = stage.sensors[number]
     moments, read_reference = sensor.moments, message_layout(sensor).reference
     assert moments is not None
@@ -299,7 +303,7 @@ def filter_with(name: str, variant: str) -> Method:
     if not variant or sampling is None:
         return chosen
 
-    def sampling_of_variant(parameters: Any) -> Sampling:
+    def sampling_of_variant(parameters: CombinedParameters) -> Sampling:
         return sampling(parameters.model_copy(update={chosen.variant: variant}))
 
     return replace(chosen, sampling=sampling_of_variant)

@@ -1,9 +1,9 @@
 """Predicts a Gaussian through a model's motion by its Jacobian, and adds the motion's noise."""
 
-from typing import Any
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
-from fuselog.replay.inference.kalman.steps import Interval, Workspace
+from fuselog.replay.engine.arrays import Floats, Numbers, Settings
+from fuselog.replay.inference.kalman.steps import CoreMemory, Interval, Predict, Workspace
 from fuselog.replay.inference.linear_algebra.gaussian import add_through
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative, known_entries
 from fuselog.replay.inference.linear_algebra.sparse import (
@@ -11,12 +11,41 @@ from fuselog.replay.inference.linear_algebra.sparse import (
     pattern_of,
     propagating_covariance,
 )
-from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.linear_algebra.tuples import AddNoise, adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.functions import MotionNoise
 from fuselog.replay.inference.model.model import Model, Motion
 from fuselog.replay.inference.model.stage import Stage
 
 
-def linear_motion(stage: Stage) -> Function:
+class LineariseMotion(Protocol):
+    """Fills the moved state (n,) and the derivatives that are wanted, see `motion_derivative`."""
+
+    def __call__(
+        self,
+        state: Numbers,
+        control: Numbers,
+        duration_s: float,
+        parameters: Settings,
+        work: CoreMemory,
+        /,
+    ) -> None: ...
+
+
+class AddMotionNoise(Protocol):
+    """Adds the noise of a motion from a state (n,) over a duration to a covariance (t, t)."""
+
+    def __call__(
+        self,
+        state: Numbers,
+        covariance: Floats,
+        duration_s: float,
+        parameters: Settings,
+        work: CoreMemory,
+        /,
+    ) -> None: ...
+
+
+def linear_motion(stage: Stage) -> Predict:
     """Make the prediction by the Jacobian at the mean, which is exact where the motion is linear.
 
     Returns `predict(mean, covariance, interval, work)`: in place, the mean (n,) becomes f(x, u) and the
@@ -42,7 +71,7 @@ def linear_motion(stage: Stage) -> Function:
     return predict
 
 
-def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Function:
+def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> LineariseMotion:
     """Make the function that moves a state and takes the derivatives that are wanted.
 
     Args:
@@ -57,7 +86,9 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Functi
     if motion.jacobians is not None:
         move, jacobians, fill = motion.move, motion.jacobians, filling(model.size)
 
-        def by_hand(state: Any, control: Any, duration_s: float, parameters: Any, work: Any) -> None:
+        def by_hand(
+            state: Numbers, control: Numbers, duration_s: float, parameters: Settings, work: CoreMemory
+        ) -> None:
             jacobians(state, control, duration_s, parameters, work.transition, work.gain)
             fill(work.state, move(state, control, duration_s, parameters))
 
@@ -71,7 +102,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Functi
     return derivative(motion.move, inputs, model.kinds, "state")
 
 
-def motion_noise(model: Model, motion: Motion) -> Function:
+def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
     """Make the function that adds the noise of a motion, whatever its kind, to a covariance.
 
     Args:
@@ -81,7 +112,7 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     Returns `add(state, covariance, duration_s, parameters, work)`, for a covariance (t, t). What enters
     by the control, or other than by addition, does so through the workspace's derivatives.
     """
-    pieces: list[Function] = []
+    pieces: list[AddMotionNoise] = []
     if motion.control_noise is not None:
         pieces.append(_control_noise(model, motion))
     if motion.noise is not None and motion.noises:
@@ -93,44 +124,52 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     return pieces[0] if len(pieces) == 1 else _both(*pieces)
 
 
-def nothing(*_: Any) -> None:
+def nothing(*_: object) -> None:
     """Do nothing, in place of what a model does not need."""
     return
 
 
-def _both(first: Function, second: Function) -> Function:
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+def _both(first: AddMotionNoise, second: AddMotionNoise) -> AddMotionNoise:
+    def add(
+        state: Numbers, covariance: Floats, duration_s: float, parameters: Settings, work: CoreMemory
+    ) -> None:
         first(state, covariance, duration_s, parameters, work)
         second(state, covariance, duration_s, parameters, work)
 
     return add
 
 
-def _control_noise(model: Model, motion: Motion) -> Function:
+def _control_noise(model: Model, motion: Motion) -> AddMotionNoise:
     fill, variances = filling(model.controls), motion.control_noise
     assert variances is not None
     known = known_entries(motion_derivative(model, motion, by_state=False), "gain")
     add_through = adding_through(pattern_of(known, model.tangent))
 
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+    def add(
+        state: Numbers, covariance: Floats, duration_s: float, parameters: Settings, work: CoreMemory
+    ) -> None:
         fill(work.control_variance, variances(duration_s, parameters))
         add_through(covariance, work.gain, work.control_variance)
 
     return add
 
 
-def _entering_noise(variances: Function, noises: int) -> Function:
+def _entering_noise(variances: MotionNoise, noises: int) -> AddMotionNoise:
     fill = filling(noises)
 
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+    def add(
+        state: Numbers, covariance: Floats, duration_s: float, parameters: Settings, work: CoreMemory
+    ) -> None:
         fill(work.noise_variance[:noises], variances(state, duration_s, parameters))
         add_through(covariance, work.noise_gain, work.noise_variance[:noises])
 
     return add
 
 
-def _additive_noise(noise: Function, add_noise: Function) -> Function:
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+def _additive_noise(noise: MotionNoise, add_noise: AddNoise) -> AddMotionNoise:
+    def add(
+        state: Numbers, covariance: Floats, duration_s: float, parameters: Settings, work: CoreMemory
+    ) -> None:
         add_noise(covariance, noise(state, duration_s, parameters))
 
     return add

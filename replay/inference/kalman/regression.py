@@ -8,14 +8,25 @@ hardly known, samples are taken nearer to the mean: see `fuselog.replay.inferenc
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, varying
-from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
-from fuselog.replay.inference.kalman.steps import Interval, Measurement, Workspace
-from fuselog.replay.inference.kalman.update import message_layout, residual_of, sensor_noise
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Numbers, varying
+from fuselog.replay.inference.kalman.predict import (
+    AddMotionNoise,
+    LineariseMotion,
+    motion_derivative,
+    motion_noise,
+    nothing,
+)
+from fuselog.replay.inference.kalman.steps import Innovate, Interval, Measurement, Predict, Workspace
+from fuselog.replay.inference.kalman.update import (
+    MeasurementNoise,
+    message_layout,
+    residual_of,
+    sensor_noise,
+)
 from fuselog.replay.inference.kalman.wide_angles import narrowing, turning, unsuspected_rad, widen
 from fuselog.replay.inference.linear_algebra.gaussian import cholesky
 from fuselog.replay.inference.linear_algebra.manifold import (
@@ -32,6 +43,7 @@ from fuselog.replay.inference.linear_algebra.moments import (
     weighted_mean_of,
 )
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
 from fuselog.replay.inference.model.model import Motion, Sensor
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.sampling.sets import SampleSets
@@ -93,14 +105,59 @@ def sample_memory(
     )
 
 
+class Sampled(Protocol):
+    """Evaluates what is sampled at a state (n,) and its noise (noises,); `arguments` are all others."""
+
+    def __call__(
+        self, state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...], /
+    ) -> Numbers: ...
+
+
+class Sample(Protocol):
+    """Evaluates a function at samples about a mean (n,), see `sampling`; returns their weights (L,)."""
+
+    def __call__(
+        self,
+        mean: Floats | Numbers,
+        arguments: tuple[AnyArgument, ...],
+        variances: Numbers,
+        sample_index: int,
+        memory: SampleMemory,
+        /,
+    ) -> Floats: ...
+
+
+class Regress(Protocol):
+    """Passes a mean (n,) and a covariance (t, t) through a function, see `regression`."""
+
+    def __call__(
+        self,
+        mean: Floats,
+        covariance: Floats,
+        arguments: tuple[AnyArgument, ...],
+        variances: Numbers,
+        spread: Floats,
+        cross: Floats,
+        sample_index: int,
+        memory: SampleMemory,
+        /,
+    ) -> bool: ...
+
+
+class Settle(Protocol):
+    """Moves a centre (n,) to the intrinsic mean of values (L, v), see `settling`."""
+
+    def __call__(self, weights: Floats, values: Floats, centre: Floats, shift: Floats, /) -> None: ...
+
+
 def sampling(
-    function: Function,
+    function: Sampled,
     kinds: tuple[str, ...],
     noises: int,
     outputs: tuple[str, ...],
     *,
     is_motion: bool = False,
-) -> Function:
+) -> Sample:
     """Make the evaluation of `function(state, noise, arguments)` at weighted samples.
 
     Returns `sample(mean, arguments, variances, sample_index, memory)`, before which the leading block of
@@ -118,7 +175,9 @@ def sampling(
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
     turns, narrow = bool(turning(kinds)), narrowing(kinds, size, bounded=is_motion)
 
-    def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
+    def evaluate(
+        mean: Floats | Numbers, points: Floats, arguments: tuple[AnyArgument, ...], memory: SampleMemory
+    ) -> None:
         """Fill the offsets of all samples, and the function's values as differences from the centre."""
         triangle, state, offsets = lower(memory.factor), read_state(mean), memory.offsets
         centre = function(state, no_noise, arguments)
@@ -137,9 +196,9 @@ def sampling(
             subtract(value, centre, memory.values, index)
 
     def sample(
-        mean: Floats,
-        arguments: tuple[Any, ...],
-        variances: tuple[float, ...],
+        mean: Floats | Numbers,
+        arguments: tuple[AnyArgument, ...],
+        variances: Numbers,
         sample_index: int,
         memory: SampleMemory,
     ) -> Floats:
@@ -152,19 +211,20 @@ def sampling(
         settle(memory.weights[chosen], memory.values, memory.centre, memory.shift)
         if share < 1.0:
             widen(share, memory)
-        return memory.weights[chosen]
+        weights: Floats = memory.weights[chosen]
+        return weights
 
     return sample
 
 
 def regression(
-    function: Function,
+    function: Sampled,
     kinds: tuple[str, ...],
     noises: int,
     outputs: tuple[str, ...],
     *,
     is_motion: bool = False,
-) -> Function:
+) -> Regress:
     """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
 
     Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
@@ -178,8 +238,8 @@ def regression(
     def regress(
         mean: Floats,
         covariance: Floats,
-        arguments: tuple[Any, ...],
-        variances: tuple[float, ...],
+        arguments: tuple[AnyArgument, ...],
+        variances: Numbers,
         spread: Floats,
         cross: Floats,
         sample_index: int,
@@ -195,7 +255,7 @@ def regression(
 
 
 @lru_cache(maxsize=64)
-def settling(kinds: tuple[str, ...]) -> Function:
+def settling(kinds: tuple[str, ...]) -> Settle:
     """Make `settle(weights, values, centre, shift)`: it moves a centre to the intrinsic mean of values.
 
     The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
@@ -218,12 +278,12 @@ def settling(kinds: tuple[str, ...]) -> Function:
     return settle
 
 
-def no_variances(*_: Any) -> tuple[float, ...]:
+def no_variances(*_: object) -> Numbers:
     """List the variances of no noise."""
     return ()
 
 
-def sampled_motion(stage: Stage, number: int) -> Function:
+def sampled_motion(stage: Stage, number: int) -> Predict:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
@@ -236,9 +296,11 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     entering = motion.noise if motion.noises else None
     moved = moved_with_noise(motion)
     regress = regression(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
-    variances_of = entering or no_variances
-    add_noise = nothing if entering else motion_noise(model, motion)
-    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
+    variances_of: MotionNoise = entering or no_variances
+    add_noise: AddMotionNoise = nothing if entering else motion_noise(model, motion)
+    linearise: LineariseMotion = nothing
+    if motion.control_noise:
+        linearise = motion_derivative(model, motion, by_state=False)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     fill = filling(model.size)
 
@@ -258,23 +320,23 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     return predict
 
 
-def moved_with_noise(motion: Motion) -> Function:
+def moved_with_noise(motion: Motion) -> Sampled:
     """Make `function(state, noise, arguments)` of a motion, for `sampling`."""
     move = motion.move
     if motion.noises:
 
-        def with_noise(state: Any, noise: Any, arguments: Any) -> Any:
+        def with_noise(state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...]) -> Numbers:
             return move(state, arguments[0], noise, arguments[1], arguments[2])
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:
+    def without(state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...]) -> Numbers:
         return move(state, arguments[0], arguments[1], arguments[2])
 
     return without
 
 
-def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
+def sampled_sensor(stage: Stage, number: int, samples: int) -> Innovate:
     """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`.
 
     Args:
@@ -287,8 +349,8 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
     read_reference, subtract = message_layout(sensor).reference, residual_of(sensor)
     entering = sensor.noise if sensor.noises else None
-    variances_of = entering or no_variances
-    add_noise = nothing if sensor.noises else sensor_noise(sensor)
+    variances_of: OfParameters = entering or no_variances
+    add_noise: MeasurementNoise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
         data, parameters, _, event = measurement
@@ -304,17 +366,17 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     return innovate
 
 
-def measured_with_noise(sensor: Sensor) -> Function:
+def measured_with_noise(sensor: Sensor) -> Sampled:
     """Make `function(state, noise, arguments)` of what a sensor measures, for `sampling`."""
     measure = sensor.measure
     if sensor.noises:
 
-        def with_noise(state: Any, noise: Any, arguments: Any) -> Any:
+        def with_noise(state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...]) -> Numbers:
             return measure(state, noise, arguments[0], arguments[1])
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:
+    def without(state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...]) -> Numbers:
         return measure(state, arguments[0], arguments[1])
 
     return without

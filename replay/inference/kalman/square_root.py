@@ -9,15 +9,21 @@ of a factor N of its noise, one factorisation makes a prediction or an update:
 Kaminski, Bryson and Schmidt, IEEE TAC 16(6), 1971; Van der Merwe and Wan, ICASSP 2001.
 """
 
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Numbers, Settings
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.forms import Parts
-from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
+from fuselog.replay.inference.kalman.predict import (
+    AddMotionNoise,
+    motion_derivative,
+    motion_noise,
+    nothing,
+)
 from fuselog.replay.inference.kalman.regression import (
+    Sample,
     measured_with_noise,
     moved_with_noise,
     no_variances,
@@ -29,9 +35,12 @@ from fuselog.replay.inference.kalman.steps import (
     InnovationRecord,
     Interval,
     Measurement,
+    Predict,
+    Update,
     Workspace,
 )
 from fuselog.replay.inference.kalman.update import (
+    MeasurementNoise,
     is_unmeasured,
     message_layout,
     residual_of,
@@ -43,20 +52,39 @@ from fuselog.replay.inference.kalman.update import (
 from fuselog.replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
 from fuselog.replay.inference.linear_algebra.gaussian import fill_identity, whiten_by
 from fuselog.replay.inference.linear_algebra.inflation import inflation
+from fuselog.replay.inference.linear_algebra.linearization import Linearise
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
 from fuselog.replay.inference.model.stage import Stage
 
 Into = tuple[Floats, Floats]  # rows, and the weights of their columns
+Given = tuple[AnyArgument, ...]  # the arguments of a motion or a sensor behind the state
 
 
-def _linear(linearise: Function, slopes: str) -> Function:
+class Spread(Protocol):
+    """Fills in Y and X of a factor (t, t) at a state (n,), see the module."""
+
+    def __call__(
+        self, state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into, /
+    ) -> None: ...
+
+
+class VariancesOf(Protocol):
+    """Gives the variances of the noise that is sampled, at a state (n,)."""
+
+    def __call__(self, state: Numbers, given: Given, /) -> Numbers: ...
+
+
+def _linear(linearise: Linearise, slopes: str) -> Spread:
     """Make `spread(state, factor, given, index, work, into)`: it fills in Y and X of a factor.
 
     By the derivative that `linearise(state, *given, work)` puts into the workspace's `slopes`.
     """
 
-    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+    def spread(
+        state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into
+    ) -> None:
         rows, weights = into
         t, m = len(factor), len(rows) - len(factor)
         linearise(state, *given, work)
@@ -70,13 +98,13 @@ def _linear(linearise: Function, slopes: str) -> Function:
     return spread
 
 
-def _sampled(
-    sample: Function, variances_of: Function, mean_of: str, size: int, samples: int
-) -> Function:
+def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int, samples: int) -> Spread:
     """Make the same of samples, whose mean goes into the workspace's `mean_of`."""
     fill = filling(size)
 
-    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+    def spread(
+        state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into
+    ) -> None:
         (rows, weights), memory = into, work.samples[samples]
         t, m = len(factor), len(rows) - len(factor)
         memory.factor[:t, :t] = factor
@@ -98,7 +126,7 @@ def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> b
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
 
 
-def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: int = -1) -> Function:
+def _predicting(stage: Stage, spread: Spread, add_noise: AddMotionNoise, samples: int = -1) -> Predict:
     """Make the prediction by what `spread` makes of the factor, or of these samples."""
     t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
     read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
@@ -121,50 +149,58 @@ def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: in
     return predict
 
 
-def _linear_motion(stage: Stage) -> Function:
+def _linear_motion(stage: Stage) -> Predict:
     linearise = motion_derivative(stage.model, stage.motion, by_state=True)
     return _predicting(stage, _linear(linearise, "transition"), motion_noise(stage.model, stage.motion))
 
 
-def _gap_motion(stage: Stage) -> Function:
+def _gap_motion(stage: Stage) -> Predict:
     gap_noise, add = stage.motion.gap_noise, adding_noise(stage.model.tangent)
     fill = filling(stage.model.size)
     assert gap_noise is not None
 
-    def stand(state: Any, control: Any, duration_s: float, parameters: Any, work: Workspace) -> None:
+    def stand(
+        state: Numbers, control: Numbers, duration_s: float, parameters: Settings, work: Workspace
+    ) -> None:
         fill(work.state, state)
         fill_identity(work.transition)
 
-    def add_noise(state: Any, noise: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+    def add_noise(
+        state: Numbers, noise: Floats, duration_s: float, parameters: Settings, work: Workspace
+    ) -> None:
         add(noise, gap_noise(state, duration_s, parameters))
 
     return _predicting(stage, _linear(stand, "transition"), add_noise)
 
 
-def _sampled_motion(stage: Stage, samples: int) -> Function:
+def _sampled_motion(stage: Stage, samples: int) -> Predict:
     """Sample a motion; the control's noise enters by the derivative at the mean, its own as a sample."""
     model, motion = stage.model, stage.motion
-    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
-    variances = (motion.noise if motion.noises else None) or no_variances
+    linearise: Linearise = nothing
+    if motion.control_noise:
+        linearise = motion_derivative(model, motion, by_state=False)
+    variances: MotionNoise = (motion.noise if motion.noises else None) or no_variances
 
-    def variances_of(state: Any, given: Any) -> Any:
+    def variances_of(state: Numbers, given: Given) -> Numbers:
         return variances(state, given[1], given[2])
 
     moved = moved_with_noise(motion)
     sample = sampling(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
     spread_samples = _sampled(sample, variances_of, "state", model.size, samples)
 
-    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+    def spread(
+        state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into
+    ) -> None:
         linearise(state, *given, work)
         spread_samples(state, factor, given, index, work, into)
 
-    add_noise = nothing if motion.noises else motion_noise(model, motion)
+    add_noise: AddMotionNoise = nothing if motion.noises else motion_noise(model, motion)
     return _predicting(stage, spread, add_noise, samples)
 
 
 def _updating(
-    stage: Stage, number: int, spread: Function, add_noise: Function, samples: int = -1
-) -> Function:
+    stage: Stage, number: int, spread: Spread, add_noise: MeasurementNoise, samples: int = -1
+) -> Update:
     """Make the update by sensor `number`; see `fuselog.replay.inference.kalman.update.kalman_update`.
 
     A component that is missing counts as one of a noise of its own, which is as predicted.
@@ -228,23 +264,24 @@ def _updating(
     return update
 
 
-def _linear_update(stage: Stage, number: int) -> Function:
+def _linear_update(stage: Stage, number: int) -> Update:
     sensor = stage.sensors[number]
     spread = _linear(sensor_derivative(stage.model, sensor), "rows")
     return _updating(stage, number, spread, sensor_noise(sensor))
 
 
-def _sampled_update(stage: Stage, number: int, samples: int) -> Function:
+def _sampled_update(stage: Stage, number: int, samples: int) -> Update:
     sensor = stage.sensors[number]
     kinds, noises = tuple(sensor.measured.values()), sensor.noises
-    variances = (sensor.noise if noises else None) or no_variances
+    variances: OfParameters = (sensor.noise if noises else None) or no_variances
 
-    def variances_of(state: Any, given: Any) -> Any:
+    def variances_of(state: Numbers, given: Given) -> Numbers:
         return variances(given[1])
 
     sample = sampling(measured_with_noise(sensor), stage.model.kinds, noises, kinds)
     spread = _sampled(sample, variances_of, "predicted", len(kinds), samples)
-    return _updating(stage, number, spread, nothing if noises else sensor_noise(sensor), samples)
+    add_noise: MeasurementNoise = nothing if noises else sensor_noise(sensor)
+    return _updating(stage, number, spread, add_noise, samples)
 
 
 FACTORED = Parts(FACTORS, _linear_motion, _sampled_motion, _linear_update, _sampled_update, _gap_motion)

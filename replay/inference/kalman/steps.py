@@ -6,11 +6,11 @@ knows. All work in one workspace, and the Kalman update after them is the same (
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
@@ -30,6 +30,14 @@ FAILURES = (
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
+
+# What a method believes of all runs, what one core works in, the estimates that it fills in, and its
+# samples, such as `Gaussian`, `Workspace`, `recursion.Estimates` and `SampleMemory`. All are the
+# method's own; a loop over events only hands them on.
+Belief = Any  # type: ignore[explicit-any]
+CoreMemory = Any  # type: ignore[explicit-any]
+EstimatesToFill = Any  # type: ignore[explicit-any]
+Samples = Any  # type: ignore[explicit-any]
 
 
 class Gaussian(NamedTuple):
@@ -54,7 +62,7 @@ class Interval(NamedTuple):
 
     control: Floats
     duration_s: float
-    parameters: Any
+    parameters: Settings
     event: int
 
 
@@ -69,9 +77,74 @@ class Measurement(NamedTuple):
     """
 
     data: Floats
-    parameters: Any
+    parameters: Settings
     gate: Floats
     event: int
+
+
+# (sets of samples, one for each of `Steps.sampled`) -> what one core works in.
+MakeMemory = Callable[[tuple[Samples, ...]], CoreMemory]
+
+
+class PredictRun(Protocol):
+    """Moves the belief of a run in place over an interval; returns whether all is well."""
+
+    def __call__(self, run: int, belief: Belief, interval: Interval, memory: CoreMemory, /) -> bool: ...
+
+
+class UpdateRun(Protocol):
+    """Updates the belief of a run in place; returns ALL_WELL, NOTHING_MEASURED or a failure."""
+
+    def __call__(
+        self,
+        run: int,
+        belief: Belief,
+        measurement: Measurement,
+        memory: CoreMemory,
+        record: "InnovationRecord",
+        /,
+    ) -> int: ...
+
+
+class EstimateRun(Protocol):
+    """Fills a row of the estimates from the belief of a run."""
+
+    def __call__(
+        self, run: int, belief: Belief, estimates: EstimatesToFill, row: int, memory: CoreMemory, /
+    ) -> None: ...
+
+
+class Predict(Protocol):
+    """Moves a mean (n,) and a covariance (t, t) in place over an interval; returns if all is well."""
+
+    def __call__(
+        self, mean: Floats, covariance: Floats, interval: Interval, work: CoreMemory, /
+    ) -> bool: ...
+
+
+class Innovate(Protocol):
+    """Fills a sensor's innovation in the workspace; returns whether its covariance was one.
+
+    Of a mean (n,) and a covariance (t, t), both unchanged.
+    """
+
+    def __call__(
+        self, mean: Floats, covariance: Floats, measurement: Measurement, work: CoreMemory, /
+    ) -> bool: ...
+
+
+class Update(Protocol):
+    """Updates a mean (n,) and a covariance (t, t) in place; returns as `UpdateRun`."""
+
+    def __call__(
+        self,
+        mean: Floats,
+        covariance: Floats,
+        measurement: Measurement,
+        work: CoreMemory,
+        record: "InnovationRecord",
+        /,
+    ) -> int: ...
 
 
 class Steps(NamedTuple):
@@ -90,10 +163,10 @@ class Steps(NamedTuple):
         form: what stands for the covariances in beliefs; the estimates have the covariances themselves.
     """
 
-    memory: Callable[[tuple[Any, ...]], Any]
-    predict: Function
-    updates: tuple[Function, ...]
-    estimate: Function
+    memory: MakeMemory
+    predict: PredictRun
+    updates: tuple[UpdateRun, ...]
+    estimate: EstimateRun
     sampled: tuple[int, ...] = ()
     resumes_after_gap: bool = False
     form: Form = COVARIANCES
@@ -143,10 +216,10 @@ class Workspace(NamedTuple):
     turned: Floats
     slope: Floats
     innovations: tuple[Innovation, ...]
-    samples: tuple[Any, ...]
+    samples: tuple[Samples, ...]
 
 
-def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
+def workspace(stage: Stage, samples: tuple[Samples, ...] = ()) -> Workspace:
     """Make the workspace of a model with the sensors at hand.
 
     Args:
@@ -178,12 +251,12 @@ def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
 
 def gaussian_filter(
     stage: Stage,
-    predict: Function,
-    updates: tuple[Function, ...],
-    memory: Callable[[tuple[Any, ...]], Any] | None = None,
+    predict: Predict,
+    updates: tuple[Update, ...],
+    memory: MakeMemory | None = None,
     sampled: tuple[int, ...] = (),
     form: Form = COVARIANCES,
-    gap_motion: Callable[[Stage], Function] | None = None,
+    gap_motion: Callable[[Stage], Predict] | None = None,
 ) -> Steps:
     """Make the steps of a filter whose belief is one Gaussian.
 
@@ -204,11 +277,13 @@ def gaussian_filter(
     if has_gaps:
         predict = _predicting_gap((gap_motion or keeping)(stage), predict)
 
-    def predict_run(run: int, belief: Gaussian, interval: Interval, work: Any) -> bool:
+    def predict_run(run: int, belief: Gaussian, interval: Interval, work: CoreMemory) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
         return predict(mean, covariance, interval, work)
 
-    def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
+    def estimate(
+        run: int, belief: Gaussian, estimates: EstimatesToFill, row: int, work: CoreMemory
+    ) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
         copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
         to_covariance(covariance)
@@ -224,7 +299,7 @@ def gaussian_filter(
     )
 
 
-def _predicting_gap(predict_gap: Function, predict_driven: Function) -> Function:
+def _predicting_gap(predict_gap: Predict, predict_driven: Predict) -> Predict:
     """Make the prediction of one kind where the control is NaN, else of the other."""
 
     def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
@@ -235,7 +310,7 @@ def _predicting_gap(predict_gap: Function, predict_driven: Function) -> Function
     return predict
 
 
-def keeping(stage: Stage) -> Function:
+def keeping(stage: Stage) -> Predict:
     """Make the prediction in a gap of the control: it keeps the mean and adds the gap noise."""
     model, gap_noise = stage.model, stage.motion.gap_noise
     assert gap_noise is not None
@@ -249,9 +324,9 @@ def keeping(stage: Stage) -> Function:
     return keep
 
 
-def _of_run(update: Function) -> Function:
+def _of_run(update: Update) -> UpdateRun:
     def update_run(
-        run: int, belief: Gaussian, measurement: Measurement, work: Any, record: InnovationRecord
+        run: int, belief: Gaussian, measurement: Measurement, work: CoreMemory, record: InnovationRecord
     ) -> int:
         mean, covariance = belief.mean[run], belief.covariance[run]
         return update(mean, covariance, measurement, work, record)

@@ -1,17 +1,20 @@
 """Updates a Gaussian by a sensor: linearises it, forms the innovation, applies the Kalman gain."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Numbers, Settings
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
+    CoreMemory,
+    Innovate,
     InnovationRecord,
     Measurement,
+    Update,
     Workspace,
 )
 from fuselog.replay.inference.linear_algebra.gaussian import (
@@ -27,7 +30,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative, known_entries
 from fuselog.replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
-from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.linear_algebra.tuples import ReadTuple, adding_noise, filling, tuple_of
 from fuselog.replay.inference.model.corrections import correcting, sloping
 from fuselog.replay.inference.model.model import Model, Sensor
 from fuselog.replay.inference.model.stage import Stage
@@ -37,9 +40,51 @@ class MessageLayout(NamedTuple):
     """Says how a sensor's message stands in an event's data: measurement, reference, its own noise."""
 
     width: int
-    measured: Function
-    reference: Function
-    noise: Function
+    measured: ReadTuple
+    reference: ReadTuple
+    noise: ReadTuple
+
+
+class Subtract(Protocol):
+    """Fills what is measured, the first of the data, minus what is predicted (m,)."""
+
+    def __call__(self, data: Floats, predicted: Floats, difference: Floats, /) -> None: ...
+
+
+class MeasurementNoise(Protocol):
+    """Adds the measurement noise R to S (m, m)."""
+
+    def __call__(
+        self, spread: Floats, data: Floats, parameters: Settings, work: CoreMemory, /
+    ) -> None: ...
+
+
+class LineariseSensor(Protocol):
+    """Fills the workspace's `predicted` h (m,), `rows` H (m, t) and `noise_gain` at a state (n,)."""
+
+    def __call__(
+        self, state: Numbers, reference: Numbers, parameters: Settings, work: CoreMemory, /
+    ) -> None: ...
+
+
+class CompareLinear(Protocol):
+    """Forms the innovation of a linearised measurement in the workspace, see `linear_innovation`."""
+
+    def __call__(
+        self, covariance: Floats, data: Floats, parameters: Settings, work: Workspace, /
+    ) -> None: ...
+
+
+class WhitenResidual(Protocol):
+    """Expresses a linearised measurement in units of its noise, see `whitening`."""
+
+    def __call__(self, data: Floats, parameters: Settings, work: Workspace, /) -> tuple[int, float]: ...
+
+
+class WriteInnovation(Protocol):
+    """Writes a sensor's innovation at its components' places in the record."""
+
+    def __call__(self, innovation: Innovation, record: InnovationRecord, /) -> None: ...
 
 
 def message_layout(sensor: Sensor) -> MessageLayout:
@@ -51,7 +96,7 @@ def message_layout(sensor: Sensor) -> MessageLayout:
     )
 
 
-def residual_of(sensor: Sensor) -> Function:
+def residual_of(sensor: Sensor) -> Subtract:
     """Make `subtract(data, predicted, difference)`: what is measured minus what is predicted, (m,).
 
     Angles differ by no more than half a turn.
@@ -65,13 +110,13 @@ def residual_of(sensor: Sensor) -> Function:
     return subtract
 
 
-def sensor_noise(sensor: Sensor) -> Function:
+def sensor_noise(sensor: Sensor) -> MeasurementNoise:
     """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
     if sensor.covariance:
         read, add_message = message_layout(sensor).noise, adding_noise(m)
 
-        def add_read(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
+        def add_read(spread: Floats, data: Floats, parameters: Settings, work: CoreMemory) -> None:
             add_message(spread, read(data))
 
         return add_read
@@ -80,20 +125,20 @@ def sensor_noise(sensor: Sensor) -> Function:
     if sensor.noises:
         noises, fill = sensor.noises, filling(sensor.noises)
 
-        def add_entering(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
+        def add_entering(spread: Floats, data: Floats, parameters: Settings, work: CoreMemory) -> None:
             fill(work.noise_variance[:noises], variances(parameters))
             add_through(spread, work.noise_gain, work.noise_variance[:noises])
 
         return add_entering
     add_noise = adding_noise(m)
 
-    def add(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
+    def add(spread: Floats, data: Floats, parameters: Settings, work: CoreMemory) -> None:
         add_noise(spread, variances(parameters))
 
     return add
 
 
-def sensor_derivative(model: Model, sensor: Sensor) -> Function:
+def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
     """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`.
 
     Args:
@@ -103,7 +148,7 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
-        def by_hand(state: Any, reference: Any, parameters: Any, work: Any) -> None:
+        def by_hand(state: Numbers, reference: Numbers, parameters: Settings, work: CoreMemory) -> None:
             jacobian(state, reference, parameters, work.rows)
             fill(work.predicted, measure(state, reference, parameters))
 
@@ -115,7 +160,7 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
     return derivative(sensor.measure, inputs, kinds, "predicted")
 
 
-def linear_sensor(stage: Stage, number: int) -> Function:
+def linear_sensor(stage: Stage, number: int) -> Innovate:
     """Make the innovation by the derivative at the mean.
 
     Returns `innovate(mean, covariance, measurement, work)`, which fills that of the sensor in
@@ -140,7 +185,7 @@ def linear_sensor(stage: Stage, number: int) -> Function:
     return innovate
 
 
-def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = None) -> Function:
+def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = None) -> CompareLinear:
     """Make the function that forms the innovation of a linearised measurement.
 
     Args:
@@ -154,7 +199,7 @@ def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = Non
     subtract, add_noise = residual_of(sensor), sensor_noise(sensor)
     measure_covariance = measuring_covariance(pattern)
 
-    def compare(covariance: Floats, data: Floats, parameters: Any, work: Workspace) -> None:
+    def compare(covariance: Floats, data: Floats, parameters: Settings, work: Workspace) -> None:
         difference, spread, cross = work.innovations[number]
         subtract(data, work.predicted, difference)
         measure_covariance(covariance, work.rows, cross, spread)
@@ -163,7 +208,7 @@ def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = Non
     return compare
 
 
-def whitening(sensor: Sensor, number: int) -> Function:
+def whitening(sensor: Sensor, number: int) -> WhitenResidual:
     """Make the function that expresses a linearised measurement in units of its noise.
 
     Args:
@@ -177,7 +222,7 @@ def whitening(sensor: Sensor, number: int) -> Function:
     """
     m, subtract, add_noise = len(sensor.measured), residual_of(sensor), sensor_noise(sensor)
 
-    def whiten_residual(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
+    def whiten_residual(data: Floats, parameters: Settings, work: Workspace) -> tuple[int, float]:
         innovation = work.innovations[number]
         difference, noise, turned = innovation
         subtract(data, work.predicted, difference)
@@ -204,7 +249,7 @@ def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
     return components
 
 
-def writing_innovation(stage: Stage, number: int) -> Function:
+def writing_innovation(stage: Stage, number: int) -> WriteInnovation:
     """Make `write_innovation(innovation, record)`: sensor `number`'s, at its components' places."""
     components = list(innovation_components(stage.sensors))
     places = tuple(components.index(name) for name in stage.sensors[number].measured)
@@ -233,7 +278,7 @@ def is_unmeasured(data: Floats, components: int) -> bool:
     return measured == 0
 
 
-def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
+def kalman_update(stage: Stage, number: int, innovate: Innovate) -> Update:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
     The gain K itself is not formed. With S = L L' and W = C L^-T, K v is W L^-1 v, see

@@ -30,11 +30,11 @@ every angle's standard deviation is at most 1 rad and no sample is beyond half a
 """
 
 from functools import lru_cache
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
 
 WIDE_RAD = 1.0  # a standard deviation, up to which samples within half a turn are taken as they are
@@ -60,8 +60,28 @@ def unsuspected_rad(points: Floats) -> float:
     return float(min(WIDE_RAD, np.pi / radius))
 
 
+class Narrow(Protocol):
+    """Scales a factor (N, N) of the samples' covariance and returns the scale c, see the module.
+
+    `points` (L, N) are the samples of N(0, I); see `SampleMemory.unsuspected` for the last argument.
+    """
+
+    def __call__(self, factor: Floats, points: Floats, unsuspected: float, /) -> float: ...
+
+
+class Regressed(Protocol):
+    """Holds samples and what became of them, see `regression.SampleMemory`."""
+
+    @property
+    def offsets(self) -> Floats: ...
+    @property
+    def values(self) -> Floats: ...
+    @property
+    def shift(self) -> Floats: ...
+
+
 @lru_cache(maxsize=64)
-def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Function:
+def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
     """Make `narrow(factor, points, unsuspected)`: it returns c, and scales the factor (N, N) by it.
 
     See the module. With `bounded`, angles that are wider than uniform become uniform first.
@@ -83,11 +103,11 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Function:
 
     def bound(factor: Floats, row: int, times: float) -> float:
         """Return the standard deviation of one component, after it is bounded."""
-        wide = times * np.sqrt(squared_length(factor, row, 1))
+        wide: float = times * np.sqrt(squared_length(factor, row, 1))
         if bounded and wide > UNIFORM_RAD:
             for k in range(row + 1):
                 factor[row, k] *= UNIFORM_RAD / wide
-            return UNIFORM_RAD
+            wide = UNIFORM_RAD
         return wide
 
     def reach_of(factor: Floats, points: Floats, first: int, width: int) -> float:
@@ -101,7 +121,8 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Function:
                     away += factor[row, k] * points[index, k]
                 squared += away * away
             most = max(most, squared)
-        return np.sqrt(most)
+        reach: float = np.sqrt(most)
+        return reach
 
     def narrow(factor: Floats, points: Floats, unsuspected: float) -> float:
         suspected = False
@@ -126,7 +147,7 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Function:
     return narrow
 
 
-def widen(share: float, memory: Any) -> None:
+def widen(share: float, memory: Regressed) -> None:
     """Divide offsets and values of narrowed samples by c."""
     for index in range(len(memory.offsets)):
         for row in range(memory.offsets.shape[1]):

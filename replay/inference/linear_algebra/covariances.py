@@ -6,10 +6,55 @@ steps predict and update it; all others, such as an IMM or a smoother, know no m
 `Form`.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
+from fuselog.replay.inference.linear_algebra.manifold import Turning
+
+
+class Propagate(Protocol):
+    """Makes of P (t, t) what stands for F P F'; the product (t, t) is to work in."""
+
+    def __call__(self, matrix: Floats, transition: Floats, product: Floats, /) -> None: ...
+
+
+class Times(Protocol):
+    """Fills a product (t,) with P v."""
+
+    def __call__(self, matrix: Floats, vector: Sequence[float] | Floats, product: Floats, /) -> None: ...
+
+
+class Turn(Protocol):
+    """Turns a matrix (t, t) by `manifold.by_right_jacobian`, which is `turning`, along a vector (t,)."""
+
+    def __call__(self, turning: Turning, vector: Floats, matrix: Floats, /) -> None: ...
+
+
+class Mix(Protocol):
+    """Fills what stands for a mixture's covariance, see `Form`."""
+
+    def __call__(
+        self, weights: Floats, away: Floats, shift: Floats, carried: Floats, matrix: Floats, /
+    ) -> None: ...
+
+
+class Predicted(Protocol):
+    """Holds what a prediction left in the workspace, see `kalman.steps.Workspace`."""
+
+    @property
+    def product(self) -> Floats: ...
+    @property
+    def rest(self) -> Floats: ...
+
+
+class Retrace(Protocol):
+    """Goes back over a prediction, see `Form`; returns whether P- is positive semidefinite."""
+
+    def __call__(
+        self, before: Floats, after: Floats, work: Predicted, turned: Floats, factor: Floats, /
+    ) -> bool: ...
 
 
 class Form(NamedTuple):
@@ -28,27 +73,27 @@ class Form(NamedTuple):
             with G', and `before` with P - G D', see `fuselog.replay.inference.smoothing.backward_pass`.
     """
 
-    start: Function
-    to_covariance: Function
-    times: Function
-    propagate: Function
-    turn: Function
-    mix: Function
-    retrace: Function
+    start: Callable[[Floats], Floats]
+    to_covariance: Callable[[Floats], object]
+    times: Times
+    propagate: Propagate
+    turn: Turn
+    mix: Mix
+    retrace: Retrace
 
 
 def _as_it_is(matrix: Floats) -> Floats:
     return matrix
 
 
-def _times(covariance: Floats, vector: Any, product: Floats) -> None:
+def _times(covariance: Floats, vector: Sequence[float] | Floats, product: Floats) -> None:
     for row in range(len(covariance)):
         product[row] = 0.0
         for column in range(len(covariance)):
             product[row] += covariance[row, column] * vector[column]
 
 
-def _turn(turning: Function, vector: Floats, covariance: Floats) -> None:
+def _turn(turning: Turning, vector: Floats, covariance: Floats) -> None:
     turning(vector, covariance)
     turning(vector, covariance.T)
 
@@ -63,7 +108,7 @@ def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, covarian
             covariance[row, column] = covariance[column, row] = entry
 
 
-def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, factor: Floats) -> bool:
+def _retrace(before: Floats, after: Floats, work: Predicted, turned: Floats, factor: Floats) -> bool:
     cross, t = work.product, len(before)
     turned[:, :] = cross
     if not solve_semidefinite(after, turned, factor):

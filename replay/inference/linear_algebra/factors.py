@@ -4,14 +4,15 @@ Thornton, JPL Technical Memorandum 33-798, 1976; Bierman, Factorization Methods 
 Estimation, 1977, VI.4.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.covariances import is_positive_definite
-from fuselog.replay.inference.linear_algebra.covariances import Form
+from fuselog.replay.inference.linear_algebra.covariances import Form, Predicted
 from fuselog.replay.inference.linear_algebra.gaussian import multiply
+from fuselog.replay.inference.linear_algebra.manifold import Turning
 
 ROUNDING = 1e-15  # of a variance, for each component that others determine
 NOTHING_LEFT = 1e-28  # a row's square beside what it was: rounding, of a row that others determine
@@ -119,7 +120,7 @@ def _to_covariance(factor: Floats) -> None:
             factor[row, column] = factor[column, row] = entry
 
 
-def _times(factor: Floats, vector: Any, product: Floats) -> None:
+def _times(factor: Floats, vector: Sequence[float] | Floats, product: Floats) -> None:
     product[:] = 0.0
     for k in range(len(factor)):
         entry = 0.0
@@ -134,7 +135,7 @@ def _propagate(factor: Floats, transition: Floats, product: Floats) -> None:
     retriangulate(product, factor)
 
 
-def _turn(turning: Function, vector: Floats, factor: Floats) -> None:
+def _turn(turning: Turning, vector: Floats, factor: Floats) -> None:
     turning(vector, factor)
     retriangulate(factor, factor)
 
@@ -151,7 +152,7 @@ def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, factor: 
         orthogonalise(array, scales, factor)
 
 
-def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, _: Floats) -> bool:
+def _retrace(before: Floats, after: Floats, work: Predicted, turned: Floats, _: Floats) -> bool:
     """Go back over a prediction by what it left: G S- in `work.product`, P - G D' in `work.rest`."""
     t = len(before)
     for row in range(t):

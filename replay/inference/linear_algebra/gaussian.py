@@ -144,7 +144,7 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
 def wrap(difference: float, is_angle: bool) -> float:
     """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
     if is_angle and not abs(difference) < np.pi:
-        return wrap_angle(difference)
+        difference = wrap_angle(difference)
     return difference
 
 

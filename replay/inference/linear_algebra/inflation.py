@@ -1,13 +1,12 @@
 """Takes the covariance of a surprising innovation for larger, so that outliers count for less."""
 
-from typing import Any
-
 import numpy as np
 
+from fuselog.replay.engine.arrays import Settings
 from fuselog.replay.inference.linear_algebra.gaussian import Innovation
 
 
-def inflation(squared: float, size: int, parameters: Any) -> float:
+def inflation(squared: float, size: int, parameters: Settings) -> float:
     """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is

@@ -5,10 +5,10 @@ fills into the arrays of its workspace.
 """
 
 import operator
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
-from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.arrays import AnyArgument
 from fuselog.replay.engine.vectors.tangent import WIDTHS
 from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks, tangent_size
 from fuselog.replay.inference.linear_algebra.tuples import range_of
@@ -25,6 +25,11 @@ _PRODUCT = (
 )
 
 
+# The inputs, the other arguments and the workspace: how many there are is up to what is linearised.
+Linearise = Callable[..., None]  # type: ignore[explicit-any]
+Place = tuple[str, int, int]  # an array of the workspace, row and column
+
+
 class Input(NamedTuple):
     """Describes an argument to differentiate by: its name, its kinds, and where its Jacobian goes.
 
@@ -39,8 +44,8 @@ class Input(NamedTuple):
 
 
 def derivative(
-    function: Function, inputs: Sequence[Input], outputs: Sequence[str], values: str = ""
-) -> Function:
+    function: object, inputs: Sequence[Input], outputs: Sequence[str], values: str = ""
+) -> Linearise:
     """Make a function that takes values and exact Jacobians of a component-first function by its graph.
 
     Args:
@@ -70,7 +75,7 @@ def derivative(
 
     def combine(
         trace: Trace, returned: Sequence[Node], slopes: Sequence[Mapping[int, Node]]
-    ) -> dict[Any, Node]:
+    ) -> dict[Place, Node]:
         return {
             (columns[variable][0], row, columns[variable][1]): node
             for variable in range(len(columns))
@@ -89,7 +94,7 @@ def derivative(
         if (into, row, column) not in known
     )
 
-    def linearise(*given: Any) -> None:
+    def linearise(*given: AnyArgument) -> None:
         work, arguments = given[-1], given[:-1]
         for place, zero in zeros:
             arguments = (*arguments[:place], zero, *arguments[place:])
@@ -108,7 +113,7 @@ def derivative(
     return linearise
 
 
-def known_entries(linearise: Function, into: str) -> dict[tuple[int, int], float | None] | None:
+def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], float | None] | None:
     """List the entries of a Jacobian that may differ from zero, by row and column, with known values.
 
     None where nothing is known, as of one written by hand.
@@ -162,7 +167,7 @@ def _in_tangent_space(
             yield t, trace.node_of(y[c] * d[1] - y[c + 1] * d[0])
         else:
             for row in (1, 2, 3):
-                total: Any = 0.0
+                total: AnyArgument = 0.0
                 for i, j, sign in _PRODUCT[row]:
                     term = y[c + i] * d[j]
                     total = total + term if (sign > 0) == (i == 0) else total - term

@@ -8,15 +8,42 @@ the difference of two states boxminus; Sola, arXiv 1711.02508.
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
 
 Quaternion = tuple[float, float, float, float]
 SETTLED = 1e-15  # rad: a mean of rotations that moves by less is found
+
+
+class Boxplus(Protocol):
+    """Moves a state x (n,) by a tangent vector d (t,), in place."""
+
+    def __call__(self, x: Floats, d: Sequence[float] | Floats, /) -> None: ...
+
+
+class Boxminus(Protocol):
+    """Fills row k of d (..., t) with a boxminus b, of states (n,)."""
+
+    def __call__(
+        self, a: Sequence[float] | Floats, b: Sequence[float] | Floats, d: Floats, k: int, /
+    ) -> None: ...
+
+
+class Turning(Protocol):
+    """Multiplies every rotation's rows (t, m) by its right Jacobian at d (t,), or by the inverse."""
+
+    def __call__(self, d: Floats, rows: Floats, /) -> None: ...
+
+
+class Recentre(Protocol):
+    """Makes tangent vectors (L, t) from a centre those from its shift (t,), see `recentring`."""
+
+    def __call__(self, values: Floats, shift: Floats, /) -> bool: ...
 
 
 def tangent_size(kinds: Sequence[str]) -> int:
@@ -41,11 +68,11 @@ def is_flat(kinds: Sequence[str]) -> bool:
 
 
 @lru_cache(maxsize=64)
-def boxplus(kinds: tuple[str, ...]) -> Function:
+def boxplus(kinds: tuple[str, ...]) -> Boxplus:
     """Make `add(x, d)`: it moves the state x (n,) by a tangent vector d (t,), in place: x boxplus d."""
     parts = tuple(manifold_blocks(kinds))
 
-    def add(x: Floats, d: Floats) -> None:
+    def add(x: Floats, d: Sequence[float] | Floats) -> None:
         for kind, c, t, _ in parts:
             if kind in ("linear", "angle"):
                 x[c] += d[t]
@@ -62,11 +89,11 @@ def boxplus(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def boxminus(kinds: tuple[str, ...]) -> Function:
+def boxminus(kinds: tuple[str, ...]) -> Boxminus:
     """Make `subtract(a, b, d, k)`: row k of d (..., t) becomes a boxminus b, of states (n,)."""
     parts = tuple(manifold_blocks(kinds))
 
-    def subtract(a: Floats, b: Floats, d: Floats, k: int) -> None:
+    def subtract(a: Sequence[float] | Floats, b: Sequence[float] | Floats, d: Floats, k: int) -> None:
         for kind, c, t, _ in parts:
             if kind == "linear":
                 d[k, t] = a[c] - b[c]
@@ -87,7 +114,7 @@ def boxminus(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Function:
+def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Turning:
     """Make `reset(d, rows)`: it multiplies every rotation's rows (t, m) by its right Jacobian at d (t,).
 
     Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
@@ -135,7 +162,7 @@ def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=64)
-def recentring(kinds: tuple[str, ...]) -> Function:
+def recentring(kinds: tuple[str, ...]) -> Recentre:
     """Make `recentre(values, shift)`: tangent vectors (L, t) from a centre become those from its shift.
 
     Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a

@@ -4,17 +4,45 @@ All sums stay in registers: arrays might overlap, for all that a compiler knows.
 of a tuple that changes wherever its name stands, so that such a tuple is gone through, not indexed.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Numbers
 from fuselog.replay.inference.linear_algebra.tuples import total
 
-Numbers = tuple[float, ...]
 REGISTERS = 32  # of a processor: sums beyond these are kept in memory
 
 
+class Offset(Protocol):
+    """Multiplies a triangle, as `lower_of` reads it, by a row of points (L, N)."""
+
+    def __call__(self, lower: Numbers, points: Floats, index: int, /) -> Numbers: ...
+
+
+class Moments(Protocol):
+    """Fills weighted covariances of values, see `moments_of`."""
+
+    def __call__(
+        self,
+        weights: Floats,
+        offsets: Floats,
+        found: Floats,
+        shift: Floats,
+        spread: Floats,
+        cross: Floats,
+        /,
+    ) -> None: ...
+
+
+class WeightedMean(Protocol):
+    """Fills the weighted sums (v,) of values (L, v)."""
+
+    def __call__(self, weights: Floats, found: Floats, mean: Floats, /) -> None: ...
+
+
 @lru_cache(maxsize=64)
-def lower_of(size: int) -> Function:
+def lower_of(size: int) -> Callable[[Floats], Numbers]:
     """Make `read(factor)`: it reads the rows of a lower triangle as one tuple."""
     places = tuple((row, column) for row in range(size) for column in range(row + 1))
 
@@ -25,7 +53,7 @@ def lower_of(size: int) -> Function:
 
 
 @lru_cache(maxsize=64)
-def offset_of(size: int) -> Function:
+def offset_of(size: int) -> Offset:
     """Make `offset(lower, points, index)`: a triangle, as `lower_of` reads it, times a row of points."""
     firsts = tuple(row * (row + 1) // 2 for row in range(size))
 
@@ -39,7 +67,7 @@ def offset_of(size: int) -> Function:
 
 
 @lru_cache(maxsize=64)
-def moments_of(states: int, values: int) -> Function:
+def moments_of(states: int, values: int) -> Moments:
     """Make `moments(weights, offsets, found, shift, spread, cross)`: weighted covariances.
 
     Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t).
@@ -65,7 +93,7 @@ def _in_parts(states: int, values: int) -> list[range]:
     return parts
 
 
-def _moments_of_some(states: int, chosen: range) -> Function:
+def _moments_of_some(states: int, chosen: range) -> Moments:
     """Make `moments` of some values: with themselves and those before, in one loop."""
     pairs = tuple((i, j) for i in chosen for j in range(i + 1))
     mixed = tuple((row, i) for row in range(states) for i in chosen)
@@ -95,7 +123,7 @@ def _moments_of_some(states: int, chosen: range) -> Function:
 
 
 @lru_cache(maxsize=64)
-def weighted_mean_of(values: int) -> Function:
+def weighted_mean_of(values: int) -> WeightedMean:
     """Make `fill(weights, found, mean)`: it fills the weighted sums (v,) of values (L, v)."""
 
     def fill(weights: Floats, found: Floats, mean: Floats) -> None:

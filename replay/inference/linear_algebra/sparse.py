@@ -5,9 +5,9 @@ itself where it is known. What is left out are products with zero: sums keep the
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.gaussian import (
     add_through,
     measured_covariance,
@@ -16,6 +16,26 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 
 Row = tuple[tuple[int, float | None], ...]
 Pattern = tuple[Row, ...]
+
+
+class Propagate(Protocol):
+    """Makes F P F' of a covariance P (t, t), and F P of the product; the last array is to work in."""
+
+    def __call__(
+        self, covariance: Floats, transition: Floats, product: Floats, turned: Floats, /
+    ) -> None: ...
+
+
+class MeasureCovariance(Protocol):
+    """Fills C = P H' (t, m) and S = H C (m, m), of a covariance P (t, t) and rows H (m, t)."""
+
+    def __call__(self, covariance: Floats, rows: Floats, cross: Floats, spread: Floats, /) -> None: ...
+
+
+class AddThrough(Protocol):
+    """Adds G diag(variances) G' to a covariance (t, t), with a gain G (t, k)."""
+
+    def __call__(self, covariance: Floats, gain: Floats, variances: Floats, /) -> None: ...
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
@@ -28,7 +48,7 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
     )
 
 
-def propagating_covariance(pattern: Pattern | None) -> Function:
+def propagating_covariance(pattern: Pattern | None) -> Propagate:
     """Make `move(covariance, transition, product, turned)`: P (t, t) becomes F P F', the product F P.
 
     `turned` is to work in: the inner loops all go along rows, so that the compiler takes several columns
@@ -73,7 +93,7 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
     return move
 
 
-def measuring_covariance(pattern: Pattern | None) -> Function:
+def measuring_covariance(pattern: Pattern | None) -> MeasureCovariance:
     """Make `measure(covariance, rows, cross, spread)`: C = P H' and S = H C, with H in `rows`."""
     if pattern is None:
         return measured_covariance
@@ -96,11 +116,11 @@ def measuring_covariance(pattern: Pattern | None) -> Function:
     return measure
 
 
-def adding_through(pattern: Pattern | None) -> Function:
+def adding_through(pattern: Pattern | None) -> AddThrough:
     """Make `add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
     if pattern is None:
         return add_through
-    columns: list[dict[int, Any]] = [dict(entries) for entries in pattern]
+    columns = [dict(entries) for entries in pattern]
     both = tuple(
         (row, column, tuple(k for k in columns[row] if k in columns[column]))
         for row in range(len(pattern))

@@ -6,9 +6,27 @@ loop over something known, which is written out (`range_of`).
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Numbers
+
+
+class ReadTuple(Protocol):
+    """Reads entries of an array (n,), or of a tuple, as a tuple."""
+
+    def __call__(self, array: Floats | Numbers, /) -> Numbers: ...
+
+
+class Fill(Protocol):
+    """Fills numbers into the first entries of an array (n,)."""
+
+    def __call__(self, array: Floats, values: Sequence[float] | Floats, /) -> None: ...
+
+
+class AddNoise(Protocol):
+    """Adds variances, or rows of a lower triangle, to a covariance (t, t)."""
+
+    def __call__(self, covariance: Floats, noise: Sequence[float] | Floats, /) -> None: ...
 
 
 def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
@@ -17,20 +35,20 @@ def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=256)
-def tuple_of(size: int, start: int = 0) -> Function:
+def tuple_of(size: int, start: int = 0) -> ReadTuple:
     """Make `read(array)`: it reads `size` entries of an array from `start` on, as a tuple."""
 
-    def read(array: Floats) -> tuple[Any, ...]:
+    def read(array: Floats | Numbers) -> Numbers:
         return tuple(array[start + index] for index in range(size))
 
     return read
 
 
 @lru_cache(maxsize=256)
-def filling(size: int) -> Function:
+def filling(size: int) -> Fill:
     """Make `fill(array, values)`: it fills the first entries of a tuple into an array."""
 
-    def fill(array: Floats, values: Sequence[float]) -> None:
+    def fill(array: Floats, values: Sequence[float] | Floats) -> None:
         for index in range_of(size):
             array[index] = values[index]
 
@@ -46,7 +64,7 @@ def total(numbers: Sequence[float]) -> float:
 
 
 @lru_cache(maxsize=64)
-def adding_noise(size: int, block: int = 0) -> Function:
+def adding_noise(size: int, block: int = 0) -> AddNoise:
     """Make `add(covariance, noise)`: it adds variances, or rows of a lower triangle, given as a tuple.
 
     The triangle is that of the first `block` components, behind which are variances of the others; of
@@ -56,7 +74,7 @@ def adding_noise(size: int, block: int = 0) -> Function:
     triangle = tuple((row, column) for row in range(corner) for column in range(row + 1))
     triangle += tuple((row, row) for row in range(corner, size))
 
-    def add(covariance: Floats, noise: tuple[float, ...]) -> None:
+    def add(covariance: Floats, noise: Sequence[float] | Floats) -> None:
         if len(noise) == size:
             for row in range_of(size):
                 covariance[row, row] += noise[row]

@@ -10,17 +10,18 @@ points of a map are added in the same way, see `fuselog.replay.inference.model.p
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import field_of
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Numbers, Settings
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.priors import gaussians
 from fuselog.replay.engine.streams.results import gaussian_stream
 from fuselog.replay.inference.model.corrections import correcting_more
+from fuselog.replay.inference.model.functions import ModelFunction, MotionNoise
 from fuselog.replay.inference.model.gauss_markov import (
     GaussMarkov,
     added_variance,
@@ -28,7 +29,7 @@ from fuselog.replay.inference.model.gauss_markov import (
     with_gauss_markov_parameters,
 )
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
-from fuselog.replay.inference.model.parameters import number_fields, settings_type
+from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields, settings_type
 from fuselog.replay.inference.model.point_errors import (
     Errors,
     PointError,
@@ -42,7 +43,9 @@ from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
-Start = Callable[[Mapping[str, Ragged]], Any]
+OfModel = TypeVar("OfModel", bound=ModelFunction)
+# (static topics) -> what an estimator begins with.
+Start = Callable[[Mapping[str, Ragged]], object]
 
 
 class Added(NamedTuple):
@@ -58,7 +61,7 @@ class Added(NamedTuple):
         return self.parameters + tuple(each.name for each in self.errors)
 
 
-def estimated(label: str, model: Model, parameters: Any) -> Added:
+def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added:
     """Return what is to be estimated beside the state, as the settings say.
 
     Raises BadInput where the model does not list as `augmentable` what is asked for, one stands twice,
@@ -245,7 +248,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     move_own = _reading(model, names, motion.move)
     angular = tuple(model.augmentable[name] == "angle" for name in names)
 
-    def move(state: Any, control: Any, *others: Any) -> Any:
+    def move(state: Numbers, control: Numbers, *others: AnyArgument) -> Numbers:
         *entering, duration_s, parameters = others
         own = (each[:noises] for each in entering)
         moved = list(move_own(state, control, *own, duration_s, parameters))
@@ -257,10 +260,10 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
 
-    def with_spreads(function: Function, *, is_triangle: bool = False) -> Function:
+    def with_spreads(function: MotionNoise, *, is_triangle: bool = False) -> MotionNoise:
         own = _reading(model, names, function)
 
-        def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        def noise(state: Numbers, duration_s: float, parameters: Settings) -> Numbers:
             found = list(own(state, duration_s, parameters))
             for index, name in enumerate(names):
                 found += [0.0] * (t + index) if is_triangle else []
@@ -296,22 +299,22 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     )
 
 
-def _reading(model: Model, names: Names, function: Function) -> Function:
+def _reading(model: Model, names: Names, function: OfModel) -> OfModel:
     """Make a model's function of the augmented state, which reads estimated parameters from there."""
     n, fields = model.size, number_fields(model.parameters)
     settings = settings_type(fields)
     places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)
 
-    def read(state: Any, *others: Any) -> Any:
+    def read(state: Numbers, *others: AnyArgument) -> object:
         *given, parameters = others
         own = (getattr(parameters, name) if at < 0 else state[at] for name, at in places)
         return function(state[:n], *given, settings(*own))
 
-    return read
+    return cast(OfModel, read)
 
 
-def _no_noise(size: int) -> Function:
-    def no_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+def _no_noise(size: int) -> MotionNoise:
+    def no_noise(state: Numbers, duration_s: float, parameters: Settings) -> Numbers:
         return (0.0,) * size
 
     return no_noise

@@ -4,9 +4,9 @@ What `check_model` finds at random states is one sentence with the function's fi
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.models.planar import wrap_angle
 from fuselog.recorders.parameters import build
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Settings
 from fuselog.replay.engine.vectors.tangent import WIDTHS, tangent_components
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
 from fuselog.replay.inference.linear_algebra.manifold import (
@@ -25,6 +25,7 @@ from fuselog.replay.inference.linear_algebra.manifold import (
 )
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise
 from fuselog.replay.inference.model.augmentation import check_augmentable
+from fuselog.replay.inference.model.functions import ModelFunction
 from fuselog.replay.inference.model.model import Correction, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import number_fields, settings_type
 from fuselog.replay.inference.model.validation import (
@@ -45,6 +46,10 @@ STEP = 1e-5  # of central differences
 TURN = 2.0 * np.pi
 
 
+# (state, other inputs) -> Jacobians by the inputs' names.
+Derivatives = Callable[[Floats, Sequence[Floats]], dict[str, Floats]]
+
+
 class _Call(NamedTuple):
     """Holds a model's function of a state and other inputs, as a method calls it.
 
@@ -59,11 +64,11 @@ class _Call(NamedTuple):
     """
 
     what: str
-    function: Function
+    function: ModelFunction
     state: Mapping[str, str]
     outputs: Mapping[str, str]
     inputs: Mapping[str, tuple[int, bool]]
-    rest: tuple[Any, ...]
+    rest: tuple[AnyArgument, ...]
 
     def value(self, state: Floats, *others: Floats) -> Floats:
         return np.array(self.function(tuple(state), *map(tuple, others), *self.rest), dtype=float)
@@ -74,7 +79,7 @@ class _Call(NamedTuple):
 
 def check_model(
     model: Model,
-    parameters: Mapping[str, Any] | None = None,
+    parameters: Mapping[str, object] | None = None,
     states: ArrayLike | None = None,
     seed: int = 0,
 ) -> "Checked":
@@ -178,7 +183,7 @@ def _checked(
     return Checked([*sentences, *(f"{name}: not checked" for name, has in others.items() if has)])
 
 
-def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
+def _motion_call(model: Model, motion: Motion, numbers: Settings) -> _Call:
     inputs = {"control": (model.controls, False)}
     if motion.noises:
         inputs["noise"] = (motion.noises, True)
@@ -186,7 +191,7 @@ def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
     return _Call(place_of(motion.move), motion.move, model.state, model.state, inputs, rest)
 
 
-def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
+def _sensor_call(model: Model, sensor: Sensor, numbers: Settings, rng: np.random.Generator) -> _Call:
     reference = tuple(rng.normal(size=sensor.reference_size))
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
     rest = (reference, numbers)
@@ -209,10 +214,11 @@ def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
 def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
     found = np.empty((1, tangent_size(kinds)))
     boxminus(kinds)(tuple(end), tuple(start), found, 0)
-    return found[0]
+    difference: Floats = found[0]
+    return difference
 
 
-def _derivatives_of(call: _Call) -> Function:
+def _derivatives_of(call: _Call) -> Derivatives:
     """Make a function of a state and other inputs that gives exact Jacobians, by the inputs' names."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
     counts = {name: n for name, (n, _) in call.inputs.items()}
@@ -235,7 +241,7 @@ def _derivatives_of(call: _Call) -> Function:
 
 
 def _check_derivatives(
-    call: _Call, exact: Function, state: Floats, others: list[Floats], part: Motion | Sensor
+    call: _Call, exact: Derivatives, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
     """Compare derivatives with differences and what is written by hand; returns that by the state."""
     jacobians = exact(state, others)
@@ -266,8 +272,8 @@ def _check_correction(
     correct: Correction, model: Model, state: Floats, rng: np.random.Generator
 ) -> None:
     """Check that a small correction moves every component by itself, and a step back is found again."""
-    at, slope = tuple(state), rng.normal(size=model.tangent)
-    slope /= np.dot(slope, correct.along(at))
+    at, direction = tuple(state), rng.normal(size=model.tangent)
+    slope = tuple(direction / np.dot(direction, correct.along(at)))
     for moved in (correct.move, correct.back):
         for column, name in enumerate(_tangent(model.state)):
             small = STEP * np.eye(model.tangent)[column]
@@ -294,12 +300,14 @@ def _check_by_hand(
     if isinstance(part, Motion) and part.jacobians is not None:
         control = others[0]
         written = {name: np.zeros_like(exact[name]) for name in ("state", "control")}
-        part.jacobians(tuple(state), tuple(control), *call.rest, written["state"], written["control"])
+        jacobians: ModelFunction = part.jacobians
+        jacobians(tuple(state), tuple(control), *call.rest, written["state"], written["control"])
         if part.control_noise is None:  # nobody asks for it
             del written["control"]
     elif isinstance(part, Sensor) and part.jacobian is not None:
         written = {"state": np.zeros_like(exact["state"])}
-        part.jacobian(tuple(state), *call.rest, written["state"])
+        by_state: ModelFunction = part.jacobian
+        by_state(tuple(state), *call.rest, written["state"])
     for name, jacobian in written.items():
         for column in range(jacobian.shape[1]):
             _compare(call, exact[name], jacobian[:, column], (name, column), 1e-9, "as written by hand")
@@ -425,7 +433,9 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
         )
 
 
-def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, block: int = 0) -> None:
+def _check_noise(
+    noise: ModelFunction | None, arguments: tuple[AnyArgument, ...], size: int, block: int = 0
+) -> None:
     """Check variances, or the rows of a lower triangle."""
     if noise is None or not size:
         return
@@ -435,7 +445,9 @@ def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, 
         raise AssertionError(f"{place_of(noise)} gives a negative variance, {smallest:.6g}")
 
 
-def _matrix(noise: Function, arguments: tuple[Any, ...], size: int, block: int = 0) -> Floats:
+def _matrix(
+    noise: ModelFunction, arguments: tuple[AnyArgument, ...], size: int, block: int = 0
+) -> Floats:
     """Make the covariance (size, size) of variances, or of the rows of a lower triangle."""
     numbers, matrix = np.array(noise(*arguments), dtype=float), np.zeros((size, size))
     if len(numbers) == size:
@@ -445,7 +457,7 @@ def _matrix(noise: Function, arguments: tuple[Any, ...], size: int, block: int =
 
 
 def _not_additive(
-    model: Model, motion: Motion, numbers: Any, states: Floats, rng: np.random.Generator
+    model: Model, motion: Motion, numbers: Settings, states: Floats, rng: np.random.Generator
 ) -> list[str]:
     """Say which components get another variance in one step than in two halves of it.
 

@@ -6,9 +6,9 @@ of the new one by the derivative of the moved state by the step, and the other w
 the state to which it leads.
 """
 
-from typing import Any
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Numbers
 from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
@@ -20,13 +20,75 @@ from fuselog.replay.inference.linear_algebra.manifold import (
     tangent_size,
 )
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.functions import AlongSlope
 from fuselog.replay.inference.model.model import Correction, Model
 from fuselog.replay.tracing.functions import traced
 
 Kinds = tuple[str, ...]
 
 
-def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> Function:
+class CorrectionWork(Protocol):
+    """Holds the arrays that a correction works in, see `kalman.steps.Workspace`."""
+
+    @property
+    def state(self) -> Floats: ...
+    @property
+    def step(self) -> Floats: ...
+    @property
+    def slope(self) -> Floats: ...
+    @property
+    def transition(self) -> Floats: ...
+    @property
+    def product(self) -> Floats: ...
+
+
+class ComparisonWork(CorrectionWork, Protocol):
+    """Holds these, and `change` (..., t), whose first row becomes a step."""
+
+    @property
+    def change(self) -> Floats: ...
+
+
+class RelinearisingWork(CorrectionWork, Protocol):
+    """Holds these, and `turned` (t,)."""
+
+    @property
+    def turned(self) -> Floats: ...
+
+
+class FillSlope(Protocol):
+    """Fills the tangent (t,) of a belief, a mean (n,) and a covariance (t, t); see `Correction`."""
+
+    def __call__(self, mean: Floats, covariance: Floats, slope: Floats, /) -> None: ...
+
+
+class Correct(Protocol):
+    """Moves a mean (n,) and its covariance (t, t) in place by the workspace's `step`."""
+
+    def __call__(self, mean: Floats, covariance: Floats, work: CorrectionWork, /) -> None: ...
+
+
+class Compare(Protocol):
+    """Fills `work.change[0]` with the step from an origin (n,) to a mean (n,); see `comparing`."""
+
+    def __call__(
+        self, origin: Floats, mean: Floats, covariance: Floats, work: ComparisonWork, /
+    ) -> None: ...
+
+
+class StepTo(Protocol):
+    """Fills `work.state` with the mean (n,) moved by `work.step`."""
+
+    def __call__(self, mean: Floats, work: CorrectionWork, /) -> None: ...
+
+
+class Chain(Protocol):
+    """Makes of a Jacobian (m, t) at the moved state one by the step, in place."""
+
+    def __call__(self, rows: Floats, work: RelinearisingWork, /) -> None: ...
+
+
+def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> FillSlope:
     """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
 
     Where nothing bends it is left as it is.
@@ -58,7 +120,7 @@ def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) 
 
 def correcting(
     kinds: Kinds, correct: Correction | None, *, back: bool = False, form: Form = COVARIANCES
-) -> Function:
+) -> Correct:
     """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
     Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
@@ -68,7 +130,7 @@ def correcting(
         step_together = stepping(kinds, correct.back if back else correct.move)
         fill, propagate = filling(len(kinds)), form.propagate
 
-        def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
+        def move_together(mean: Floats, covariance: Floats, work: CorrectionWork) -> None:
             step_together(mean, work)
             fill(mean, work.state)
             propagate(covariance, work.transition, work.product)
@@ -77,19 +139,19 @@ def correcting(
     add, reset, turn = boxplus(kinds), by_right_jacobian(kinds), form.turn
     if is_flat(kinds):
 
-        def move(mean: Floats, covariance: Floats, work: Any) -> None:
+        def move(mean: Floats, covariance: Floats, work: CorrectionWork) -> None:
             add(mean, work.step)
 
         return move
 
-    def move_and_turn(mean: Floats, covariance: Floats, work: Any) -> None:
+    def move_and_turn(mean: Floats, covariance: Floats, work: CorrectionWork) -> None:
         add(mean, work.step)
         turn(reset, work.step, covariance)
 
     return move_and_turn
 
 
-def comparing(kinds: Kinds, correct: Correction | None) -> Function:
+def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
     """Make `compare(origin, mean, covariance, work)`: it finds the step that `correcting` takes back.
 
     Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
@@ -111,7 +173,9 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
             traced(correct.step, len(kinds), len(kinds), t), inputs, ("linear",) * t, "step"
         )
 
-        def compare_together(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+        def compare_together(
+            origin: Floats, mean: Floats, covariance: Floats, work: ComparisonWork
+        ) -> None:
             linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
             work.change[0] = work.step
             propagate_covariance(covariance, work.transition, work.product)
@@ -120,12 +184,12 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
     subtract, reset_back = boxminus(kinds), by_right_jacobian(kinds, back=True)
     if is_flat(kinds):
 
-        def compare(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+        def compare(origin: Floats, mean: Floats, covariance: Floats, work: ComparisonWork) -> None:
             subtract(mean, origin, work.change, 0)
 
         return compare
 
-    def compare_and_turn(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+    def compare_and_turn(origin: Floats, mean: Floats, covariance: Floats, work: ComparisonWork) -> None:
         subtract(mean, origin, work.change, 0)
         reset_back(work.change[0], covariance)
         reset_back(work.change[0], covariance.T)
@@ -133,7 +197,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
     return compare_and_turn
 
 
-def relinearising(model: Model) -> tuple[Function, Function]:
+def relinearising(model: Model) -> tuple[StepTo, Chain]:
     """Find where an iterated update linearises, and the chain rule back to the mean.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`; after it
@@ -142,7 +206,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
     t = model.tangent
     if model.correct is not None:
 
-        def chain_together(rows: Floats, work: Any) -> None:
+        def chain_together(rows: Floats, work: RelinearisingWork) -> None:
             for i in range(len(rows)):
                 for column in range(t):
                     entry = 0.0
@@ -155,11 +219,11 @@ def relinearising(model: Model) -> tuple[Function, Function]:
     fill, add, flat = filling(model.size), boxplus(model.kinds), is_flat(model.kinds)
     turn = by_right_jacobian(model.kinds)
 
-    def step_to(mean: Floats, work: Any) -> None:
+    def step_to(mean: Floats, work: CorrectionWork) -> None:
         fill(work.state, mean)
         add(work.state, work.step)
 
-    def chain(rows: Floats, work: Any) -> None:
+    def chain(rows: Floats, work: RelinearisingWork) -> None:
         if not flat:
             for row in range(t):
                 work.turned[row] = -work.step[row]
@@ -168,7 +232,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
     return step_to, chain
 
 
-def stepping(kinds: Kinds, move: Function) -> Function:
+def stepping(kinds: Kinds, move: AlongSlope) -> StepTo:
     """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative.
 
     It is moved by `work.step`, and bends along `work.slope`.
@@ -179,7 +243,7 @@ def stepping(kinds: Kinds, move: Function) -> Function:
     linearise = derivative(traced(move, *arguments), inputs, kinds, "state")
     read_state, read_step = tuple_of(len(kinds)), tuple_of(len(straight))
 
-    def step_to(mean: Floats, work: Any) -> None:
+    def step_to(mean: Floats, work: CorrectionWork) -> None:
         linearise(read_state(mean), read_step(work.step), read_step(work.slope), work)
 
     return step_to
@@ -191,8 +255,8 @@ def correcting_more(model: Model, more: int) -> Correction | None:
         return None
     n, t, correct = model.size, model.tangent, model.correct
 
-    def longer(move: Function) -> Function:
-        def move_all(state: Any, step: Any, slope: Any) -> Any:
+    def longer(move: AlongSlope) -> AlongSlope:
+        def move_all(state: Numbers, step: Numbers, slope: Numbers) -> Numbers:
             moved = move(state[:n], step[:t], slope[:t])
             return (*moved, *(state[n + each] + step[t + each] for each in range(more)))
 
@@ -200,10 +264,10 @@ def correcting_more(model: Model, more: int) -> Correction | None:
 
     along_own, step_own = correct.along, correct.step
 
-    def along(state: Any) -> Any:
+    def along(state: Numbers) -> Numbers:
         return (*along_own(state[:n]), *(0.0,) * more)
 
-    def step_to(state: Any, target: Any, slope: Any) -> Any:
+    def step_to(state: Numbers, target: Numbers, slope: Numbers) -> Numbers:
         step = step_own(state[:n], target[:n], slope[:t])
         return (*step, *(target[n + each] - state[n + each] for each in range(more)))
 

@@ -4,11 +4,12 @@ The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimati
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, create_model
 
+from fuselog.replay.engine.arrays import AnyArgument, Settings
 from fuselog.replay.inference.model.parameters import ModelParameters
 
 
@@ -30,19 +31,21 @@ def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
     """Add to a model's parameters those of the processes of these components."""
-    processes: dict[str, Any] = {
+    processes: dict[str, AnyArgument] = {
         f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
     return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **processes)
 
 
-def remaining_share(name: str, duration_s: Any, parameters: Any) -> Any:
+def remaining_share(name: str, duration_s: float, parameters: Settings) -> float:
     """Compute the share of a component's distance from its mean that is left after a step."""
-    return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
+    share: float = np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
+    return share
 
 
-def added_variance(name: str, duration_s: Any, parameters: Any) -> Any:
+def added_variance(name: str, duration_s: float, parameters: Settings) -> float:
     """Compute the variance that a step adds to a component."""
     walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
     returned = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
-    return walked + returned * getattr(parameters, f"sigma_{name}") ** 2
+    variance: float = walked + returned * getattr(parameters, f"sigma_{name}") ** 2
+    return variance

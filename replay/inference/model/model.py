@@ -8,13 +8,26 @@ the state of every model that gives what the method needs.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
 
 from fuselog.recorders.log import Schema, Stream, schemas
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Numbers, Settings
 from fuselog.replay.engine.renamed import renamed
 from fuselog.replay.engine.vectors.components import Components
 from fuselog.replay.inference.linear_algebra.manifold import tangent_size
+from fuselog.replay.inference.model.functions import (
+    AlongSlope,
+    ControlNoise,
+    LogLikelihood,
+    Measure,
+    MeasurementJacobian,
+    MeasurementMoments,
+    MotionJacobians,
+    MotionMoments,
+    MotionNoise,
+    Move,
+    OfParameters,
+    OfState,
+)
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start
 
@@ -109,15 +122,15 @@ class Motion:
             without the additive noise; for the method `analytic`.
     """
 
-    move: Function
-    noise: Function | None = None
+    move: Move
+    noise: MotionNoise | None = None
     noises: int = 0
     noise_block: int = 0
-    control_noise: Function | None = None
-    gap_noise: Function | None = None
+    control_noise: ControlNoise | None = None
+    gap_noise: MotionNoise | None = None
     linear: bool = False
-    jacobians: Function | None = None
-    moments: Function | None = None
+    jacobians: MotionJacobians | None = None
+    moments: MotionMoments | None = None
 
     def triangle(self, tangent: int) -> int:
         """Count the numbers of `noise` where they are a triangle, for a state of size `tangent`."""
@@ -135,8 +148,8 @@ class Switching:
         initial: (parameters) -> the modes' probabilities at the prior's time; equal ones unless given.
     """
 
-    rates: Function
-    initial: Function | None = None
+    rates: OfParameters
+    initial: OfParameters | None = None
 
 
 @renamed(about="reference")
@@ -182,8 +195,8 @@ class Sensor:
     topic: str
     schema: Schema
     measured: Components
-    measure: Function
-    noise: Function | None = None
+    measure: Measure
+    noise: OfParameters | None = None
     noises: int = 0
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
@@ -194,9 +207,9 @@ class Sensor:
     read: Callable[[Stream], Floats] | None = None
     delay: str = ""
     linear: bool = False
-    jacobian: Function | None = None
-    moments: Function | None = None
-    log_likelihood: Function | None = None
+    jacobian: MeasurementJacobian | None = None
+    moments: MeasurementMoments | None = None
+    log_likelihood: LogLikelihood | None = None
     stated: Mapping[str, Callable[[Mapping[str, str]], float]] = field(default_factory=dict)
 
     @property
@@ -227,10 +240,10 @@ class Sensor:
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
     """Make the sensor of position fixes, of a state that has x, y and perhaps z in these places."""
 
-    def position(state: Any, reference: Any, parameters: Any) -> Any:
+    def position(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
         return tuple(state[place] for place in places)
 
-    def fix_noise(parameters: Any) -> Any:
+    def fix_noise(parameters: Settings) -> Numbers:
         return (parameters.sigma_fix_m**2,) * len(places)
 
     return Sensor(
@@ -261,10 +274,10 @@ class Correction:
         back: (state, step, slope) -> the state after a step of a smoother's backward pass.
     """
 
-    along: Function
-    move: Function
-    step: Function
-    back: Function
+    along: OfState
+    move: AlongSlope
+    step: AlongSlope
+    back: AlongSlope
 
 
 @renamed(estimable="augmentable")

@@ -8,27 +8,29 @@ states that parameters become part of, and what is written as C have it as any o
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, TypeVar, cast
 
 import numpy as np
 from pydantic import create_model
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters, build, field_of, meanings
-from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.arrays import AnyArgument, Settings
+from fuselog.replay.inference.model.augmentation import OfModel
 from fuselog.replay.inference.model.binding import Found
 from fuselog.replay.inference.model.model import Model, Sensor
-from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
 from fuselog.replay.inference.model.settings import TracedParameters
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.tracing.reads import pure
 
-Tables = Mapping[str, Mapping[str, Any]]
+Value = TypeVar("Value")
+Tables = Mapping[str, Mapping[str, object]]
 
 
 def with_own_parameters(
     model: Model, found: Found, tables: Tables, parameters: Parameters
-) -> tuple[Model, Found, Any]:
+) -> tuple[Model, Found, CombinedParameters]:
     """Return a model whose topics have parameters of their own, its topics, and the parameters.
 
     They are given to topics that some are set for, and to all of a kind of which there are several.
@@ -137,19 +139,19 @@ def _fields_of(topic: str, names: Iterable[str]) -> dict[str, str]:
     return {name: field_of(f"{topic}.{name}") for name in names}
 
 
-def _with_owned(given: Mapping[str, Any], owned: Mapping[str, tuple[str, str]]) -> dict[str, Any]:
+def _with_owned(given: Mapping[str, Value], owned: Mapping[str, tuple[str, str]]) -> dict[str, Value]:
     return {**given, **{field: given[name] for field, (_, name) in owned.items() if name in given}}
 
 
 @lru_cache(maxsize=64)
 def _with_fields(
     parameters: type[Parameters], owned: tuple[tuple[str, tuple[str, str]], ...]
-) -> type[Any]:
+) -> type[CombinedParameters]:
     """Add the topics' own parameters to others, with the bounds of what they stand for."""
-    said, fields, lines = meanings(parameters), dict[str, Any](), list[str]()
+    said, fields, lines = meanings(parameters), dict[str, AnyArgument](), list[str]()
     for field, (topic, name) in owned:
         entry = parameters.model_fields[name]
-        bounds: Any = (
+        bounds: AnyArgument = (
             Annotated[(entry.annotation, *entry.metadata)] if entry.metadata else entry.annotation
         )
         fields[field] = bounds | None, None
@@ -163,7 +165,7 @@ def _with_fields(
 def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
     """Return the sensor with functions that read the topic's own parameters."""
 
-    def reading(function: Function | None, place: int = -1) -> Function | None:
+    def reading(function: OfModel | None, place: int = -1) -> OfModel | None:
         return function and _reading(function, place, fields)
 
     return replace(
@@ -182,23 +184,24 @@ def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
 class _Own:
     """Reads parameters, in place of some those of a topic."""
 
-    def __init__(self, parameters: Any, fields: tuple[tuple[str, str], ...]) -> None:
+    def __init__(self, parameters: Settings, fields: tuple[tuple[str, str], ...]) -> None:
         self._parameters, self._fields = parameters, dict(fields)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._parameters, self._fields.get(name, name))
+    def __getattr__(self, name: str) -> float:
+        value: float = getattr(self._parameters, self._fields.get(name, name))
+        return value
 
 
-def _reading(function: Function, place: int, fields: Mapping[str, str]) -> Function:
+def _reading(function: OfModel, place: int, fields: Mapping[str, str]) -> OfModel:
     """Make a function whose parameters, at a place of its arguments, are the topic's own.
 
     It is seen to do the same again where the given one is; see `fuselog.replay.tracing.reads`.
     """
     pairs = tuple(fields.items())
 
-    def read(*arguments: Any) -> Any:
+    def read(*arguments: AnyArgument) -> object:
         given = list(arguments)
         given[place] = _Own(given[place], pairs)
         return function(*given)
 
-    return read
+    return cast(OfModel, read)

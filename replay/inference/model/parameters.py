@@ -8,6 +8,11 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field, PositiveFloat
 
 from fuselog.recorders.parameters import Parameters
+from fuselog.replay.engine.arrays import Settings
+
+# The parameters of a model and of a method together: a class that is made when both are known, see
+# `fuselog.replay.inference.estimators.combined`.
+CombinedParameters = Any  # type: ignore[explicit-any]
 
 
 @cache
@@ -23,12 +28,12 @@ def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def settings_type(names: tuple[str, ...]) -> type[Any]:
+def settings_type(names: tuple[str, ...]) -> type[Settings]:
     """Make the NamedTuple that model functions get as their parameters."""
     return namedtuple("Settings", names)
 
 
-class ModelParameters(Parameters):
+class ModelParameters(Parameters):  # type: ignore[explicit-any]
     """Defines the options of every model.
 
     A parameter that is none is what the channels of the log state: the sensor's own first, then those

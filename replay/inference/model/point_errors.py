@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fuselog.recorders.errors import BadInput
+from fuselog.replay.engine.arrays import AnyArgument, Numbers, Settings
 from fuselog.replay.inference.model.corrections import correcting_more
 from fuselog.replay.inference.model.gauss_markov import (
     added_variance,
@@ -94,7 +95,7 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
     given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()
     entries = len(given) or t
 
-    def move(state: Any, control: Any, *others: Any) -> Any:
+    def move(state: Numbers, control: Numbers, *others: AnyArgument) -> Numbers:
         *entering, duration_s, parameters = others
         own = (each[:noises] for each in entering)
         moved = list(inner(state[:n], control, *own, duration_s, parameters))
@@ -103,7 +104,7 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
 
-    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+    def noise(state: Numbers, duration_s: float, parameters: Settings) -> Numbers:
         found = noise_of(state[:n], duration_s, parameters) if noise_of else (0.0,) * t
         return (*found, *(added_variance(name, duration_s, parameters) for name in names))
 
@@ -128,7 +129,7 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
     ]
     n, size, inner = model.size, sensor.reference_size, sensor.measure
 
-    def measure(state: Any, *others: Any) -> Any:
+    def measure(state: Numbers, *others: AnyArgument) -> Numbers:
         *entering, reference, parameters = others
         seen = list(inner(state[:n], *entering, reference[:size], parameters))
         for place, row, numbers in own:
@@ -145,9 +146,9 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
     )
 
 
-def _same(reference: Any, numbers: Sequence[int]) -> Any:
+def _same(reference: Numbers, numbers: Sequence[int]) -> float:
     """Return 1 where a message is about these points, 0 where not."""
-    found: Any = 1.0
+    found = 1.0
     for index, number in enumerate(numbers):
         found = found * (reference[index] == number)
     return found

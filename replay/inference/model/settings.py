@@ -1,15 +1,14 @@
 """Collects the numbers that a model's functions read: from parameters, or from a log's channels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic
 from fuselog.recorders.log.planes import ORIGIN
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.inference.model.binding import Found
 from fuselog.replay.inference.model.model import Model, Sensor
@@ -24,19 +23,22 @@ from fuselog.replay.inference.model.validation import (
     switching_of,
 )
 
+# (settings (1 + sensors, fields), row) -> its parameters: 0 is the motion's, the others the sensors'.
+ReadSettings = Callable[[Floats, int], Settings]
+
 
 @lru_cache(maxsize=64)
-def reading_settings(names: tuple[str, ...]) -> Function:
-    """Make `read(settings, row)`: it reads a row of numbers as the NamedTuple."""
+def reading_settings(names: tuple[str, ...]) -> ReadSettings:
+    """Make the function that reads a row of numbers as the NamedTuple."""
     kind = settings_type(names)
 
-    def read(settings: Floats, row: int) -> Any:
+    def read(settings: Floats, row: int) -> Settings:
         return kind(*(settings[row, index] for index in range(len(names))))
 
     return read
 
 
-def trial_parameters(model: Model) -> Any:
+def trial_parameters(model: Model) -> Settings:
     """Make parameters to try functions with: every number is one."""
     names = number_fields(model.parameters)
     return settings_type(names)(*(1.0,) * len(names))
@@ -45,11 +47,11 @@ def trial_parameters(model: Model) -> Any:
 class TracedParameters:
     """Records which parameters a model's functions read: `read`; a parameter that is unset is one."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Mapping[str, float | None]) -> None:
         self._values = values
         self.read: set[str] = set()
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> float:
         if name not in self._values:
             raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._values)}")
         self.read.add(name)
@@ -225,7 +227,9 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
 
 
 @lru_cache(maxsize=64)
-def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tuple[set[str], ...]:
+def _needed(
+    where: str, stage: Stage, given: tuple[tuple[str, float | None], ...]
+) -> tuple[set[str], ...]:
     """Find the parameters that motion and sensors read; BadInput where the model is not as declared."""
     model, values = stage.model, dict(given)
     check_state(where, model)

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 from fuselog.recorders.registry import available
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
@@ -111,13 +111,13 @@ def _with_traced(part: Part, **arguments: tuple[Argument, ...]) -> Part:
     return _same_again(part, **changed) if changed else part
 
 
-_KNOWN: dict[Any, tuple[Any, Any]] = {}
+_KNOWN: dict[tuple[object, ...], tuple[object, object]] = {}
 
 
-def _same_again(part: Part, **changes: Any) -> Part:
+def _same_again(part: Part, **changes: object) -> Part:
     """Return the part with these changes: one object as long as they are the same ones."""
     key = id(part), *((name, id(each)) for name, each in changes.items())
     known = _KNOWN.get(key)
     if known is None:
         known = _KNOWN[key] = part, replace(part, **changes)  # type: ignore[type-var]
-    return known[1]
+    return cast(Part, known[1])

@@ -2,11 +2,19 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 from fuselog.recorders.log import Stream
-from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.renamed import renamed
+
+
+class Align(Protocol):
+    """Finds a state from the path that the control leads along and from fixes, see `Start.align`."""
+
+    def __call__(
+        self, path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Settings, /
+    ) -> tuple[Floats, Floats] | None: ...
 
 
 @renamed(suspect="check_prior")
@@ -37,9 +45,9 @@ class Start:
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
-    align: Callable[..., tuple[Floats, Floats] | None] | None = None
-    find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
-    check_prior: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
+    align: Align | None = None
+    find: "Callable[[Mapping[str, Stream], Settings], Started] | None" = None
+    check_prior: Callable[[Mapping[str, Stream], Settings], list[str]] | None = None
 
 
 class Started(NamedTuple):

@@ -1,13 +1,13 @@
 """Checks that a model is what it declares: sizes, kinds, variances and rates, before any method runs."""
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Settings
 from fuselog.replay.engine.vectors.tangent import are_kinds
+from fuselog.replay.inference.model.functions import ModelFunction
 from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
 from fuselog.replay.tracing.functions import place_of
 
@@ -21,7 +21,7 @@ def check_state(where: str, model: Model) -> None:
         )
 
 
-def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> None:
+def check_motion(where: str, model: Model, motion: Motion, parameters: Settings) -> None:
     """Call a motion's functions once, uncompiled.
 
     `parameters` has a number for every parameter. Raises BadInput where a function fails, or
@@ -62,7 +62,7 @@ def check_correction(where: str, model: Model) -> None:
         _check(where, model.correct.step, (state, state, error), (model.tangent,))
 
 
-def check_switching(where: str, model: Model, parameters: Any) -> None:
+def check_switching(where: str, model: Model, parameters: Settings) -> None:
     """Call the functions of a model's switching once, uncompiled; see `check_motion`."""
     assert model.modes
     assert model.switching
@@ -72,7 +72,7 @@ def check_switching(where: str, model: Model, parameters: Any) -> None:
         _check(where, switching.initial, (parameters,), (modes,))
 
 
-def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
+def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats, Floats]:
     """Return the rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
 
     Raises BadInput where a rate is negative, or the probabilities are none.
@@ -104,7 +104,7 @@ def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Flo
     return rates, initial
 
 
-def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
+def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings) -> None:
     """Call a sensor's functions once, uncompiled; see `check_motion`.
 
     Args:
@@ -165,7 +165,9 @@ def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
+def _check(
+    where: str, function: ModelFunction, arguments: tuple[AnyArgument, ...], sizes: tuple[int, ...]
+) -> None:
     what = f"{where}: {place_of(function)}"
     with np.errstate(all="ignore"):
         try:

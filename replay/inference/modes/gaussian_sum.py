@@ -11,12 +11,12 @@ Magill, Optimal Adaptive Estimation of Sampled Stochastic Processes, IEEE TAC 10
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, manifold_blocks
@@ -30,18 +30,21 @@ from fuselog.replay.inference.kalman.methods import (
     no_steps,
 )
 from fuselog.replay.inference.kalman.steps import (
+    CoreMemory,
     Gaussian,
     InnovationRecord,
     Interval,
     Measurement,
+    Samples,
     Steps,
+    UpdateRun,
 )
 from fuselog.replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 from fuselog.replay.inference.linear_algebra.manifold import boxplus
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.modes.mixing import MixtureMemory, likeliest_of, mixing, mixture_memory
-from fuselog.replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
+from fuselog.replay.inference.modes.mixture import MixtureFilter, Mixtures, UpdateMixture, mixture_update
 from fuselog.replay.inference.run.filtering import FilterState
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
@@ -49,7 +52,7 @@ ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding sa
 AGREED = 0.1  # members become one where their means are on average so near, as a squared distance
 
 
-class GaussianSumParameters(UnscentedParameters, RegressionParameters):
+class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
     """States the filter of every member, and the number of members.
 
     Members lie side by side, and the standard deviation of each is half their distance, so that their
@@ -94,7 +97,7 @@ class GaussianSumBelief(NamedTuple):
 class GaussianSumMemory(NamedTuple):
     """Holds what the steps of one core work in: the members' filter, their mixture, `factor` (t, t)."""
 
-    filters: tuple[Any]
+    filters: tuple[CoreMemory]
     mixture: MixtureMemory
     factor: Floats
 
@@ -167,7 +170,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
             probability[0], belief.log_probability[run, 0] = 1.0, 0.0
             belief.left[run] = 1
 
-    def of_run(update: Function) -> Function:
+    def of_run(update: UpdateMixture) -> UpdateRun:
         def update_run(
             run: int,
             belief: GaussianSumBelief,
@@ -200,7 +203,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         mix(probability, memory.mixture, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])
 
-    def memory(sets: tuple[Any, ...]) -> GaussianSumMemory:
+    def memory(sets: tuple[Samples, ...]) -> GaussianSumMemory:
         mixture = mixture_memory(stage, members)
         return GaussianSumMemory((inner.memory(sets),), mixture, np.empty((t, t)))
 

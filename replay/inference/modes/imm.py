@@ -16,12 +16,11 @@ Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Any
 
 import numpy as np
 from pydantic import field_validator
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.blocks import Ragged, join
 from fuselog.replay.inference.kalman.methods import (
     FILTERS,
@@ -37,7 +36,9 @@ from fuselog.replay.inference.kalman.steps import (
     InnovationRecord,
     Interval,
     Measurement,
+    Samples,
     Steps,
+    UpdateRun,
 )
 from fuselog.replay.inference.linear_algebra.tuples import filling
 from fuselog.replay.inference.model.model import Model
@@ -56,6 +57,7 @@ from fuselog.replay.inference.modes.mixture import (
     MixtureFilter,
     Mixtures,
     ModeBelief,
+    UpdateMixture,
     mixture_update,
     predicting,
 )
@@ -64,7 +66,7 @@ from fuselog.replay.inference.run.filtering import FilterState
 from fuselog.replay.inference.run.recursion import FilterEvents
 
 
-class InteractingParameters(UnscentedParameters, RegressionParameters):
+class InteractingParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
     """States the filter of every mode, and what is written.
 
     Attributes:
@@ -78,7 +80,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
 
     @field_validator("mode", mode="before")
     @classmethod
-    def _no_mode(cls, mode: Any) -> None:
+    def _no_mode(cls, mode: object) -> None:
         if mode is not None:
             raise ValueError("imm takes all modes of a model; leave out `mode`, or use a filter of one")
 
@@ -126,7 +128,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         mix(probability, memory.mixture, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])
 
-    def memory(sets: tuple[Any, ...]) -> InteractingMemory:
+    def memory(sets: tuple[Samples, ...]) -> InteractingMemory:
         waiting = iter(sets)
         inner = tuple(each.memory(tuple(next(waiting) for _ in each.sampled)) for each in filters)
         return InteractingMemory(
@@ -138,7 +140,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             mixture=mixture_memory(stage, modes),
         )
 
-    def of_run(update: Function) -> Function:
+    def of_run(update: UpdateMixture) -> UpdateRun:
         def update_run(
             run: int,
             belief: ModeBelief,

@@ -1,12 +1,12 @@
 """Mixes the Gaussians of modes: the transition matrix, the weights of mixtures, and their moments."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
-from fuselog.replay.inference.kalman.steps import InnovationRecord
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.inference.kalman.steps import CoreMemory, InnovationRecord
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from fuselog.replay.inference.linear_algebra.manifold import (
@@ -63,7 +63,7 @@ class InteractingMemory(NamedTuple):
         mixture: for the modes' Gaussians.
     """
 
-    filters: tuple[Any, ...]
+    filters: tuple[CoreMemory, ...]
     rates: Floats
     transition: Floats
     weights: Floats
@@ -71,8 +71,38 @@ class InteractingMemory(NamedTuple):
     mixture: MixtureMemory
 
 
+class FillTransition(Protocol):
+    """Fills Pi (M, M) of rates (M (M - 1),) between modes over a duration."""
+
+    def __call__(self, rates: Floats, duration_s: float, transition: Floats, /) -> None: ...
+
+
+class FillWeights(Protocol):
+    """Moves probabilities (M,) and their logarithms over the change of modes, and fills the weights."""
+
+    def __call__(
+        self, probability: Floats, log_probability: Floats, memory: InteractingMemory, /
+    ) -> None: ...
+
+
+class ToCommonTangent(Protocol):
+    """Carries means (M, n) and covariances (M, t, t) to the tangent space of the likeliest."""
+
+    def __call__(
+        self, mean: Floats, covariance: Floats, probability: Floats, memory: MixtureMemory, /
+    ) -> None: ...
+
+
+class MixModes(Protocol):
+    """Fills mean (n,) and covariance (t, t) of a mixture with these weights (M,)."""
+
+    def __call__(
+        self, weights: Floats, memory: MixtureMemory, mean: Floats, covariance: Floats, /
+    ) -> None: ...
+
+
 @lru_cache(maxsize=16)
-def transition_matrix(modes: int) -> Function:
+def transition_matrix(modes: int) -> FillTransition:
     """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformisation.
 
     With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
@@ -126,7 +156,7 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
     )
 
 
-def mixing_weights(modes: int) -> Function:
+def mixing_weights(modes: int) -> FillWeights:
     """Make `fill_weights(probability, log_probability, memory)`: the probabilities become c.
 
     Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still hold
@@ -149,7 +179,8 @@ def mixing_weights(modes: int) -> Function:
             total += weights[end, begin]
         for begin in range(modes):
             weights[end, begin] /= total
-        return highest + np.log(total)
+        logarithm: float = highest + np.log(total)
+        return logarithm
 
     def fill_weights(probability: Floats, log_probability: Floats, memory: InteractingMemory) -> None:
         weights, predicted = memory.weights, memory.predicted
@@ -171,7 +202,7 @@ def mixing_weights(modes: int) -> Function:
     return fill_weights
 
 
-def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, Function]:
+def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[ToCommonTangent, MixModes]:
     """Make the two halves of mixing the Gaussians of all modes.
 
     Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent

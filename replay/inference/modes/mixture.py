@@ -2,25 +2,28 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.results import ALL_WELL, named
 from fuselog.replay.inference.kalman.steps import (
+    CoreMemory,
     Gaussian,
     InnovationRecord,
     Interval,
     Measurement,
     Steps,
+    UpdateRun,
 )
 from fuselog.replay.inference.kalman.update import innovation_components, writing_innovation
 from fuselog.replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
 from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.modes.mixing import MixtureMemory
 from fuselog.replay.inference.run.filtering import Filter
 from fuselog.replay.inference.run.recursion import Estimates, Innovations
 
@@ -49,7 +52,38 @@ class Mixtures(NamedTuple):
     probability: Floats
 
 
-def predicting(filters: Sequence[Steps]) -> Function:
+class MixtureWork(Protocol):
+    """Holds what each Gaussian's filter works in, and what their mixture does."""
+
+    @property
+    def filters(self) -> tuple[CoreMemory, ...]: ...
+    @property
+    def mixture(self) -> MixtureMemory: ...
+
+
+class PredictModes(Protocol):
+    """Predicts the Gaussian of every mode; returns whether all are well."""
+
+    def __call__(
+        self, belief: Gaussian, interval: Interval, memories: tuple[CoreMemory, ...], /
+    ) -> bool: ...
+
+
+class UpdateMixture(Protocol):
+    """Updates several Gaussians and the probabilities (M,) of their modes, see `mixture_update`."""
+
+    def __call__(
+        self,
+        gaussians: Gaussian,
+        weights: tuple[Floats, Floats],
+        measurement: Measurement,
+        memory: MixtureWork,
+        record: InnovationRecord,
+        /,
+    ) -> int: ...
+
+
+def predicting(filters: Sequence[Steps]) -> PredictModes:
     """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well.
 
     Steps take the number of a run and Gaussians whose first axis is the run; here, and in
@@ -57,7 +91,7 @@ def predicting(filters: Sequence[Steps]) -> Function:
     """
     predictions = tuple(each.predict for each in filters)
 
-    def predict(belief: Any, interval: Interval, memories: Any) -> bool:
+    def predict(belief: Gaussian, interval: Interval, memories: tuple[CoreMemory, ...]) -> bool:
         well = True
         for mode in range_of(len(predictions)):
             predict_mode, memory = predictions[mode], memories[mode]
@@ -67,7 +101,7 @@ def predicting(filters: Sequence[Steps]) -> Function:
     return predict
 
 
-def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
+def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateMixture:
     """Make the update of several Gaussians by sensor `number`, and of the probabilities of their modes.
 
     `update(gaussians, (probability, log_probability), ...)`, in place; see `Steps.updates`. A
@@ -85,7 +119,7 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
     angular = tuple(kind == "angle" for kind in measured.values())
     m, write_innovation = len(measured), writing_innovation(stage, number)
 
-    def blend(probability: Floats, memory: Any, record: InnovationRecord) -> float:
+    def blend(probability: Floats, memory: MixtureWork, record: InnovationRecord) -> float:
         """Note the innovation of the mixture of all modes; returns its NIS."""
         innovation, records = memory.filters[0].innovations[number], memory.mixture.records
         difference, covariance, _ = innovation
@@ -115,7 +149,7 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
         gaussians: Gaussian,
         weights: tuple[Floats, Floats],
         measurement: Measurement,
-        memory: Any,
+        memory: MixtureWork,
         record: InnovationRecord,
     ) -> int:
         data, parameters, _, event = measurement
@@ -152,7 +186,7 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
         for mode in range(len(probability)):
             probability[mode] = np.exp(log_probability[mode] - highest)
             total += probability[mode]
-        likelihood = highest + np.log(total)
+        likelihood: float = highest + np.log(total)
         for mode in range(len(probability)):
             log_probability[mode] -= likelihood
             probability[mode] /= total
@@ -169,7 +203,9 @@ class MixtureFilter(Filter, ABC):
     def names(self) -> Sequence[str]:
         """Return what the Gaussians are of."""
 
-    def no_results(self, due: Integers, recorded: Integers, components: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, components: int
+    ) -> tuple[Mixtures, Innovations]:
         """Return estimates and innovations to be filled in."""
         (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
         probability = np.empty((len(mean), len(self.names)))

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.inference.modes.mixing import transition_matrix
 
 
@@ -26,12 +27,12 @@ def smoothing_memory(modes: int) -> SmoothingMemory:
 
 
 @lru_cache(maxsize=16)
-def smoothing_over_runs(modes: int) -> Function:
+def smoothing_over_runs(modes: int) -> OverRuns:
     """Compile `smoothing` over all runs."""
     return compile_over_runs(smoothing(modes), allocates=False, title="the smoother of modes")
 
 
-def smoothing(modes: int) -> Function:
+def smoothing(modes: int) -> RunOnce:
     """Make `smooth(run, ...)`: probabilities (n, M) given data so far become those given all of the run.
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).

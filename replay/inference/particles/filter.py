@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, model_validator
 
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.arrays import Columns, Integers
 from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.engine.philox import WORDS, fill_normals, run_key
 from fuselog.replay.engine.streams.blocks import Ragged
@@ -16,6 +16,7 @@ from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.streams.results import ALL_WELL, named
 from fuselog.replay.inference.kalman.methods import Method, MethodParameters, no_steps
 from fuselog.replay.inference.kalman.steps import (
+    Samples,
     Steps,
     workspace,
 )
@@ -45,7 +46,7 @@ from fuselog.replay.inference.run.timing import join_events, select_events
 MOST_PARTICLES = 1_000_000
 
 
-class ParticleParameters(MethodParameters):
+class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
     """States the number of particles, and when they are resampled.
 
     Random numbers depend on `seed` and on the run's first measurement.
@@ -89,7 +90,7 @@ def particle_steps(stage: Stage, particles: int, resample_below: float, *, progr
     by_control = model.controls if motion.control_noise else 0
     noises = by_control + (motion.noises or (t if motion.noise else 0))
 
-    def memory(_: tuple[Any, ...]) -> ParticleMemory:
+    def memory(_: tuple[Samples, ...]) -> ParticleMemory:
         numbers = np.empty(-(-particles * noises // WORDS) * WORDS)
         return ParticleMemory(
             least_effective=resample_below * particles,
@@ -202,7 +203,7 @@ class ParticleFilter(Filter):
         after = self.begun(state, {run: [prior.mean[run], prior.covariance[run]] for run in unseeded})
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
-    def begun(self, state: FilterState, seeds: Mapping[int, list[Any]]) -> FilterState:
+    def begun(self, state: FilterState, seeds: Mapping[int, list[Columns]]) -> FilterState:
         """Draw particles from the priors of some runs, each seeded by its data."""
         if not seeds:
             return state
@@ -221,7 +222,7 @@ class ParticleFilter(Filter):
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Any, Innovations]:
+    ) -> tuple[Clouds, Innovations]:
         """Make estimates, with particles where they are wanted, and innovations to be filled in."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud

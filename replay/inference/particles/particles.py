@@ -7,20 +7,20 @@ count. Mean and covariance are those of the weighted particles, in the tangent s
 Gordon, Salmond and Smith, IEE Proceedings F 140(2), 1993; systematic resampling: Kitagawa 1996.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers, Numbers
 from fuselog.replay.engine.philox import Words, fill_normals, philox, unit
 from fuselog.replay.inference.kalman.predict import nothing
 from fuselog.replay.inference.kalman.regression import settling
-from fuselog.replay.inference.kalman.steps import Gaussian, Interval, Workspace
+from fuselog.replay.inference.kalman.steps import EstimateRun, Gaussian, Interval, PredictRun, Workspace
 from fuselog.replay.inference.linear_algebra.gaussian import (
     Innovation,
     semidefinite_cholesky,
 )
-from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
+from fuselog.replay.inference.linear_algebra.manifold import Boxplus, boxminus, boxplus
 from fuselog.replay.inference.linear_algebra.moments import (
     lower_of,
     moments_of,
@@ -136,7 +136,41 @@ class ParticleMemory(NamedTuple):
     kernel: Kernel
 
 
-def moving(stage: Stage, by_control: int, renew: Function) -> Function:
+class Renew(Protocol):
+    """Resamples the particles of a run; returns whether all is well."""
+
+    def __call__(self, run: int, cloud: Cloud, memory: ParticleMemory, /) -> bool: ...
+
+
+class Drive(Protocol):
+    """Gives a particle's control (controls,)."""
+
+    def __call__(self, interval: Interval, drawn: Floats, memory: ParticleMemory, /) -> Numbers: ...
+
+
+class MoveParticle(Protocol):
+    """Gives a state (n,) after the motion, with noise that is drawn."""
+
+    def __call__(
+        self,
+        state: Numbers,
+        driven: Numbers,
+        drawn: Floats,
+        interval: Interval,
+        memory: ParticleMemory,
+        /,
+    ) -> Numbers: ...
+
+
+class SpreadParticles(Protocol):
+    """Fills offsets (N, t) with draws of the additive noise at states (N, n); False if it is none."""
+
+    def __call__(
+        self, states: Floats, offsets: Floats, interval: Interval, memory: ParticleMemory, /
+    ) -> bool: ...
+
+
+def moving(stage: Stage, by_control: int, renew: Renew) -> PredictRun:
     """Make the prediction: every particle moves with noise of its own, after resampling where due.
 
     Args:
@@ -149,7 +183,7 @@ def moving(stage: Stage, by_control: int, renew: Function) -> Function:
     drive, move = _driving(stage), _moved(stage, by_control)
     is_additive = motion.noise is not None and not motion.noises
     spread = _additive_noise(stage, by_control) if is_additive else _no_noise
-    scatter = add if is_additive else nothing
+    scatter: Boxplus = add if is_additive else nothing
 
     def predict(run: int, cloud: Cloud, interval: Interval, memory: ParticleMemory) -> bool:
         states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
@@ -232,18 +266,18 @@ def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
     return power * best + np.log(mean) if best > -np.inf else np.nan
 
 
-def _driving(stage: Stage) -> Function:
+def _driving(stage: Stage) -> Drive:
     """Make `drive(interval, drawn, memory)`: a particle's control, as a tuple."""
     controls, variances = stage.model.controls, stage.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
 
-        def as_stated(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Any:
+        def as_stated(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Numbers:
             return read(interval.control)
 
         return as_stated
 
-    def with_error(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Any:
+    def with_error(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Numbers:
         fill(memory.control, variances(interval.duration_s, interval.parameters))
         for k in range(controls):
             memory.control[k] = interval.control[k] + np.sqrt(memory.control[k]) * drawn[k]
@@ -252,14 +286,14 @@ def _driving(stage: Stage) -> Function:
     return with_error
 
 
-def _moved(stage: Stage, first: int) -> Function:
+def _moved(stage: Stage, first: int) -> MoveParticle:
     """Make `moved(state, driven, drawn, interval, memory)`: a state after the motion."""
     move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
     if not noises:
 
         def without(
-            state: Any, driven: Any, drawn: Floats, interval: Interval, memory: ParticleMemory
-        ) -> Any:
+            state: Numbers, driven: Numbers, drawn: Floats, interval: Interval, memory: ParticleMemory
+        ) -> Numbers:
             return move(state, driven, interval.duration_s, interval.parameters)
 
         return without
@@ -267,8 +301,8 @@ def _moved(stage: Stage, first: int) -> Function:
     read, fill = tuple_of(noises), filling(noises)
 
     def with_noise(
-        state: Any, driven: Any, drawn: Floats, interval: Interval, memory: ParticleMemory
-    ) -> Any:
+        state: Numbers, driven: Numbers, drawn: Floats, interval: Interval, memory: ParticleMemory
+    ) -> Numbers:
         _, duration_s, parameters, _ = interval
         fill(memory.noise, variances(state, duration_s, parameters))
         for k in range(noises):
@@ -282,7 +316,7 @@ def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: Parti
     return True
 
 
-def _additive_noise(stage: Stage, first: int) -> Function:
+def _additive_noise(stage: Stage, first: int) -> SpreadParticles:
     """Make `spread(states, offsets, interval, memory)`: draws of the additive noise.
 
     They are tangent vectors, at the states before they move. Noise is factored anew only where it is
@@ -294,7 +328,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     add_noise = adding_noise(t, stage.motion.noise_block)
     read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
-    def factored(lower: Floats, variances: Any) -> bool:
+    def factored(lower: Floats, variances: Numbers) -> bool:
         lower[:, :] = 0.0
         add_noise(lower, variances)
         return semidefinite_cholesky(lower, lower, t)
@@ -318,7 +352,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     return spread
 
 
-def summing_up(model: Model) -> Function:
+def summing_up(model: Model) -> EstimateRun:
     """Make the estimate: intrinsic mean and covariance of weighted particles, and these where wanted."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)

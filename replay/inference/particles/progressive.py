@@ -9,11 +9,11 @@ Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised part
 Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
 """
 
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.philox import WORDS, fill_normals
 from fuselog.replay.inference.kalman.regression import settling
 from fuselog.replay.inference.linear_algebra.gaussian import semidefinite_cholesky
@@ -24,6 +24,7 @@ from fuselog.replay.inference.particles.particles import (
     Cloud,
     Kernel,
     ParticleMemory,
+    Renew,
     SensorMemory,
     effective_number,
     resample,
@@ -53,7 +54,7 @@ def kernel_of(particles: int, n: int, t: int) -> Kernel:
     )
 
 
-def renewing(model: Model) -> Function:
+def renewing(model: Model) -> Renew:
     """Make `renew(run, cloud, memory)`: it resamples, and spreads what it has resampled.
 
     Returns False where the covariance of the particles is no covariance.
@@ -88,7 +89,39 @@ def renewing(model: Model) -> Function:
     return renew
 
 
-def taking_in_parts(model: Model, look: Function, likelihood: Function) -> Function:
+class Look(Protocol):
+    """Prepares the likelihood for particles that moved; returns how many components it uses."""
+
+    def __call__(
+        self, states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int, /
+    ) -> int: ...
+
+
+class Likelihood(Protocol):
+    """Gives log p at particle i of states (N, n); NaN where that does not predict the measurement."""
+
+    def __call__(
+        self, states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int, /
+    ) -> float: ...
+
+
+class Take(Protocol):
+    """Weighs and moves the particles of a run by a measurement, see `taking_in_parts`."""
+
+    def __call__(
+        self,
+        run: int,
+        cloud: Cloud,
+        data: Floats,
+        parameters: Settings,
+        memory: ParticleMemory,
+        own: SensorMemory,
+        kept: int,
+        /,
+    ) -> tuple[float, bool]: ...
+
+
+def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
     """Make `take(run, cloud, data, parameters, memory, own, kept)`: it weighs and moves the particles.
 
     Returns the log-likelihood, NaN where no particle explains what was measured, and whether all is
@@ -106,7 +139,7 @@ def taking_in_parts(model: Model, look: Function, likelihood: Function) -> Funct
         run: int,
         cloud: Cloud,
         data: Floats,
-        parameters: Any,
+        parameters: Settings,
         memory: ParticleMemory,
         own: SensorMemory,
         kept: int,

@@ -1,10 +1,10 @@
 """Updates particles: weighs each by the likelihood of what was measured."""
 
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import (
     NOT_EXPLAINED,
@@ -12,6 +12,7 @@ from fuselog.replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     InnovationRecord,
     Measurement,
+    UpdateRun,
 )
 from fuselog.replay.inference.kalman.update import (
     is_unmeasured,
@@ -33,10 +34,18 @@ from fuselog.replay.inference.linear_algebra.linearization import Input, derivat
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory, reweigh
-from fuselog.replay.inference.particles.progressive import taking_in_parts
+from fuselog.replay.inference.particles.progressive import Likelihood, Look, Take, taking_in_parts
 
 
-def weighing(stage: Stage, number: int, *, progressive: bool) -> Function:
+class CompareParticles(Protocol):
+    """Fills a sensor's differences at particles (N, n), and its noise."""
+
+    def __call__(
+        self, states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, /
+    ) -> None: ...
+
+
+def weighing(stage: Stage, number: int, *, progressive: bool) -> UpdateRun:
     """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
 
     The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
@@ -89,14 +98,14 @@ def weighing(stage: Stage, number: int, *, progressive: bool) -> Function:
     return update
 
 
-def _at_once(likelihood: Function) -> Function:
+def _at_once(likelihood: Likelihood) -> Take:
     """Make `take`, see `taking_in_parts`, of a measurement that is taken in at once."""
 
     def take(
         run: int,
         cloud: Cloud,
         data: Floats,
-        parameters: Any,
+        parameters: Settings,
         memory: ParticleMemory,
         own: SensorMemory,
         kept: int,
@@ -109,10 +118,12 @@ def _at_once(likelihood: Function) -> Function:
     return take
 
 
-def _looking(compare: Function, number: int) -> Function:
+def _looking(compare: CompareParticles, number: int) -> Look:
     """Make `look`, see `taking_in_parts`, where the likelihood is that of Gaussian noise."""
 
-    def look(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory, kept: int) -> int:
+    def look(
+        states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int
+    ) -> int:
         compare(states, data, parameters, memory)
         kept = keep_predicted(memory.sensors[number])
         factor_kept(memory.sensors[number], kept)
@@ -121,12 +132,14 @@ def _looking(compare: Function, number: int) -> Function:
     return look
 
 
-def _as_before(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory, kept: int) -> int:
+def _as_before(
+    states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int
+) -> int:
     """Prepare nothing, for a likelihood that asks for nothing but the state."""
     return kept
 
 
-def _comparing(stage: Stage, number: int) -> Function:
+def _comparing(stage: Stage, number: int) -> CompareParticles:
     """Make `compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
     model, sensor = stage.model, stage.sensors[number]
     measure, fill = sensor.measure, filling(len(sensor.measured))
@@ -134,7 +147,7 @@ def _comparing(stage: Stage, number: int) -> Function:
     add_noise, subtract = sensor_noise(sensor), residual_of(sensor)
 
     def predict_alike(
-        states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
+        states: Floats, i: int, data: Floats, parameters: Settings, memory: ParticleMemory
     ) -> None:
         fill(memory.work.predicted, measure(read_state(states[i]), read_reference(data), parameters))
 
@@ -146,7 +159,7 @@ def _comparing(stage: Stage, number: int) -> Function:
         linearise = derivative(measure, inputs, kinds, "predicted")
 
         def predict_with_noise(
-            states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
+            states: Floats, i: int, data: Floats, parameters: Settings, memory: ParticleMemory
         ) -> None:
             linearise(read_state(states[i]), read_reference(data), parameters, memory.work)
             memory.sensors[number].noise[i] = 0.0
@@ -154,7 +167,7 @@ def _comparing(stage: Stage, number: int) -> Function:
 
         predict = predict_with_noise
 
-    def compare(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory) -> None:
+    def compare(states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory) -> None:
         own = memory.sensors[number]
         if len(own.noise) == 1:
             own.noise[0] = 0.0
@@ -245,7 +258,7 @@ def factor_kept(own: SensorMemory, size: int) -> None:
         own.determinant[number] = 2.0 * np.log(determinant)
 
 
-def _likelihood(stage: Stage, number: int) -> Function:
+def _likelihood(stage: Stage, number: int) -> Likelihood:
     """Make `likelihood(states, i, data, parameters, own, size)`: log p of the measurement at particle i.
 
     The model's own, or that of Gaussian noise; NaN where the particle does not predict it.
@@ -257,7 +270,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
     _, read_measured, read_reference, _ = message_layout(sensor)
 
     def likelihood(
-        states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
+        states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int
     ) -> float:
         return stated(read_state(states[i]), read_measured(data), read_reference(data), parameters)
 
@@ -265,7 +278,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
 
 
 def gaussian_likelihood(
-    states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
+    states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int
 ) -> float:
     """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v.
 
@@ -287,4 +300,5 @@ def gaussian_likelihood(
         squared += difference[a] * difference[a]
     factor = inflation(squared, size, parameters)
     known = own.determinant[number] + size * LOG_TWO_PI
-    return -0.5 * (squared / factor + known + size * np.log(factor))
+    logarithm: float = -0.5 * (squared / factor + known + size * np.log(factor))
+    return logarithm

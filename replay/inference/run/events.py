@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -307,7 +307,7 @@ def _field(stream: Stream, name: str, size: int) -> Floats:
     return numbers
 
 
-def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:
+def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int) -> Floats:
     """Call a model's own function of a topic; raises BadInput where its array has another shape."""
     if not len(ragged):  # vectors have no width here
         return np.empty((0, components))

@@ -1,6 +1,6 @@
 """Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
@@ -11,8 +11,8 @@ from fuselog.recorders.log import Topic, schemas
 from fuselog.recorders.log.planes import in_frame
 from fuselog.recorders.log.streams import computed_stream
 from fuselog.replay.engine import chi2
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats, Integers, RowSlice
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.compiling.notices import done_once
 from fuselog.replay.engine.compiling.scratch import Scratch
 from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
@@ -20,11 +20,19 @@ from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.priors import gaussians
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, named, rows_of, wrapped
 from fuselog.replay.inference.kalman.methods import Method
-from fuselog.replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
+from fuselog.replay.inference.kalman.steps import (
+    FAILURES,
+    NOT_STARTED,
+    CoreMemory,
+    EstimatesToFill,
+    Gaussian,
+    Samples,
+    Steps,
+)
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.linear_algebra.covariances import Form
 from fuselog.replay.inference.model.binding import Found
-from fuselog.replay.inference.model.parameters import number_fields
+from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
 from fuselog.replay.inference.model.settings import placed_settings, reading_settings
 from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.events import (
@@ -62,6 +70,9 @@ from fuselog.replay.inference.run.timing import (
 )
 from fuselog.replay.inference.sampling.samplers import Sampler
 
+# What a smoother keeps for its backward pass, or a filter for late messages: its own.
+Kept = Any  # type: ignore[explicit-any]
+
 
 class FilterState(NamedTuple):
     """Holds what a filter carries from block to block.
@@ -78,11 +89,11 @@ class FilterState(NamedTuple):
 
     carried: RecursionState
     context: Context
-    generators: tuple[Any, ...]
+    generators: tuple[Samples, ...]
     waiting: FilterEvents | None
     next_output: Integers
     unsettled: FilterEvents | None = None
-    kept: Any = None
+    kept: Kept = None
 
 
 @lru_cache(maxsize=64)
@@ -92,7 +103,7 @@ def _steps(stage: Stage, method: Method) -> Steps:
 
 
 @lru_cache(maxsize=64)
-def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
+def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
     """Make the loop over the runs, compiled when first called, and its steps."""
     steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
@@ -101,7 +112,7 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
     return compile_over_runs(loop, allocates=False, title=title), steps
 
 
-def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
+def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) -> tuple[Sampler, ...]:
     """Make a sampler for each sampled function; raises BadInput where the sampling has no such size.
 
     Args:
@@ -131,7 +142,7 @@ class Filter:
     found: Found
     stage: Stage
     method: Method
-    parameters: Any
+    parameters: CombinedParameters
     settings: Floats
     samplers: tuple[Sampler, ...]
     is_bound: ClassVar[bool] = False
@@ -283,7 +294,7 @@ class Filter:
 
     def filtered(
         self, state: FilterState, events: FilterEvents
-    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
+    ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
         with done_once():
@@ -318,8 +329,8 @@ class Filter:
         return after, filled(estimates, due), made
 
     def parts(
-        self, generators: tuple[Any, ...], events: FilterEvents
-    ) -> Iterator[tuple[slice | None, Function]]:
+        self, generators: tuple[Samples, ...], events: FilterEvents
+    ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
         """Iterate over runs, None for all, and what makes the memory of a core with their samples."""
         if not self.is_random:
             yield None, self.scratch
@@ -340,7 +351,7 @@ class Filter:
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Any, Innovations]:
+    ) -> tuple[EstimatesToFill, Innovations]:
         """Make estimates and innovations to be filled in, see `recursion.no_results`."""
         return no_results(due, recorded, self.stage.model, innovation_size)
 
@@ -361,7 +372,7 @@ class Filter:
         """Name the topic that the estimates are compared with."""
         return self.found.truth
 
-    def output_streams(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
+    def output_streams(self, estimates: EstimatesToFill, offsets: Integers, /) -> list[Ragged]:
         """Make the streams of estimates; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 

@@ -1,7 +1,7 @@
 """Finds the first messages of every run, and describes what they determine."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from fuselog.recorders.log import Clock, Stream, schemas
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import reason_stream
+from fuselog.replay.engine.vectors.components import Components
 from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.start import Start
@@ -43,7 +44,7 @@ def run_count(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
-def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+def unknown(state: Components, start: Start | None) -> tuple[Floats, Floats]:
     """Make the mean (n,) and sigmas (t,) of a state that nobody knows; NaN where none is given."""
     kinds = list(state.values())
     sigmas = named_now(start.sigmas, list(state), kinds) if start else {}

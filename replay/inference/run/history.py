@@ -1,11 +1,11 @@
 """Keeps the latest messages of every run, and what a filter believed after each."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
+from fuselog.replay.engine.arrays import Booleans, Columns, Floats, Integers
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.events import data_columns
@@ -16,7 +16,7 @@ from fuselog.replay.inference.run.recursion import (
 )
 
 BEFORE_ALL_NS = np.iinfo(np.int64).min
-Structure = tuple[tuple[str, Any], ...]
+Structure = tuple[tuple[str, "int | Structure"], ...]
 
 
 class KeptMessages(NamedTuple):
@@ -33,7 +33,7 @@ class KeptMessages(NamedTuple):
     time_ns: Integers
     source: Integers
     data: Floats
-    target_id: Any
+    target_id: Columns
     position: Integers
     after: RecursionState
     has_innovation: Booleans
@@ -80,9 +80,9 @@ class History(NamedTuple):
         rows, runs = self.rows, np.arange(len(self.first))
         places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
 
-        def moved(column: Any) -> Any:
+        def moved(column: Columns) -> Columns:
             if isinstance(column, tuple):
-                made: Any = type(column)
+                made = type(column)
                 return made(*map(moved, column))
             wider = np.zeros((len(runs) * capacity, *column.shape[1:]), column.dtype)
             wider[places] = column[rows]
@@ -138,7 +138,7 @@ def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
     return most
 
 
-def structure_of(rows: Any) -> Structure:
+def structure_of(rows: Columns) -> Structure:
     """Describe a NamedTuple of arrays, or of such NamedTuples: their names and numbers of axes."""
     return tuple(
         (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
@@ -146,13 +146,19 @@ def structure_of(rows: Any) -> Structure:
     )
 
 
+class CopyRow(Protocol):
+    """Copies row i of a NamedTuple of arrays to row j of another."""
+
+    def __call__(self, source: Columns, i: int, target: Columns, j: int, /) -> None: ...
+
+
 @lru_cache(maxsize=64)
-def copying_rows(structure: Structure) -> Function:
+def copying_rows(structure: Structure) -> CopyRow:
     """Make `copy(source, i, target, j)`: row i of a NamedTuple of arrays to row j of another."""
     columns = tuple(name for name, of in structure if not isinstance(of, tuple))
     groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
 
-    def copy(source: Any, i: int, target: Any, j: int) -> None:
+    def copy(source: Columns, i: int, target: Columns, j: int) -> None:
         for name in columns:
             getattr(target, name)[j] = getattr(source, name)[i]
         for name, copy_group in groups:

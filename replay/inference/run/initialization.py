@@ -8,14 +8,13 @@ a plane that no channel states is the first geodetic fix. All of it is told, on 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, Stream, Topic, make_stream, schemas
 from fuselog.recorders.parameters import meanings
-from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Columns, Floats, Numbers, Settings
 from fuselog.replay.engine.replaying.estimator import Initialization, Initialized
 from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
 from fuselog.replay.engine.streams.geodetic import in_plane, origins_of
@@ -75,7 +74,7 @@ class Initializer:
         )
 
     @property
-    def _prior_check(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
+    def _prior_check(self) -> Callable[[Mapping[str, Stream], Settings], list[str]] | None:
         start = self.stage.model.start
         return start.check_prior if start is not None else None
 
@@ -261,7 +260,7 @@ class Initializer:
 
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
-    ) -> tuple[dict[str, Ragged], Any]:
+    ) -> tuple[dict[str, Ragged], Settings]:
         """Collect first messages and maps by the model's names for their topics, and the parameters."""
         model, control = self.stage.model, self.found.control
         given = {}
@@ -277,7 +276,7 @@ class Initializer:
 
     def _checked_prior(
         self,
-        check_prior: Callable[[Mapping[str, Stream], Any], list[str]],
+        check_prior: Callable[[Mapping[str, Stream], Settings], list[str]],
         first: Mapping[str, Ragged],
         static: Mapping[str, Ragged],
         origins: Floats | None,
@@ -351,7 +350,7 @@ class Initializer:
         assert model.start.align is not None
         parameters = self._parameters()
         state, control = (0.0,) * model.size, np.zeros(model.controls)
-        path: list[Any] = []
+        path: list[Numbers] = []
         places: list[Floats] = []
         spreads: list[Floats] = []
         begin, end = events.offsets[run : run + 2]
@@ -374,14 +373,13 @@ class Initializer:
                 path.append(state)
                 places.append(data[:size])
                 spreads.append(lower + np.tril(lower, -1).T)
-                solved = model.start.align(
-                    *map(np.array, (path, places, spreads)), (time_ns - first_ns) * 1e-9, parameters
-                )
+                fixes = np.array(path), np.array(places), np.array(spreads)
+                solved = model.start.align(*fixes, (time_ns - first_ns) * 1e-9, parameters)
                 if solved is not None:
                     return time_ns + 1, *solved
         return None
 
-    def _parameters(self) -> Any:
+    def _parameters(self) -> Settings:
         """Return the parameters; of those that topics have, these are the first topic's of each kind."""
         model = self.stage.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
@@ -400,7 +398,7 @@ class Initializer:
     def _origin_stream(self, fixes: Ragged) -> Ragged:
         """Make the stream of origins, as fixes on a topic of their own."""
         stream = fixes.stream
-        columns: dict[str, Any] = {
+        columns: dict[str, Columns] = {
             name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
         }
         topic = f"/estimates/{self.name}/origin"

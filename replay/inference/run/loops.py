@@ -4,13 +4,61 @@ What events are differs: messages, scans of detections, activities of nodes. All
 (runs + 1,) and `time_ns` (n,), and stand in the inputs of a recursion as `events`.
 """
 
-from typing import Any
+from typing import Protocol
 
-from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.arrays import AnyArgument
 from fuselog.replay.engine.streams.results import ALL_WELL
 
 
-def over_events(process: Function, record: Function, *, fails: bool = True) -> Function:
+class OnEvent(Protocol):
+    """Does something at an event of a run, see `over_events`; returns ALL_WELL or what failed.
+
+    Inputs, state, results and memory are those of the recursion.
+    """
+
+    def __call__(
+        self,
+        run: int,
+        event: int,
+        inputs: AnyArgument,
+        state: AnyArgument,
+        results: AnyArgument,
+        memory: AnyArgument,
+        /,
+    ) -> int: ...
+
+
+class OnStamp(Protocol):
+    """Moves the state of a run through all events of a stamp; returns whether the run goes on."""
+
+    def __call__(
+        self,
+        run: int,
+        begin: int,
+        end: int,
+        inputs: AnyArgument,
+        state: AnyArgument,
+        results: AnyArgument,
+        memory: AnyArgument,
+        /,
+    ) -> bool: ...
+
+
+class Follow(Protocol):
+    """Moves the state of a run through all its events, and fills the results."""
+
+    def __call__(
+        self,
+        run: int,
+        inputs: AnyArgument,
+        state: AnyArgument,
+        results: AnyArgument,
+        memory: AnyArgument,
+        /,
+    ) -> None: ...
+
+
+def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Follow:
     """Make the loop over the events of one run, one after the other.
 
     Args:
@@ -24,7 +72,13 @@ def over_events(process: Function, record: Function, *, fails: bool = True) -> F
     its `state.failure` is not ALL_WELL, or its events end.
     """
 
-    def follow(run: int, inputs: Any, state: Any, results: Any, memory: Any) -> None:
+    def follow(
+        run: int,
+        inputs: AnyArgument,
+        state: AnyArgument,
+        results: AnyArgument,
+        memory: AnyArgument,
+    ) -> None:
         """Move the state, and fill the results, until the events end or the run fails."""
         for event in range(inputs.events.offsets[run], inputs.events.offsets[run + 1]):
             has_failed = state.failure[run] != ALL_WELL if fails else False
@@ -39,7 +93,7 @@ def over_events(process: Function, record: Function, *, fails: bool = True) -> F
     return follow
 
 
-def over_stamps(process: Function) -> Function:
+def over_stamps(process: OnStamp) -> Follow:
     """Make the loop over the events of one run, all of one stamp together.
 
     Args:
@@ -49,7 +103,13 @@ def over_stamps(process: Function) -> Function:
     Returns `follow(run, inputs, state, results, memory)`, for `compile_over_runs`.
     """
 
-    def follow(run: int, inputs: Any, state: Any, results: Any, memory: Any) -> None:
+    def follow(
+        run: int,
+        inputs: AnyArgument,
+        state: AnyArgument,
+        results: AnyArgument,
+        memory: AnyArgument,
+    ) -> None:
         """Move the state, and fill the results, until the events end or the run does."""
         begin, last, time_ns = (
             inputs.events.offsets[run],

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fuselog.recorders.log import make_stream, schemas
-from fuselog.replay.engine.arrays import Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Columns, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of
 from fuselog.replay.inference.kalman.methods import Method
-from fuselog.replay.inference.kalman.steps import FAILURES, Steps
+from fuselog.replay.inference.kalman.steps import FAILURES, CoreMemory, EstimateRun, Steps
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import number_fields
@@ -35,11 +35,12 @@ from fuselog.replay.inference.run.history import (
     no_history,
     structure_of,
 )
-from fuselog.replay.inference.run.loops import over_events
+from fuselog.replay.inference.run.loops import Follow, over_events
 from fuselog.replay.inference.run.recursion import (
     CONTROL,
     FilterEvents,
     Innovations,
+    ProcessEvent,
     RecursionState,
     RunInputs,
     RunResults,
@@ -73,7 +74,7 @@ class LateState(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Function, Steps]:
+def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverRuns, Steps]:
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
     loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
@@ -81,7 +82,9 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Funct
     return compile_over_runs(loop, allocates=False, title=title), steps
 
 
-def reprocessing(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
+def reprocessing(
+    model: Model, process: ProcessEvent, estimate: EstimateRun, structure: Structure
+) -> Follow:
     """Make the loop over the events of one run in the order of arrival; see `recursion.recursion`.
 
     `structure` is that of `KeptMessages`.
@@ -97,7 +100,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             for k in range(history.counts[run]):
                 copy(kept, base + history.first[run] + k, kept, base + k)
             history.first[run] = 0
-        row = base + history.first[run] + history.counts[run]
+        row: int = base + history.first[run] + history.counts[run]
         time_ns, position = events.time_ns[event], events.arrival[event, 1]
         while kept.time_ns[row - 1] > time_ns or (
             kept.time_ns[row - 1] == time_ns and kept.position[row - 1] > position
@@ -110,7 +113,9 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         history.counts[run] += 1
         return row
 
-    def process_again(run: int, row: int, inputs: RunInputs, state: LateState, memory: Any) -> int:
+    def process_again(
+        run: int, row: int, inputs: RunInputs, state: LateState, memory: CoreMemory
+    ) -> int:
         """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
         events, carried, kept, at = inputs.events, state.carried, state.history.kept, state.row
         stored = FilterEvents(
@@ -154,7 +159,12 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         return row
 
     def reprocess(
-        run: int, event: int, inputs: RunInputs, state: LateState, results: RunResults, memory: Any
+        run: int,
+        event: int,
+        inputs: RunInputs,
+        state: LateState,
+        results: RunResults,
+        memory: CoreMemory,
     ) -> int:
         """Put an event where it belongs, and use it and all behind it again."""
         history, kept = state.history, state.history.kept
@@ -176,7 +186,12 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         return failure
 
     def record(
-        run: int, event: int, inputs: RunInputs, state: LateState, results: RunResults, memory: Any
+        run: int,
+        event: int,
+        inputs: RunInputs,
+        state: LateState,
+        results: RunResults,
+        memory: CoreMemory,
     ) -> int:
         """Fill in the newest estimate where one is wanted."""
         if not inputs.events.wants_estimate[event]:
@@ -195,10 +210,16 @@ def capacity_of(history: History) -> int:
 
 def last_row(run: int, history: History) -> int:
     """Find the newest kept message of a run."""
-    return run * capacity_of(history) + history.first[run] + history.counts[run] - 1
+    row: int = run * capacity_of(history) + history.first[run] + history.counts[run] - 1
+    return row
 
 
 # As an estimator
+
+
+# An `filtering.Filter` and its state, which stand above this module.
+AnyFilter = Any  # type: ignore[explicit-any]
+AnyFilterState = Any  # type: ignore[explicit-any]
 
 
 @dataclass(frozen=True)
@@ -208,15 +229,15 @@ class OutOfSequenceFilter:
     `inner` is an `filtering.Filter`, and the states are of its type.
     """
 
-    inner: Any
+    inner: AnyFilter
     window_ns: int
 
-    def start(self, static: Mapping[str, Ragged]) -> Any:
+    def start(self, static: Mapping[str, Ragged]) -> AnyFilterState:
         """Make the state at every run's prior."""
         state = self.inner.start(static)
         return state._replace(kept=no_history(self.inner.stage, state.carried))
 
-    def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
+    def run(self, state: AnyFilterState, block: Block) -> tuple[AnyFilterState, list[Ragged]]:
         """Filter a block, its messages in the order of arrival."""
         inner, sensors = self.inner, self.inner.stage.sensors
         events, without_covariance = filter_events(
@@ -253,7 +274,7 @@ class OutOfSequenceFilter:
         made += [rewound(inner.name, events, repeated), *skipped]
         return state._replace(carried=carried, kept=history), made
 
-    def finish(self, state: Any) -> list[Ragged]:
+    def finish(self, state: AnyFilterState) -> list[Ragged]:
         """Put out the innovations that might still have changed."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
@@ -261,7 +282,7 @@ class OutOfSequenceFilter:
         if not self.inner.stage.sensors:
             return []
         kept = history.kept
-        columns: Any = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
+        columns: Columns = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
         innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
         return [self.inner.innovations(innovations, offsets)]
 

@@ -1,17 +1,16 @@
 """Says what an estimator of a model reads: which numbers of which topics, which parameters for what."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from fuselog.recorders.log import Stream
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Settings
 from fuselog.replay.engine.replaying.estimator import Reading
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
 from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.functions import ModelFunction, OfParameters
 from fuselog.replay.inference.model.model import Control, Sensor
 from fuselog.replay.inference.model.parameters import number_fields, settings_type
 from fuselog.replay.inference.model.settings import TracedParameters, reading_settings
@@ -88,7 +87,7 @@ def _noises(stage: Stage, found: Found) -> dict[str, str]:
     model = stage.model
     names = number_fields(model.parameters)
     state = trial_state(model.kinds)
-    of_motion: list[Callable[[Any], Any]] = []
+    of_motion: list[OfParameters] = []
     for motion in stage.modes or (stage.motion,):
         given = (noise for noise in (motion.noise, motion.gap_noise) if noise is not None)
         of_motion += [partial(noise, state, 1.0) for noise in given]
@@ -99,7 +98,7 @@ def _noises(stage: Stage, found: Found) -> dict[str, str]:
     return found_noises | {name: "" for each in of_motion for name in _squared(each, names)}
 
 
-def _squared(variances: Callable[[Any], Any], names: tuple[str, ...]) -> list[str]:
+def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
     """List the parameters by which one of the variances grows as by a standard deviation."""
     traced, ones = TracedParameters(dict.fromkeys(names)), dict.fromkeys(names, 1.0)
     kind = settings_type(names)
@@ -140,7 +139,7 @@ def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
     state, control = trial_state(model.kinds), (0.0,) * model.controls
     readers: list[tuple[str, set[str]]] = []
 
-    def note(topic: str, function: Function, *arguments: Any) -> None:
+    def note(topic: str, function: ModelFunction, *arguments: AnyArgument) -> None:
         traced = TracedParameters(dict.fromkeys(names))
         with np.errstate(all="ignore"):
             function(*arguments, traced)
@@ -165,17 +164,17 @@ def _own_errors(
     state = trial_state(model.kinds)
     biases: dict[tuple[str, int], str] = {}
     factors: dict[tuple[str, int], str] = {}
-    control = 1.7 + np.arange(model.controls)
+    control: Floats = 1.7 + np.arange(model.controls, dtype=np.float64)
     entering = ((0.0,) * stage.motion.noises,) if stage.motion.noises else ()
 
-    def moved(driven: Any, parameters: Any) -> Floats:
+    def moved(driven: Floats, parameters: Settings) -> Floats:
         return np.array(stage.motion.move(state, tuple(driven), *entering, 0.5, parameters), float)
 
     with np.errstate(all="ignore"):
         for name in model.augmentable:
             more = ones._replace(**{name: 1.0 + STEP})
             for place, of_topic in enumerate(_driving(stage, found)):
-                unit = STEP * np.eye(model.controls)[place]
+                unit: Floats = STEP * np.eye(model.controls)[place]
                 by_parameter = moved(control, more)
                 if np.array_equal(by_parameter, moved(control, ones)):
                     continue

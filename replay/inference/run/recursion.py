@@ -6,16 +6,17 @@ belief is no Gaussian any more.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from itertools import accumulate, pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
 from fuselog.recorders.log.streams import computed_stream
+from fuselog.replay.engine.arrays import AnyArgument, Columns, Floats, Integers, RowSlice
 from fuselog.replay.engine.streams.blocks import Ragged, filled_rows
 from fuselog.replay.engine.streams.results import ALL_WELL, named, rows_of
 from fuselog.replay.inference.kalman.steps import (
@@ -24,6 +25,10 @@ from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     UNKNOWN,
+    Belief,
+    CoreMemory,
+    EstimateRun,
+    EstimatesToFill,
     InnovationRecord,
     Interval,
     Measurement,
@@ -31,12 +36,9 @@ from fuselog.replay.inference.kalman.steps import (
 )
 from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.model import Model
+from fuselog.replay.inference.model.settings import ReadSettings
 from fuselog.replay.inference.model.stage import Stage
-from fuselog.replay.inference.run.loops import over_events
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Function = Callable[..., Any]
+from fuselog.replay.inference.run.loops import Follow, over_events
 
 CONTROL = -1  # an event's source; sensors count from zero, and NOTHING is only a time
 NOTHING = -2
@@ -77,7 +79,7 @@ class RecursionState(NamedTuple):
         failure: (runs,), ALL_WELL or an index of `steps.FAILURES`.
     """
 
-    belief: Any
+    belief: Belief
     control: Floats
     time_ns: Integers
     accepted_ns: Integers
@@ -121,7 +123,7 @@ class RunInputs(NamedTuple):
 class RunResults(NamedTuple):
     """Holds what a recursion fills in: the method's own estimates, and innovations."""
 
-    estimates: Any
+    estimates: EstimatesToFill
     innovations: Innovations
 
 
@@ -138,7 +140,7 @@ def recorded_innovations(
         offsets: (runs + 1,), where those of each run begin.
     """
     _, time_ns, target_id, difference, covariance, numbers = innovations
-    columns: dict[str, NDArray] = {
+    columns: dict[str, Columns] = {
         "sensor_time_ns": time_ns,
         "target_id": target_id,
         "accepted": numbers[:, 2].astype(np.uint32),
@@ -152,7 +154,7 @@ def recorded_innovations(
     return Ragged(stream, offsets)
 
 
-ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
+ResultsType = TypeVar("ResultsType", bound=tuple[AnyArgument, ...])
 
 
 def no_results(
@@ -185,7 +187,7 @@ def no_results(
 @lru_cache(maxsize=64)
 def _places(
     estimates: int, innovations: int, n: int, t: int, m: int
-) -> tuple[tuple[slice, tuple[int, ...]], ...]:
+) -> tuple[tuple[RowSlice, tuple[int, ...]], ...]:
     """Return where the columns of so many estimates and innovations lie in memory, and their shapes."""
     shapes = (
         *((estimates, *shape) for shape in ((), (n,), (t, t))),
@@ -206,11 +208,41 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     rows, kept = filled_rows(offsets, end)
     if isinstance(rows, slice):
         return results, kept
-    made: Any = type(results)
+    made: Columns = type(results)
     return made(kept[1:], *(column[rows] for column in columns)), kept
 
 
-def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+class ProcessEvent(Protocol):
+    """Predicts to an event of a run and updates by it, see `processing`; an `OnEvent` of filters."""
+
+    def __call__(
+        self,
+        run: int,
+        event: int,
+        inputs: RunInputs,
+        carried: RecursionState,
+        results: RunResults,
+        memory: CoreMemory,
+        /,
+    ) -> int: ...
+
+
+class WriteEstimate(Protocol):
+    """Fills in the next estimate of a run from a row of the belief, see `writing_estimates`."""
+
+    def __call__(
+        self,
+        run: int,
+        row: int,
+        time_ns: int,
+        belief: Belief,
+        estimates: EstimatesToFill,
+        memory: CoreMemory,
+        /,
+    ) -> int: ...
+
+
+def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> ProcessEvent:
     """Make the function that processes one event of a run; see `recursion`.
 
     Args:
@@ -235,7 +267,12 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 carried.control[run, k] = data[first + k]
 
     def advance(
-        run: int, event: int, duration_s: float, inputs: RunInputs, carried: RecursionState, memory: Any
+        run: int,
+        event: int,
+        duration_s: float,
+        inputs: RunInputs,
+        carried: RecursionState,
+        memory: CoreMemory,
     ) -> bool:
         """Predict to an event."""
         control, data = carried.control[run], inputs.events.data[event]
@@ -252,7 +289,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         inputs: RunInputs,
         carried: RecursionState,
         results: RunResults,
-        memory: Any,
+        memory: CoreMemory,
     ) -> int:
         """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did.
 
@@ -298,7 +335,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     return process
 
 
-def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
     """Make the loop over events, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
@@ -318,7 +355,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         inputs: RunInputs,
         carried: RecursionState,
         results: RunResults,
-        memory: Any,
+        memory: CoreMemory,
     ) -> int:
         """Fill in the estimate where one is wanted, from the state's own time on."""
         time_ns = inputs.events.time_ns[event]
@@ -329,7 +366,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     return over_events(processing(stage, steps, settings_of), record)
 
 
-def writing_estimates(estimate: Function) -> Function:
+def writing_estimates(estimate: EstimateRun) -> WriteEstimate:
     """Make `write(run, row, time_ns, belief, estimates, memory)`: it fills in a run's next estimate.
 
     That is of a row of the belief; an estimate that is none counts as not written. Returns what is wrong
@@ -339,7 +376,14 @@ def writing_estimates(estimate: Function) -> Function:
         estimate: the method's, see `Steps.estimate`.
     """
 
-    def write(run: int, row: int, time_ns: int, belief: Any, estimates: Any, memory: Any) -> int:
+    def write(
+        run: int,
+        row: int,
+        time_ns: int,
+        belief: Belief,
+        estimates: EstimatesToFill,
+        memory: CoreMemory,
+    ) -> int:
         result = estimates.end[run]
         estimate(row, belief, estimates, result, memory)
         failure = fault_of(estimates.mean[result], estimates.covariance[result])

@@ -1,19 +1,18 @@
 """Draws the samples of randomised filters: a generator for every run, a set for every event."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
-from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.arrays import Integers, RowSlice
 from fuselog.replay.inference.run.recursion import (
     FilterEvents,
 )
 from fuselog.replay.inference.sampling.samplers import Sampler
-from fuselog.replay.inference.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
+from fuselog.replay.inference.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
 
 def seeded_generators(
-    generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int
-) -> tuple[Any, ...]:
+    generators: tuple[Generators, ...], events: FilterEvents, count: int, seed: int
+) -> tuple[Generators, ...]:
     """Seed generators of every sampled function and run, by the seed and the run's first data.
 
     Args:
@@ -31,8 +30,8 @@ def seeded_generators(
 
 
 def sample_sets(
-    samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
-) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
+    samplers: Sequence[Sampler], generators: tuple[Generators, ...], offsets: Integers
+) -> Iterator[tuple[RowSlice, tuple[SampleSets, ...]]]:
     """Iterate over runs and their samples; the largest random function says how many runs at once.
 
     Args:

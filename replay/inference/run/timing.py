@@ -2,11 +2,10 @@
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.arrays import Booleans, Columns, Floats, Integers
 from fuselog.replay.engine.streams.blocks import last_of_equals, ragged_rows, run_of_rows
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.stage import Stage
@@ -73,7 +72,7 @@ def compensate_delays(
     waiting = select_events(events, ~settled)
     measured = select_events(events._replace(time_ns=time_ns), settled)
     order = np.lexsort((measured.time_ns, run[settled]))
-    columns: Any = (column[order] for column in measured[1:])
+    columns: Columns = (column[order] for column in measured[1:])
     measured = FilterEvents(measured.offsets, *columns)
     measured = measured._replace(wants_estimate=last_of_stamps(measured))
     return measured._replace(wants_estimate=where_wanted(stage, measured)), waiting
@@ -106,7 +105,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
-    columns: Any = (
+    columns: Columns = (
         np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
     )
     return FilterEvents(first.offsets + second.offsets, *columns)
@@ -127,7 +126,7 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
         events: n of them, of all runs.
         chosen: (n,).
     """
-    columns: Any = (column[chosen] for column in events[1:])
+    columns: Columns = (column[chosen] for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
 
 

@@ -87,7 +87,8 @@ def read_set(source: Path | Traversable, name: SetName) -> Array | None:
     if archive is None:
         return None
     with np.load(io.BytesIO(archive)) as sets:
-        return sets.get(str(name))
+        found: Array | None = sets.get(str(name))
+        return found
 
 
 def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:

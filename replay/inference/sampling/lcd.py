@@ -72,7 +72,8 @@ def lcd_samples(
         begin = generator.standard_normal(free * dimension)
         with threadpool_limits(1):  # products this small only keep a second core spinning
             optima.append(minimize(objective, begin, jac=True, method="L-BFGS-B", options=OPTIMISER))
-    return whole(min(optima, key=lambda optimum: optimum.fun).x)
+    found: Array = min(optima, key=lambda optimum: optimum.fun).x
+    return whole(found)
 
 
 def check_count(dimension: int, count: int, symmetric: bool) -> None:
@@ -98,4 +99,5 @@ def moment_corrected(points: Array) -> Array:
     variances, axes = np.linalg.eigh(centred.T @ centred / len(points))
     if not variances[0] > 1e-12 * variances[-1]:
         raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions; give more")
-    return centred @ (axes / np.sqrt(variances)) @ axes.T
+    corrected: Array = centred @ (axes / np.sqrt(variances)) @ axes.T
+    return corrected

@@ -13,11 +13,11 @@ Bell, SIAM J. Optim. 4(3), 1994.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise
 from fuselog.replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
@@ -25,7 +25,9 @@ from fuselog.replay.inference.kalman.steps import (
     InnovationRecord,
     Interval,
     Measurement,
+    Predict,
     Steps,
+    Update,
     Workspace,
     gaussian_filter,
     workspace,
@@ -137,7 +139,7 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
             scalar_update(mean, covariance, column, variance, -mean[component])
 
 
-def affine_motion(stage: Stage) -> Function:
+def affine_motion(stage: Stage) -> Predict:
     """Make the prediction of the tangent vector at one stamp to that at the next."""
     model, motion = stage.model, stage.motion
     linearise = motion_derivative(model, motion, by_state=True)
@@ -174,7 +176,19 @@ def affine_motion(stage: Stage) -> Function:
     return predict
 
 
-def carrying(kinds: tuple[str, ...]) -> Function:
+class Carry(Protocol):
+    """Multiplies rows (t, m) by E(-offset), by way of `step`; offset and step are (t,)."""
+
+    def __call__(self, offset: Floats, rows: Floats, step: Floats, /) -> None: ...
+
+
+class Reach(Protocol):
+    """Finds how far a node's state is from its origin (n,); returns False if that is unknown."""
+
+    def __call__(self, trajectory: "Trajectory", node: int, origin: Floats, /) -> bool: ...
+
+
+def carrying(kinds: tuple[str, ...]) -> Carry:
     """Make `carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
 
     Takes tangent vectors at one state to those at the state that lies `offset` from it.
@@ -190,7 +204,7 @@ def carrying(kinds: tuple[str, ...]) -> Function:
     return carry
 
 
-def reaching(kinds: tuple[str, ...]) -> Function:
+def reaching(kinds: tuple[str, ...]) -> Reach:
     """Make `reach(trajectory, node, origin)`: how far a state is from its origin; False if unknown.
 
     Fills `offset`, and adds its square in units of the noise to the costs. Where noise has no part the
@@ -287,7 +301,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
     return size
 
 
-def affine_sensor(stage: Stage, number: int) -> Function:
+def affine_sensor(stage: Stage, number: int) -> Update:
     """Make the update of the tangent vector by sensor `number`, one component after the other."""
     model, sensor = stage.model, stage.sensors[number]
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference

@@ -14,13 +14,21 @@ Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+from fuselog.replay.inference.kalman.steps import (
+    CoreMemory,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Samples,
+    Steps,
+    UpdateRun,
+)
 from fuselog.replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
     fill_identity,
@@ -82,7 +90,7 @@ class Piece(NamedTuple):
 class ForwardMemory(NamedTuple):
     """Holds what the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
 
-    filter: Any
+    filter: CoreMemory
     rest: Floats
     turned: Floats
     factor: Floats
@@ -126,14 +134,14 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
             nodes.gain[row], nodes.rest[row] = belief.gain[run], belief.rest[run]
         belief.predicted[run], belief.predictions[run] = mean, 0
 
-    def memory(sets: tuple[Any, ...]) -> ForwardMemory:
+    def memory(sets: tuple[Samples, ...]) -> ForwardMemory:
         return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
 
     updates = tuple(_with_memory(update) for update in steps.updates)
     return steps._replace(memory=memory, predict=predict, updates=updates, estimate=estimate)
 
 
-def _with_memory(update: Function) -> Function:
+def _with_memory(update: UpdateRun) -> UpdateRun:
     def update_filter(
         run: int,
         belief: Chain,
@@ -209,14 +217,22 @@ class BackMemory(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> Function:
+def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> OverRuns:
     """Compile the same over all runs; see `backward_pass`."""
     return compile_over_runs(
         backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
     )
 
 
-def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
+class GoBack(Protocol):
+    """Smooths the nodes of one run's piece; `later` then holds the first of them."""
+
+    def __call__(
+        self, run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory, /
+    ) -> None: ...
+
+
+def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
     """Make the loop over the nodes of one run, from its last to its first.
 
     Args:

@@ -9,30 +9,31 @@ ensemble.
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import PositiveFloat
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, make_stream, schemas
-from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, RowSlice
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.results import named
 from fuselog.replay.engine.vectors.components import match_components
 from fuselog.replay.engine.vectors.tangent import truth_at
 from fuselog.replay.inference.kalman.methods import FILTERS, Method, MethodParameters
+from fuselog.replay.inference.kalman.steps import CoreMemory, EstimatesToFill, Samples
 from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
 from fuselog.replay.inference.run.filtering import Filter, FilterState
 from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
 from fuselog.replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
 
 
-class BoundParameters(MethodParameters):
+class BoundParameters(MethodParameters):  # type: ignore[explicit-any]
     """States whose bound it is, and how truth is read.
 
     Attributes:
@@ -59,7 +60,7 @@ def back_memory(t: int) -> BackMemory:
 
 
 @lru_cache(maxsize=1)
-def smooth_over_runs() -> Function:
+def smooth_over_runs() -> OverRuns:
     """Compile `smooth` over all runs."""
     return compile_over_runs(smooth, allocates=False, title="the bound of smoothers")
 
@@ -157,20 +158,24 @@ class BoundFilter(Filter):
 
     def filtered(
         self, state: FilterState, events: FilterEvents
-    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
+    ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
         """Go through events, with the truths at all of them."""
         truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
         after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
         return after._replace(generators=()), nodes, failures
 
-    def parts(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:  # noqa: ARG002
+    def parts(
+        self,
+        generators: tuple[Samples, ...],
+        events: FilterEvents,  # noqa: ARG002
+    ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
         """Return all runs, and what makes a core's memory with the truths."""
         yield None, partial(self.steps.memory, generators)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Any, Innovations]:
+    ) -> tuple[EstimatesToFill, Innovations]:
         """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))

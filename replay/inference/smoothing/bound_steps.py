@@ -1,10 +1,10 @@
 """Predicts and updates the covariance of a filter that linearises at the true states."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.inference.kalman.predict import motion_derivative, motion_noise
 from fuselog.replay.inference.kalman.steps import (
     NO_TRUTH,
@@ -13,7 +13,9 @@ from fuselog.replay.inference.kalman.steps import (
     InnovationRecord,
     Interval,
     Measurement,
+    Samples,
     Steps,
+    UpdateRun,
     Workspace,
     workspace,
 )
@@ -89,7 +91,7 @@ def bound_steps(stage: Stage) -> Steps:
         mean[:] = memory.truth[event]
         return True
 
-    def estimate(run: int, trajectory: TrueTrajectory, nodes: Nodes, row: int, _: Any) -> None:
+    def estimate(run: int, trajectory: TrueTrajectory, nodes: Nodes, row: int, _: BoundMemory) -> None:
         nodes.mean[row] = trajectory.mean[run]
         nodes.covariance[row], nodes.noise[row] = trajectory.covariance[run], trajectory.noise[run]
         nodes.transition[row] = trajectory.transition[run]
@@ -97,7 +99,7 @@ def bound_steps(stage: Stage) -> Steps:
         fill_identity(trajectory.transition[run])
         trajectory.noise[run], trajectory.information[run] = 0.0, 0.0
 
-    def memory(sets: tuple[Any, ...]) -> BoundMemory:
+    def memory(sets: tuple[Samples, ...]) -> BoundMemory:
         sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
         return BoundMemory(sets[0], tuple(np.empty((m, m)) for m in sizes), workspace(stage))
 
@@ -105,7 +107,7 @@ def bound_steps(stage: Stage) -> Steps:
     return Steps(memory, predict, updates, estimate)
 
 
-def bound_update(stage: Stage, number: int) -> Function:
+def bound_update(stage: Stage, number: int) -> UpdateRun:
     """Make the update by sensor `number` as if it had measured what is predicted: nothing moves."""
     innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
     m = len(stage.sensors[number].measured)

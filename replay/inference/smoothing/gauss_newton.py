@@ -13,17 +13,18 @@ Bell, SIAM J. Optim. 4(3), 1994; Sarkka and Svensson, ICASSP 2020.
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import Gaussian, Steps
 from fuselog.replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
 from fuselog.replay.inference.model.parameters import number_fields
-from fuselog.replay.inference.model.settings import reading_settings
+from fuselog.replay.inference.model.settings import ReadSettings, reading_settings
 from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.recursion import (
     Innovations,
@@ -34,6 +35,7 @@ from fuselog.replay.inference.run.recursion import (
 )
 from fuselog.replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
 from fuselog.replay.inference.smoothing.backward_pass import (
+    BackMemory,
     ForwardMemory,
     Later,
     Piece,
@@ -89,7 +91,7 @@ class Ended(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def searching(stage: Stage) -> tuple[Function, Steps]:
+def searching(stage: Stage) -> tuple[OverRuns, Steps]:
     """Return the compiled search, and the steps that make its memory."""
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
@@ -97,7 +99,7 @@ def searching(stage: Stage) -> tuple[Function, Steps]:
     return compile_over_runs(search(stage, steps, settings_of), allocates=False, title=title), steps
 
 
-def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
     """Make the search of one run's trajectory, for `compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
     follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
@@ -130,7 +132,8 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         nodes.end[run] = begin
         follow(run, inputs, carried, RunResults(nodes, state.innovations), memory)
         whole = carried.failure[run] == ALL_WELL and nodes.end[run] == offsets[run + 1]
-        return whole and np.isfinite(trajectory.cost[0] + trajectory.held[0])
+        finite: bool = np.isfinite(trajectory.cost[0] + trajectory.held[0])
+        return whole and finite
 
     def move(
         trajectory: Trajectory, kept: Floats, steps: Floats, begin: int, end: int
@@ -156,7 +159,12 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         return largest, squares, settled
 
     def search_run(
-        run: int, inputs: RunInputs, plan: Plan, state: SearchState, ended: Ended, scratch: Any
+        run: int,
+        inputs: RunInputs,
+        plan: Plan,
+        state: SearchState,
+        ended: Ended,
+        scratch: tuple[ForwardMemory, BackMemory],
     ) -> None:
         """Move what is kept to the best trajectory of a run; the covariances go with it."""
         memory, back = scratch

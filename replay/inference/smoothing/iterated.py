@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, reduce
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -18,7 +18,7 @@ from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged, copied, ragged_rows, run_of_rows
 from fuselog.replay.inference.kalman.methods import FILTERS, Method
-from fuselog.replay.inference.kalman.steps import Gaussian, Steps
+from fuselog.replay.inference.kalman.steps import CoreMemory, Gaussian, Steps
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.events import data_columns
 from fuselog.replay.inference.run.filtering import FilterState
@@ -34,6 +34,7 @@ from fuselog.replay.inference.smoothing import smoothers
 from fuselog.replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
 from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
+    BackMemory,
     Nodes,
     Piece,
     Smoothed,
@@ -45,7 +46,7 @@ from fuselog.replay.inference.smoothing.gauss_newton import Ended, Plan, SearchS
 from fuselog.replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
-class IteratedParameters(SmootherParameters):
+class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
     """Defines options of smoother:iterated: where the search starts, its damping, the loss of outliers.
 
     Attributes:
@@ -147,7 +148,8 @@ class IteratedSmoother(Smoother):
                 f"estimator {self.name}: start = motion: the prior cannot be moved along all of a run; "
                 "choose another start"
             )
-        return moved.mean
+        mean: Floats = moved.mean
+        return mean
 
     def _first(self, state: FilterState) -> list[FilterEvents]:
         """Return the prior's time as an event; an interpolated control has made one already."""
@@ -203,7 +205,7 @@ class IteratedSmoother(Smoother):
         loss = np.array([LOSSES.index(asked.loss), asked.loss_scale])
         trajectory, noises = kept.mean.copy(), no_factors(count, t)
 
-        def scratch() -> Any:
+        def scratch() -> tuple[CoreMemory, BackMemory]:
             own = Trajectory(
                 trajectory,
                 noises,

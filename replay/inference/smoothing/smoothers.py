@@ -12,12 +12,12 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.arrays import Integers
+from fuselog.replay.engine.arrays import Columns, Integers
 from fuselog.replay.engine.streams.blocks import Ragged, by_runs, copied, run_of_rows
 from fuselog.replay.inference.kalman.methods import (
     FILTERS,
@@ -51,7 +51,7 @@ UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file
 
 
-class SmootherParameters(UnscentedParameters, RegressionParameters):
+class SmootherParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
     """States what goes forward, and how far estimates look ahead.
 
     Attributes:
@@ -144,7 +144,7 @@ class Smoother(Filter):
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Any, Innovations]:
+    ) -> tuple[Nodes, Innovations]:
         """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
@@ -237,7 +237,7 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
     if len(pieces) == 1:
         return pieces[0]
     order, offsets = by_runs([piece.offsets for piece in pieces])
-    columns: Any = zip(*(piece.nodes[1:] for piece in pieces), strict=True)
+    columns: Columns = zip(*(piece.nodes[1:] for piece in pieces), strict=True)
     return Piece(Nodes(offsets[1:], *(np.concatenate(parts)[order] for parts in columns)), offsets)
 
 
@@ -245,7 +245,7 @@ def _rows_from(piece: Piece, begin: Integers) -> Piece:
     """Return the nodes of every run from row begin[run] on."""
     counts = piece.offsets[1:] - begin
     rows = np.arange(piece.offsets[-1]) >= np.repeat(begin, np.diff(piece.offsets))
-    columns: Any = (column[rows] for column in piece.nodes[1:])
+    columns: Columns = (column[rows] for column in piece.nodes[1:])
     offsets = np.append(0, np.cumsum(counts))
     return Piece(Nodes(offsets[1:], *columns), offsets)
 

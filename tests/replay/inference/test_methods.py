@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.replay.engine.vectors.tangent import rotation_vector
+from fuselog.replay.inference.kalman.reference import predict, update
 from fuselog.replay.inference.kalman.regression import regression, sample_memory
 from fuselog.replay.inference.linear_algebra.manifold import by_right_jacobian
 from fuselog.replay.inference.sampling.sets import SampleSets
@@ -65,6 +66,52 @@ def test_the_problem_is_the_sheets() -> None:
     end = [1.56358747379, -1.89527677641, -11.6611389171, 0.835043675821, -0.731742374361]
     assert_allclose(truth[-1][1], end, rtol=1e-11)
     assert_allclose(sum(np.nansum(value) for *_, value in told), 1500.62680183, rtol=1e-11)
+
+
+def test_the_compiled_filter_is_the_reference_algebra() -> None:
+    """Every estimate of the compiled EKF, with Jacobians by differences in place of traced ones."""
+    told, _ = vehicle_a.simulate(7, missing=False)
+    parameters = vehicle_a.VehicleParameters()
+    mean, covariance, now, wanted = vehicle_a.MEAN, vehicle_a.COVARIANCE, 0.0, {}
+    for time_s, sensor, beacon, value in told:
+        duration_s = time_s - now
+
+        def f(state: Any, duration_s: float = duration_s) -> Any:
+            return np.array(vehicle_a.move(tuple(state), (), duration_s, parameters))
+
+        if duration_s > 0.0:
+            noise = np.diag(vehicle_a.NOISE * duration_s)
+            mean, covariance = predict(mean, covariance, f, slopes(f), noise)
+        look, noise_of = {
+            "rb": (vehicle_a.see, vehicle_a.see_noise),
+            "speed": (vehicle_a.read_speed, vehicle_a.speed_noise),
+        }[sensor]
+
+        def h(state: Any, look: Any = look, beacon: int = beacon) -> Any:
+            return np.array(look(tuple(state), BEACONS[beacon], parameters))
+
+        if sensor == "rb":  # a whole turn more is the same bearing
+            value[1] += 2 * np.pi * np.round((h(mean)[1] - value[1]) / (2 * np.pi))
+        mean, covariance = update(mean, covariance, value, h, slopes(h), np.diag(noise_of(parameters)))
+        now = time_s
+        wanted[vehicle_a.EPOCH_NS + round(time_s * 1e9)] = mean, covariance
+    found = outputs(VEHICLE_A, "ekf", [vehicle_a.source(told)])["state"]
+    assert len(found) == len(wanted) == 160
+    for stamp_ns, state, spread in zip(
+        found.stream.publish_time_ns, found["mean"], found["covariance"].reshape(-1, 5, 5), strict=True
+    ):
+        assert_state(state, wanted[stamp_ns][0], rtol=1e-7)
+        assert_allclose(spread, wanted[stamp_ns][1], atol=1e-8)
+
+
+def slopes(function: Any) -> Any:
+    """The Jacobian of a function by central differences."""
+
+    def jacobian(state: Any) -> Any:
+        steps = 1e-5 * np.eye(len(state))
+        return np.stack([(function(state + d) - function(state - d)) / 2e-5 for d in steps], axis=1)
+
+    return jacobian
 
 
 # Mean at 20 s, trace of the covariance, log-likelihood, sum of NIS.

@@ -5,13 +5,14 @@ NumPy's own structure of an array says where its numbers and its sizes are; its 
 
 import operator
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
 from fuselog.replay.engine.compiling.kernels.values import STORED, Array, Record, combined
+from fuselog.replay.engine.compiling.kinds import Value
 
 KNOWN = 64  # sizes up to this are part of a kernel
 
@@ -34,7 +35,7 @@ _LAYOUT = _PACKED | _ALIGNED
 _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
 
 
-def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> None:
+def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
     """Add what an argument is, for the kernel's key, and what it is at run time.
 
     So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
@@ -57,7 +58,7 @@ def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> N
         numbers.append(value)
 
 
-def with_types(value: Any, kinds: Iterator[Any]) -> Any:
+def with_types(value: Value, kinds: Iterator[Value]) -> Value:
     """Return an argument in full, as `value_of` takes it: from what it is and its part of the key."""
     kind = next(kinds)
     if isinstance(value, tuple):
@@ -76,7 +77,7 @@ def with_types(value: Any, kinds: Iterator[Any]) -> Any:
     raise BadInput(f"a kernel takes numbers, arrays and tuples of them, not a {kind.__name__}")
 
 
-_SCALARS: tuple[tuple[Any, str], ...] = (
+_SCALARS: tuple[tuple[Value, str], ...] = (
     ((bool, np.bool_), TRUTH),
     (np.unsignedinteger, WORD),
     ((int, np.integer), WHOLE),
@@ -84,7 +85,7 @@ _SCALARS: tuple[tuple[Any, str], ...] = (
 )
 
 
-def letters(kind: Any) -> str:
+def letters(kind: Value) -> str:
     """Describe how the numbers of an argument are packed into words."""
     if isinstance(kind, KnownArray):
         return "q"
@@ -93,7 +94,7 @@ def letters(kind: Any) -> str:
     return {REAL: "d", WORD: "Q", TRUTH: "?7x"}.get(kind, "q")
 
 
-def value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
+def value_of(kind: Value, emitter: Emitter, words: Iterator[int]) -> Value:
     """Return the value that a described argument is in the kernel: loaded from its words."""
     if isinstance(kind, KnownArray):
         return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
@@ -120,13 +121,13 @@ def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
     """Return an array of NumPy's: where its numbers are, and the sizes that are not known."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
-    shape: list[Any] = [
+    shape: list[Value] = [
         _loaded_from("i64", emitter, sizes, 8 * axis) if size is None else size
         for axis, size in enumerate(kind.shape)
     ]
-    strides: list[Any] = []
+    strides: list[Value] = []
     if kind.is_packed:
-        stride: Any = 1
+        stride: Value = 1
         for size in reversed(shape):
             strides.insert(0, stride)
             stride = combined(emitter, operator.mul, size, stride)

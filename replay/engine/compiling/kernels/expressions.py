@@ -5,7 +5,6 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterator
 from types import FunctionType
-from typing import Any
 
 import numpy as np
 
@@ -41,6 +40,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     part_of,
     store,
 )
+from fuselog.replay.engine.compiling.kinds import AnyArray, Value
 
 # Functions that make arrays, and whether these are zero.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
@@ -50,33 +50,33 @@ class Expressions(Scope, ABC):
     """Represents one function while its expressions are lowered."""
 
     @abstractmethod
-    def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
+    def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
         """Lower `yes if condition else no`."""
 
     # --- expressions ---
 
-    def value(self, node: ast.expr) -> Any:
+    def value(self, node: ast.expr) -> Value:
         """Return what an expression gives."""
         self.line = getattr(node, "lineno", self.line)
         return getattr(self, f"of_{type(node).__name__}", self.unknown)(node)
 
-    def unknown(self, node: ast.expr) -> Any:
+    def unknown(self, node: ast.expr) -> Value:
         """Say that there are no such expressions in kernels."""
         raise TypeError(f"a kernel has no {type(node).__name__}: {ast.unparse(node)}")
 
-    def of_Constant(self, node: ast.Constant) -> Any:  # noqa: N802
+    def of_Constant(self, node: ast.Constant) -> Value:  # noqa: N802
         """Return a number or a text."""
         return node.value
 
-    def of_Name(self, node: ast.Name) -> Any:  # noqa: N802
+    def of_Name(self, node: ast.Name) -> Value:  # noqa: N802
         """Return a variable, a parameter, or something from outside."""
         return self.lookup(node.id)
 
-    def of_Tuple(self, node: ast.Tuple) -> Any:  # noqa: N802
+    def of_Tuple(self, node: ast.Tuple) -> Value:  # noqa: N802
         """Return a tuple."""
         return tuple(self.listed(node.elts))
 
-    def listed(self, nodes: list[ast.expr]) -> Iterator[Any]:
+    def listed(self, nodes: list[ast.expr]) -> Iterator[Value]:
         """Yield entries or arguments, those of `*others` among them."""
         for node in nodes:
             if isinstance(node, ast.Starred):
@@ -84,14 +84,14 @@ class Expressions(Scope, ABC):
             else:
                 yield self.value(node)
 
-    def of_GeneratorExp(self, node: ast.GeneratorExp) -> Any:  # noqa: N802
+    def of_GeneratorExp(self, node: ast.GeneratorExp) -> Value:  # noqa: N802
         """Return values for every one of what is known, as a tuple."""
         before = dict(self.known)
         found = tuple(self._generated(node, list(node.generators)))
         self.known = before
         return found
 
-    def _generated(self, node: Any, generators: list[ast.comprehension]) -> Iterator[Any]:
+    def _generated(self, node: Value, generators: list[ast.comprehension]) -> Iterator[Value]:
         if not generators:
             yield self.value(node.elt)
             return
@@ -101,14 +101,14 @@ class Expressions(Scope, ABC):
             if all(self.truth(self.value(test)) for test in first.ifs):
                 yield from self._generated(node, others)
 
-    def _bind(self, target: ast.expr, value: Any) -> None:
+    def _bind(self, target: ast.expr, value: Value) -> None:
         if isinstance(target, ast.Name):
             self.known[target.id] = value
         elif isinstance(target, ast.Tuple):
             for each, part in zip(target.elts, entries(value) or (), strict=True):
                 self._bind(each, part)
 
-    def iterated(self, node: ast.expr) -> list[Any]:
+    def iterated(self, node: ast.expr) -> list[Value]:
         """Return the values that a loop goes over, where they are known."""
         found = self.value(node)
         parts = entries(found)
@@ -118,11 +118,11 @@ class Expressions(Scope, ABC):
             return [from_python(each) for each in found]
         raise TypeError("a loop goes over a range, or over a tuple")
 
-    def of_BinOp(self, node: ast.BinOp) -> Any:  # noqa: N802
+    def of_BinOp(self, node: ast.BinOp) -> Value:  # noqa: N802
         """Lower `a + b` and the like."""
         return self.operation(node.op, self.value(node.left), self.value(node.right))
 
-    def operation(self, node: ast.operator, left: Any, right: Any) -> Any:
+    def operation(self, node: ast.operator, left: Value, right: Value) -> Value:
         """Return the result of an operator."""
         operation = OPERATORS[type(node)]
         if is_known(left) and is_known(right):
@@ -136,7 +136,7 @@ class Expressions(Scope, ABC):
             return parts + others
         return binary(self.emitter, operation, self.scalar(left), self.scalar(right))
 
-    def scalar(self, value: Any) -> Any:
+    def scalar(self, value: Value) -> Value:
         """Return a number; raises TypeError where it is none."""
         if isinstance(value, Number) or is_static(value):
             return value
@@ -144,7 +144,7 @@ class Expressions(Scope, ABC):
             return load(self.emitter, value)
         raise TypeError(f"a number is needed, not a {type(value).__name__}")
 
-    def of_UnaryOp(self, node: ast.UnaryOp) -> Any:  # noqa: N802
+    def of_UnaryOp(self, node: ast.UnaryOp) -> Value:  # noqa: N802
         """Lower `-a` and `not a`."""
         value = self.value(node.operand)
         if isinstance(node.op, ast.Not):
@@ -154,7 +154,7 @@ class Expressions(Scope, ABC):
             return -value if is_static(value) else negative(self.emitter, self.scalar(value))
         return value
 
-    def truth(self, value: Any) -> Any:
+    def truth(self, value: Value) -> Value:
         """Tell whether something holds: known, or a number at run time."""
         if isinstance(value, Number):
             return self.emitter.truth(value)
@@ -162,7 +162,7 @@ class Expressions(Scope, ABC):
             raise TypeError("an array is neither true nor false")
         return bool(value)
 
-    def of_BoolOp(self, node: ast.BoolOp) -> Any:  # noqa: N802
+    def of_BoolOp(self, node: ast.BoolOp) -> Value:  # noqa: N802
         """Lower `a and b`: the second is looked at only where the first leaves it open."""
         is_and = isinstance(node.op, ast.And)
         first = self.truth(self.value(node.values[0]))
@@ -172,7 +172,7 @@ class Expressions(Scope, ABC):
         known = ast.Constant(not is_and)
         return self.chosen(first, rest, known) if is_and else self.chosen(first, known, rest)
 
-    def of_Compare(self, node: ast.Compare) -> Any:  # noqa: N802
+    def of_Compare(self, node: ast.Compare) -> Value:  # noqa: N802
         """Lower `a < b` and `a < b < c`."""
         left, found = self.value(node.left), None
         for operation, right_node in zip(node.ops, node.comparators, strict=True):
@@ -187,7 +187,7 @@ class Expressions(Scope, ABC):
             left = right
         return found
 
-    def compared(self, operation: Any, left: Any, right: Any) -> Any:
+    def compared(self, operation: Value, left: Value, right: Value) -> Value:
         """Return the result of one comparison."""
         if is_known(left) and is_known(right):
             return bool(operation(as_python(left), as_python(right)))
@@ -204,7 +204,7 @@ class Expressions(Scope, ABC):
             return compare(self.emitter, operation, self.scalar(left), self.scalar(right))
         if operation not in (operator.eq, operator.ne) or len(parts) != len(others):
             raise TypeError("tuples are compared by == and !=, and of one length")
-        found: Any = operation is operator.eq
+        found: Value = operation is operator.eq
         joined = operator.and_ if operation is operator.eq else operator.or_
         for part, other in zip(parts, others, strict=True):
             each = self.compared(operation, part, other)
@@ -216,18 +216,18 @@ class Expressions(Scope, ABC):
             )
         return found
 
-    def of_IfExp(self, node: ast.IfExp) -> Any:  # noqa: N802
+    def of_IfExp(self, node: ast.IfExp) -> Value:  # noqa: N802
         """Lower `a if condition else b`."""
         condition = self.truth(self.value(node.test))
         if isinstance(condition, Number):
             return self.chosen(condition, node.body, node.orelse)
         return self.value(node.body if condition else node.orelse)
 
-    def of_Attribute(self, node: ast.Attribute) -> Any:  # noqa: N802
+    def of_Attribute(self, node: ast.Attribute) -> Value:  # noqa: N802
         """Return a field of a NamedTuple, the shape of an array, something of a module."""
         return self.attribute(self.value(node.value), node.attr)
 
-    def attribute(self, owner: Any, name: str) -> Any:
+    def attribute(self, owner: Value, name: str) -> Value:
         """Return what something has under a name."""
         if isinstance(owner, Record) and name in owner.type._fields:
             return owner.get(name)
@@ -242,7 +242,7 @@ class Expressions(Scope, ABC):
             return from_python(getattr(owner, name))
         raise TypeError(f"a {type(owner).__name__} has no {name} in a kernel")
 
-    def of_Subscript(self, node: ast.Subscript) -> Any:  # noqa: N802
+    def of_Subscript(self, node: ast.Subscript) -> Value:  # noqa: N802
         """Return a number of an array, a part of it, or an entry of a tuple."""
         owner = self.value(node.value)
         parts = entries(owner)
@@ -258,7 +258,7 @@ class Expressions(Scope, ABC):
         index = self.value(node.slice)
         return parts[int(index)] if is_static(index) else self.entry(parts, index)
 
-    def entry(self, parts: tuple[Any, ...], index: Number) -> Number:
+    def entry(self, parts: tuple[Value, ...], index: Number) -> Number:
         """Return an entry of a tuple of numbers, by an index that is not known."""
         if not all(isinstance(each, Number) or is_static(each) for each in parts):
             raise TypeError("an entry of this tuple is found by an index that is known")
@@ -272,7 +272,7 @@ class Expressions(Scope, ABC):
                 store(self.emitter, part_of(self.emitter, kept, (place,)), each)
         return load(self.emitter, part_of(self.emitter, kept, (index,)))
 
-    def element(self, node: ast.Subscript, owner: Any = None) -> Array:
+    def element(self, node: ast.Subscript, owner: Value = None) -> Array:
         """Return the place in an array, or the part of one, that a subscript stands for."""
         owner = self.value(node.value) if owner is None else owner
         if isinstance(owner, np.ndarray):
@@ -284,13 +284,13 @@ class Expressions(Scope, ABC):
             raise TypeError(f"{ast.unparse(node)}: {len(index)} indices for {len(owner.shape)} axes")
         return part_of(self.emitter, owner, tuple(self._index(each) for each in index))
 
-    def constant_array(self, array: np.ndarray) -> Array:
+    def constant_array(self, array: AnyArray) -> Array:
         """Return an array from outside, which a kernel reads: one that nobody can write to."""
         if array.flags.writeable:
             raise TypeError("an array that could change is part of a kernel; pass it as an argument")
         return self.program.table(array)
 
-    def _index(self, node: ast.expr) -> Any:
+    def _index(self, node: ast.expr) -> Value:
         if not isinstance(node, ast.Slice):
             return self.scalar(self.value(node))
         if node.step is not None:
@@ -304,7 +304,7 @@ class Expressions(Scope, ABC):
 
     # --- calls ---
 
-    def of_Call(self, node: ast.Call) -> Any:  # noqa: N802
+    def of_Call(self, node: ast.Call) -> Value:  # noqa: N802
         """Make a function, a NamedTuple, or something that writes its own instructions."""
         if isinstance(node.func, ast.Attribute) and node.func.attr == "_replace":
             owner = self.value(node.func.value)
@@ -318,7 +318,7 @@ class Expressions(Scope, ABC):
         named = {each.arg: self.value(each.value) for each in node.keywords if each.arg}
         return self.called(function, arguments, named)
 
-    def called(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
+    def called(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
         """Return what a call gives."""
         write = getattr(function, "lowered", None)
         if write is not None:  # it knows how, see fuselog.replay.tracing
@@ -351,7 +351,7 @@ class Expressions(Scope, ABC):
         name = getattr(function, "__name__", function)
         raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
 
-    def new_array(self, like: Any, dtype: Any = float, *, is_zero: bool) -> Array:
+    def new_array(self, like: Value, dtype: Value = float, *, is_zero: bool) -> Array:
         """Make what `np.empty` and the like give, of known sizes: there until the function returns."""
         shape = like.shape if isinstance(like, Array) else like if isinstance(like, tuple) else (like,)
         if not all(is_static(size) for size in shape):
@@ -369,10 +369,10 @@ class Expressions(Scope, ABC):
         return copy
 
     @abstractmethod
-    def fill(self, place: Array, value: Any) -> None:
+    def fill(self, place: Array, value: Value) -> None:
         """Write a number to every place of an array."""
 
-    def _worked_out(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
+    def _worked_out(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
         """Return the result of a function whose arguments are all known: Python has it."""
         known = [as_python(each) for each in arguments]
         with np.errstate(all="ignore"):
@@ -380,18 +380,18 @@ class Expressions(Scope, ABC):
                 function(*known, **{name: as_python(each) for name, each in named.items()})
             )
 
-    def _length(self, value: Any) -> Any:
+    def _length(self, value: Value) -> Value:
         parts = entries(value)
         if isinstance(value, Array):
             return _whole(value.shape[0])
         return len(value if parts is None else parts)
 
 
-def _whole(size: int | str) -> Any:
+def _whole(size: int | str) -> Value:
     return Number(WHOLE, size, natural=True) if isinstance(size, str) else size
 
 
-def _given(function: FunctionType, arguments: list[Any], named: dict[str, Any]) -> list[Any]:
+def _given(function: FunctionType, arguments: list[Value], named: dict[str, Value]) -> list[Value]:
     """Return all arguments in their places, with defaults."""
     code = function.__code__
     names = code.co_varnames[: code.co_argcount]

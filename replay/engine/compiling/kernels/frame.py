@@ -1,7 +1,6 @@
 """Keeps the frame of a function that is lowered: its blocks, and its variables' places in memory."""
 
 from types import FunctionType
-from typing import Any
 
 from fuselog.replay.engine.compiling.kernels.expressions import Expressions
 from fuselog.replay.engine.compiling.kernels.numbers import (
@@ -19,6 +18,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     signature,
 )
 from fuselog.replay.engine.compiling.kernels.variables import placed_names
+from fuselog.replay.engine.compiling.kinds import Value
 
 
 class Wider(Exception):
@@ -29,7 +29,7 @@ class Frame(Expressions):
     """Represents one function's blocks of instructions, and the places of its variables."""
 
     def __init__(
-        self, program: Program, function: FunctionType, arguments: list[Any], kinds: dict[str, str]
+        self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
     ) -> None:
         definition, _, _ = definition_of(function)
         names = [each.arg for each in (*definition.args.posonlyargs, *definition.args.args)]
@@ -44,7 +44,7 @@ class Frame(Expressions):
         self.definition = definition
         self.kinds = kinds
         self.placed = placed_names(definition)
-        self.places: dict[str, Any] = {}
+        self.places: dict[str, Value] = {}
         self.ended = False
         for name in names:
             if name in self.placed:
@@ -69,16 +69,16 @@ class Frame(Expressions):
 
     # --- places in memory ---
 
-    def place(self, value: Any) -> Any:
+    def place(self, value: Value) -> Value:
         """Return a place for values like this one: its leaves are addresses."""
         return rebuilt(value, iter([self.emitter.memory(kind) for kind, _ in leaves(value)]))
 
-    def write(self, place: Any, value: Any) -> None:
+    def write(self, place: Value, value: Value) -> None:
         """Write a value to a place for it."""
         for (kind, code), (_, address) in zip(leaves(value), leaves(place), strict=True):
             self.emitter.add(f"store {kind} {code}, ptr {address}")
 
-    def read(self, place: Any) -> Any:
+    def read(self, place: Value) -> Value:
         """Return the value at a place."""
         names = []
         for kind, address in leaves(place):
@@ -86,7 +86,7 @@ class Frame(Expressions):
             self.emitter.add(f"{names[-1]} = load {kind}, ptr {address}")
         return rebuilt(place, iter(names))
 
-    def assign(self, name: str, value: Any) -> None:
+    def assign(self, name: str, value: Value) -> None:
         """Give a name a value."""
         if name not in self.placed:
             self.known[name] = value
@@ -96,14 +96,14 @@ class Frame(Expressions):
             self.places[name] = self.place(value)
         self.write(self.places[name], value)
 
-    def fitting(self, name: str, value: Any) -> Any:
+    def fitting(self, name: str, value: Value) -> Value:
         """Return the value as its place holds it; raises `Wider` where the place has to be another."""
         value = self.widened(name, unsure(at_run_time(value)))
         if name in self.places:
             value = self.converted(name, value, self.places[name])
         return value
 
-    def widened(self, name: str, value: Any) -> Any:
+    def widened(self, name: str, value: Value) -> Value:
         """Return the value with the kinds of numbers that its place was found to need."""
         if isinstance(value, Number):
             kind = self.kinds.get(name, value.kind)
@@ -114,7 +114,7 @@ class Frame(Expressions):
         made = tuple(self.widened(f"{name}[{place}]", each) for place, each in enumerate(parts))
         return Record(value.type, made) if isinstance(value, Record) else made
 
-    def converted(self, name: str, value: Any, place: Any) -> Any:
+    def converted(self, name: str, value: Value, place: Value) -> Value:
         """Convert a number, or a tuple's numbers, to the place's kinds.
 
         `Wider` where it cannot hold them.
@@ -140,19 +140,19 @@ class Frame(Expressions):
         )
         return rebuilt(place, iter([code for each in made for _, code in leaves(each)]))
 
-    def lookup(self, name: str) -> Any:
+    def lookup(self, name: str) -> Value:
         """Return what a name stands for."""
         if name in self.places:
             return self.read(self.places[name])
         return super().lookup(name)
 
 
-def unsure(value: Any) -> Any:
+def unsure(value: Value) -> Value:
     """Return a number of which it is not known whether it is negative."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
-def common_value(one: Any, other: Any) -> Any:
+def common_value(one: Value, other: Value) -> Value:
     """Return the one value, with numbers of the kinds that hold the other's too."""
     if isinstance(one, Number) and isinstance(other, Number):
         return one._replace(kind=common_kind(one, other))

@@ -4,7 +4,6 @@ import math
 import operator
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     kind_of,
     negative,
 )
+from fuselog.replay.engine.compiling.kinds import KernelFunction, Value
 
 
 def absolute(emitter: Emitter, x: Scalar) -> Number:
@@ -35,7 +35,7 @@ def absolute(emitter: Emitter, x: Scalar) -> Number:
     return emitter.select(below, negative(emitter, whole), whole)._replace(natural=True)
 
 
-def _least(operation: Any, emitter: Emitter, *values: Scalar) -> Number:
+def _least(operation: Value, emitter: Emitter, *values: Scalar) -> Number:
     """Lower Python's `min` and `max`: the first of equal ones."""
     kind = common_kind(*values)
     found, *others = (emitter.as_kind(each, kind) for each in values)
@@ -44,7 +44,7 @@ def _least(operation: Any, emitter: Emitter, *values: Scalar) -> Number:
     return found
 
 
-def _bounded(operation: Any, emitter: Emitter, x: Scalar, y: Scalar) -> Number:
+def _bounded(operation: Value, emitter: Emitter, x: Scalar, y: Scalar) -> Number:
     """Lower `np.minimum` and `np.maximum`, which are NaN where an argument is."""
     kind = common_kind(x, y)
     x, y = emitter.as_kind(x, kind), emitter.as_kind(y, kind)
@@ -102,11 +102,14 @@ def _scaled(factor: float, emitter: Emitter, x: Scalar) -> Number:
     return binary(emitter, operator.mul, emitter.as_kind(x, REAL), factor)
 
 
-def _operator(operation: Any) -> Callable[..., Number]:
+EmitOfTwo = Callable[[Emitter, Scalar, Scalar], Number]
+
+
+def _operator(operation: Value) -> EmitOfTwo:
     return lambda emitter, x, y: binary(emitter, operation, x, y)
 
 
-def _comparison(operation: Any) -> Callable[..., Number]:
+def _comparison(operation: Value) -> EmitOfTwo:
     return lambda emitter, x, y: compare(emitter, operation, x, y)
 
 
@@ -153,7 +156,7 @@ _LIBM_RENAMED = {
     np.fabs: "llvm.fabs.f64",
 }
 # What NumPy's and Python's functions are of numbers: (emitter, *arguments) -> number.
-FUNCTIONS: dict[Any, Callable[..., Any]] = {
+FUNCTIONS: dict[Value, KernelFunction] = {
     **{getattr(np, name): partial(_of_reals, f"llvm.{name}.f64") for name in _INTRINSICS},
     **{getattr(np, name): partial(_of_reals, name) for name in _LIBM},
     **{function: partial(_of_reals, name) for function, name in _LIBM_RENAMED.items()},

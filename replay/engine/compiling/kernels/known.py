@@ -2,26 +2,26 @@
 
 import ast
 import operator
-from typing import Any
 
 import numpy as np
 
 from fuselog.replay.engine.compiling.kernels.numbers import Number
 from fuselog.replay.engine.compiling.kernels.values import Array, Record, entries
+from fuselog.replay.engine.compiling.kinds import Value
 
 
-def is_in(x: Any, many: Any) -> bool:
+def is_in(x: Value, many: Value) -> bool:
     """Tell what `x in many` is."""
     return x in many
 
 
-def is_not_in(x: Any, many: Any) -> bool:
+def is_not_in(x: Value, many: Value) -> bool:
     """Tell what `x not in many` is."""
     return x not in many
 
 
 # Python's operators by their names in a source.
-OPERATORS: dict[type[ast.AST], Any] = {
+OPERATORS: dict[type[ast.AST], Value] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -47,7 +47,7 @@ OPERATORS: dict[type[ast.AST], Any] = {
 }
 
 
-def is_known(value: Any) -> bool:
+def is_known(value: Value) -> bool:
     """Tell whether nothing of a value exists at run time only."""
     if isinstance(value, Number | Array):
         return False
@@ -55,14 +55,14 @@ def is_known(value: Any) -> bool:
     return parts is None or all(map(is_known, parts))
 
 
-def as_python(value: Any) -> Any:
+def as_python(value: Value) -> Value:
     """Return what is known, as Python has it."""
     if isinstance(value, Record):
         return value.type(*map(as_python, value.values))
     return tuple(map(as_python, value)) if isinstance(value, tuple) else value
 
 
-def from_python(value: Any) -> Any:
+def from_python(value: Value) -> Value:
     """Return what Python has, as it is known while lowering."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return Record(type(value), tuple(map(from_python, value)))

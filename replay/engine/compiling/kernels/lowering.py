@@ -9,7 +9,7 @@ import ast
 import operator
 from collections.abc import Iterator, Sequence
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fuselog.replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
 from fuselog.replay.engine.compiling.kernels.numbers import (
@@ -34,6 +34,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     signature,
     store,
 )
+from fuselog.replay.engine.compiling.kinds import Value
 
 
 class _Loop(NamedTuple):
@@ -43,7 +44,7 @@ class _Loop(NamedTuple):
     next: str
 
 
-def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tuple[Emitter, Any]:
+def lower(program: Program, function: FunctionType, arguments: list[Value]) -> tuple[Emitter, Value]:
     """Return the body of a function for these arguments, and what it returns."""
     kinds: dict[str, str] = {}
     while True:
@@ -65,15 +66,15 @@ class _Lowering(Frame):
     """Lowers the body of one function, for arguments of these kinds."""
 
     def __init__(
-        self, program: Program, function: FunctionType, arguments: list[Any], kinds: dict[str, str]
+        self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
     ) -> None:
         self._loops: list[_Loop] = []
         self._depth = 0  # of branches and loops that may not be run
-        self._returned: Any = None
+        self._returned: Value = None
         self._exit = ""
         super().__init__(program, function, arguments, kinds)
 
-    def body(self) -> Any:
+    def body(self) -> Value:
         """Lower all of it, and return what it returns."""
         self.statements(self.definition.body)
         if self._exit:
@@ -129,7 +130,7 @@ class _Lowering(Frame):
             found = self.operation(statement.op, self.value(target), self.value(statement.value))
             self.give(target, found)
 
-    def give(self, target: ast.expr, value: Any) -> None:
+    def give(self, target: ast.expr, value: Value) -> None:
         """Assign to a name, names, or a part of an array."""
         if isinstance(target, ast.Name):
             self.assign(target.id, value)
@@ -150,7 +151,7 @@ class _Lowering(Frame):
         else:
             raise TypeError("only names and parts of arrays can be assigned to")
 
-    def fill(self, place: Array, value: Any) -> None:
+    def fill(self, place: Array, value: Value) -> None:
         """Write a number, or an array of the same shape, to every place of an array."""
 
         def write(index: Number) -> None:
@@ -291,7 +292,7 @@ class _Lowering(Frame):
         self.go(head)
         self.begin(after)
 
-    def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
+    def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
         """Lower `yes if condition else no`, of which one is computed."""
         labels, after, before = (
             (self.label("then"), self.label("else")),

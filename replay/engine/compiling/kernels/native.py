@@ -18,7 +18,7 @@ from pathlib import Path
 from struct import Struct
 from threading import Lock
 from types import FunctionType
-from typing import Any, cast
+from typing import cast
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -38,6 +38,7 @@ from fuselog.replay.engine.compiling.kernels.arguments import describe, letters,
 from fuselog.replay.engine.compiling.kernels.lowering import lower
 from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
 from fuselog.replay.engine.compiling.kernels.program import Program
+from fuselog.replay.engine.compiling.kinds import AnyArray, Entry, KernelFunction, RunOnce, Value
 from fuselog.replay.engine.compiling.notices import compiling, done_once
 from fuselog.replay.engine.compiling.scratch import Memory
 
@@ -48,17 +49,17 @@ _MADE_BY = "a kernel that fuselog compiled"
 class _Layout:
     """Holds the kinds of what a core works in: the same object for the same kinds, quick to look up."""
 
-    def __init__(self, kinds: tuple[Any, ...]) -> None:
+    def __init__(self, kinds: tuple[Value, ...]) -> None:
         self.kinds = kinds
 
 
 _layout_of = cache(_Layout)
 
 
-def _described(memory: Any) -> tuple[_Layout, list[Any]]:
+def _described(memory: Value) -> tuple[_Layout, list[Value]]:
     """Describe what a core works in: kinds, with all sizes known, and the numbers to hand over."""
-    kinds: list[Any] = []
-    words: list[Any] = []
+    kinds: list[Value] = []
+    words: list[Value] = []
     describe(memory, 0, kinds, words)
     return _layout_of(tuple(kinds)), words
 
@@ -72,19 +73,19 @@ class Kernel:
     def __init__(self, run_once: FunctionType, title: str = "") -> None:
         self._function = run_once
         self._title = title or f"{run_once.__module__}.{run_once.__name__}"
-        self._entries: dict[Any, tuple[Struct, Callable[..., Any]]] = {}
-        self._loaded: dict[Any, Callable[..., Any]] = {}
+        self._entries: dict[Value, tuple[Struct, KernelFunction]] = {}
+        self._loaded: dict[Value, KernelFunction] = {}
         self._lock = Lock()
 
     def of(
-        self, arguments: Sequence[Any], memory: Memory | None = None, varies: int = 1
+        self, arguments: Sequence[Value], memory: Memory | None = None, varies: int = 1
     ) -> Callable[[int, int], None]:
         """Make the loop over the runs from `first` up to `end` for these arguments, which it holds.
 
         So many first axes of arrays vary, none of those in the memory; see `describe`.
         """
-        kinds: list[Any] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
-        numbers: list[Any] = []
+        kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
+        numbers: list[Value] = []
         for each in arguments:
             describe(each, varies, kinds, numbers)
         layout_of_memory = None
@@ -105,14 +106,14 @@ class Kernel:
         layout, entry = known
         given = layout.pack(*numbers)
 
-        def loop(first: int, end: int, kept: Any = (arguments, memory)) -> None:  # noqa: ARG001
+        def loop(first: int, end: int, kept: Value = (arguments, memory)) -> None:  # noqa: ARG001
             entry(first, end, given)
 
         return loop
 
     def _layout_and_entry(
-        self, arguments: Sequence[Any], kinds: Iterator[Any]
-    ) -> tuple[Struct, Callable[..., Any]]:
+        self, arguments: Sequence[Value], kinds: Iterator[Value]
+    ) -> tuple[Struct, KernelFunction]:
         """Return how the numbers of such arguments are packed, and the entry that takes them."""
         is_checked = next(kinds)
         described = tuple(with_types(each, kinds) for each in arguments)
@@ -124,7 +125,7 @@ class Kernel:
         return Struct(f"={''.join(map(letters, described))}"), self._loaded[key]
 
 
-def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
+def function_of(function: KernelFunction) -> KernelFunction:
     """Make a function that makes no arrays, for Python; no size of the arrays that it is given is known.
 
     It returns nothing, or a number of the kind that its annotation says.
@@ -137,17 +138,17 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
             "'-> int', '-> bool' or '-> None'"
         )
 
-    def call(run: int, arguments: tuple[Any, ...]) -> None:  # noqa: ARG001
+    def call(run: int, arguments: tuple[Value, ...]) -> None:  # noqa: ARG001
         function(*arguments)
 
-    def evaluate(run: int, arguments: tuple[Any, ...], found: np.ndarray) -> None:
+    def evaluate(run: int, arguments: tuple[Value, ...], found: AnyArray) -> None:
         found[run] = function(*arguments)
 
     once = call if returned == "None" else evaluate
     once.__module__, once.__name__ = function.__module__, function.__name__
     kernel = Kernel(cast(FunctionType, once))
 
-    def called(*arguments: Any) -> Any:
+    def called(*arguments: Value) -> Value:
         if returned == "None":
             return kernel.of((arguments,), varies=_ALL)(0, 1)
         found = np.empty(1, returned)
@@ -160,7 +161,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 # --- making -----------------------------------------------------------------------------------------
 
 
-def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool = False) -> Program:
+def program_of(function: FunctionType, kinds: Sequence[Value], *, is_checked: bool = False) -> Program:
     """Make the kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
 
     It returns 0, or where indices are checked the number of the first fault.
@@ -196,13 +197,13 @@ def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool
     return program
 
 
-def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., None]:
+def _checked_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) -> RunOnce:
     """Make the kernel's entry that raises IndexError for an index beyond its array; it is not kept."""
     with compiling(title):
         program = program_of(function, kinds, is_checked=True)
         kernel = _loaded(object_code(program.text()))
 
-    def checked(*arguments: Any) -> None:
+    def checked(*arguments: Value) -> None:
         fault = kernel(*arguments)
         if fault:
             raise IndexError(f"an index is beyond its array in {program.faults[fault - 1]}")
@@ -210,7 +211,7 @@ def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -
     return checked
 
 
-def _kept_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
+def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) -> Entry:
     """Load the kernel's entry from the cache; where that lacks it, make it and keep it there."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
@@ -247,7 +248,7 @@ def _keep(path: Path, code: bytes) -> None:
         say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
 
 
-def _named(kinds: Any) -> Any:
+def _named(kinds: Value) -> Value:
     """Return kinds of arguments in words that are the same in every process."""
     if isinstance(kinds, type):
         return f"{kinds.__module__}.{kinds.__qualname__}", getattr(kinds, "_fields", ())
@@ -278,7 +279,7 @@ def _machine() -> tuple[str, str]:
     return name or llvm.get_host_cpu_name(), features
 
 
-def _new_target() -> Any:
+def _new_target() -> Value:
     """Return LLVM's description of the machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
@@ -289,7 +290,7 @@ def _new_target() -> Any:
     )
 
 
-def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
+def _made(function: FunctionType, kinds: Sequence[Value]) -> bytes:
     """Make the kernel's object code."""
     with _without_garbage():
         return object_code(program_of(function, kinds).text())
@@ -310,10 +311,10 @@ def object_code(text: str) -> bytes:
     return bytes(target.emit_object(module))
 
 
-_ENGINES: list[Any] = []  # what is loaded stays
+_ENGINES: list[Value] = []  # what is loaded stays
 
 
-def _loaded(code: bytes) -> Callable[..., int]:
+def _loaded(code: bytes) -> Entry:
     """Return the entry of a kernel's object code; the engine owns its target."""
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))

@@ -8,9 +8,11 @@ import operator
 import struct
 from collections.abc import Callable
 from itertools import count
-from typing import Any, NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
+
+from fuselog.replay.engine.compiling.kinds import Value
 
 REAL, WHOLE, WORD, TRUTH = "double", "i64", "u64", "i1"  # kinds; a word is an unsigned integer
 _WIDTH = {TRUTH: 0, WHOLE: 1, WORD: 2, REAL: 3}
@@ -36,7 +38,7 @@ Static = bool | int | float  # what is known while lowering
 Scalar = Number | Static
 
 
-def constant(value: Any) -> Number:
+def constant(value: Value) -> Number:
     """Return a number that is known, as LLVM writes it; real ones bit by bit."""
     if isinstance(value, bool | np.bool_):
         return Number(TRUTH, "true" if value else "false")
@@ -47,7 +49,7 @@ def constant(value: Any) -> Number:
     return Number(REAL, f"0x{struct.pack('>d', float(value)).hex().upper()}")
 
 
-def is_static(value: Any) -> TypeGuard[Static]:
+def is_static(value: Value) -> TypeGuard[Static]:
     """Tell whether it is a number that is known while lowering."""
     return isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating)
 
@@ -178,7 +180,7 @@ _ORDERED = {
 }
 
 
-def binary(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Number:
+def binary(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
     """Return the result of an operator of Python's."""
     if operation is operator.pow:
         return power(emitter, left, right)
@@ -203,7 +205,7 @@ def binary(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Num
     return emitter.number(kind, f"{name} i64 {x.code}, {y.code}")._replace(natural=natural)
 
 
-def _divided(emitter: Emitter, operation: Any, x: Number, y: Number) -> Number:
+def _divided(emitter: Emitter, operation: Value, x: Number, y: Number) -> Number:
     """Lower `x % y` or `x // y`, whose remainder has the sign of y."""
     if x.kind == WORD:
         name = "urem" if operation is operator.mod else "udiv"
@@ -262,7 +264,7 @@ def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
     return emitter.call("llvm.pow.f64", emitter.as_kind(base, REAL), emitter.as_kind(exponent, REAL))
 
 
-def compare(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Number:
+def compare(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
     """Return the result of a comparison; false with NaN, but for `!=`."""
     kind = common_kind(left, right)
     kind = WHOLE if kind == TRUTH else kind

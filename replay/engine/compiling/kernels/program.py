@@ -8,9 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import count
 from types import FunctionType
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
@@ -23,6 +21,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     signature,
     table,
 )
+from fuselog.replay.engine.compiling.kinds import AnyArray, Value
 
 FEW = 30  # lines of a function that is always written where it is called
 
@@ -39,7 +38,7 @@ class Instance(NamedTuple):
 
     name: str
     type: str
-    returned: Any
+    returned: Value
     can_fail: bool
 
 
@@ -51,7 +50,7 @@ class Program:
 
     def __init__(
         self,
-        lower: Callable[["Program", FunctionType, list[Any]], tuple[Emitter, Any]],
+        lower: Callable[["Program", FunctionType, list[Value]], tuple[Emitter, Value]],
         *,
         is_checked: bool = False,
     ) -> None:
@@ -60,11 +59,11 @@ class Program:
         self.faults: list[str] = []
         self.functions: list[str] = []
         self.declared: set[str] = set()
-        self.tables: dict[Any, tuple[str, Array]] = {}
-        self.instances: dict[Any, Instance] = {}
+        self.tables: dict[Value, tuple[str, Array]] = {}
+        self.instances: dict[Value, Instance] = {}
         self._names = count()
         self._open: list[int] = []
-        self._kept: list[Any] = []  # whose ids are keys
+        self._kept: list[Value] = []  # whose ids are keys
 
     def text(self) -> str:
         """Return the whole module."""
@@ -76,14 +75,14 @@ class Program:
         """Return a name that no other function or table has."""
         return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
 
-    def table(self, numbers: np.ndarray) -> Array:
+    def table(self, numbers: AnyArray) -> Array:
         """Return a constant array."""
         key = numbers.dtype.str, numbers.shape, numbers.tobytes()
         if key not in self.tables:
             self.tables[key] = table(self.name("table"), numbers)
         return self.tables[key][1]
 
-    def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Any]) -> Any:
+    def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Value]) -> Value:
         """Call a function with these arguments; it is lowered where that was not done yet."""
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
@@ -100,7 +99,7 @@ class Program:
         return placed(result, is_local=True) if any(map(is_local, arguments)) else result
 
     def define(
-        self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Any
+        self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Value
     ) -> Instance:
         """Add a function whose body ends before what it returns is given back."""
         found = list(leaves(returned))
@@ -131,19 +130,19 @@ class Program:
         self.declared |= body.declared
         return Instance(name, kind, returned, body.can_fail)
 
-    def _parameter(self, index: int, value: Any) -> tuple[Any, list[tuple[str, str]]]:
+    def _parameter(self, index: int, value: Value) -> tuple[Value, list[tuple[str, str]]]:
         """Return an argument as the function that it is given to knows it, and its leaves there."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
         known = placed(_unsure(value), is_local=False)
         return rebuilt(known, iter([code for _, code in found])), found
 
 
-def _unsure(value: Any) -> Any:
+def _unsure(value: Value) -> Value:
     """Return an integer that may be negative in another call of the function."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
-def called(emitter: Emitter, instance: Instance, arguments: Sequence[Any]) -> Any:
+def called(emitter: Emitter, instance: Instance, arguments: Sequence[Value]) -> Value:
     """Call a function that has been lowered."""
     given = ", ".join(f"{kind} {code}" for each in arguments for kind, code in leaves(each))
     if instance.type == "void":

@@ -3,7 +3,6 @@
 import builtins
 from itertools import count
 from types import FunctionType
-from typing import Any
 
 from fuselog.replay.engine.compiling.kernels.known import (
     from_python,
@@ -12,6 +11,7 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     Emitter,
 )
 from fuselog.replay.engine.compiling.kernels.program import Program, definition_of
+from fuselog.replay.engine.compiling.kinds import Value
 
 
 class Scope:
@@ -22,7 +22,7 @@ class Scope:
         self.emitter = Emitter(self.fault if program.is_checked else None)
         self.function = function
         self.line = 0
-        self.known: dict[str, Any] = {}
+        self.known: dict[str, Value] = {}
         self._outside = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
         self._globals = function.__globals__
         self._labels = count()
@@ -41,7 +41,7 @@ class Scope:
         """Return a name for a block."""
         return f"{stem}{next(self._labels)}"
 
-    def lookup(self, name: str) -> Any:
+    def lookup(self, name: str) -> Value:
         """Return what a name stands for."""
         if name in self.known:
             return self.known[name]

@@ -9,7 +9,6 @@ import operator
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Any
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     constant,
     is_static,
 )
+from fuselog.replay.engine.compiling.kinds import AnyArray, Value
 
 Size = int | str  # known, or the name of an integer
 Leaf = tuple[str, str]  # LLVM's type, and a name
@@ -66,22 +66,22 @@ class Array:
 class Record:
     """Represents a NamedTuple of values."""
 
-    type: type[Any]
-    values: tuple[Any, ...]
+    type: type[Value]
+    values: tuple[Value, ...]
 
-    def get(self, name: str) -> Any:
+    def get(self, name: str) -> Value:
         """Return a field."""
         return self.values[self.type._fields.index(name)]
 
 
-def entries(value: Any) -> tuple[Any, ...] | None:
+def entries(value: Value) -> tuple[Value, ...] | None:
     """Return the values that a tuple or NamedTuple holds; None of anything else."""
     if isinstance(value, Record):
         return value.values
     return value if isinstance(value, tuple) and not isinstance(value, Number) else None
 
 
-def leaves(value: Any) -> Iterator[Leaf]:
+def leaves(value: Value) -> Iterator[Leaf]:
     """Return what of a value exists at run time."""
     if isinstance(value, Number):
         yield value.type, value.code
@@ -95,7 +95,7 @@ def leaves(value: Any) -> Iterator[Leaf]:
             yield from leaves(entry)
 
 
-def rebuilt(value: Any, names: Iterator[str]) -> Any:
+def rebuilt(value: Value, names: Iterator[str]) -> Value:
     """Return the same value with other names for its leaves."""
     if isinstance(value, Number):
         return Number(value.kind, next(names), value.natural)
@@ -110,7 +110,7 @@ def rebuilt(value: Any, names: Iterator[str]) -> Any:
     return value
 
 
-def signature(value: Any) -> Any:
+def signature(value: Value) -> Value:
     """Return what a value is, but for the names of its leaves; what is known counts as it is."""
     if isinstance(value, Number):
         return value.kind
@@ -126,7 +126,7 @@ def signature(value: Any) -> Any:
     return "object", id(value)
 
 
-def at_run_time(value: Any) -> Any:
+def at_run_time(value: Value) -> Value:
     """Return the value with every number that is known as one at run time."""
     if is_static(value):
         return constant(value)
@@ -149,7 +149,7 @@ def _size(number: Scalar) -> Size:
     return number.code if isinstance(number, Number) else int(number)
 
 
-def combined(emitter: Emitter, operation: Any, left: Size, right: Size) -> Size:
+def combined(emitter: Emitter, operation: Value, left: Size, right: Size) -> Size:
     """Compute the sum, product or difference of two sizes."""
     if isinstance(left, int) and isinstance(right, int):
         return int(operation(left, right))
@@ -181,7 +181,7 @@ def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
     return emitter.select(is_below, turned, number).code
 
 
-def part_of(emitter: Emitter, array: Array, index: tuple[Any, ...]) -> Array:
+def part_of(emitter: Emitter, array: Array, index: tuple[Value, ...]) -> Array:
     """Return a part of an array, by numbers and slices (pairs of bounds, None where open)."""
     offset: Size = 0
     shape: list[Size] = []
@@ -249,7 +249,7 @@ def store(emitter: Emitter, place: Array, value: Scalar) -> None:
 # --- constants --------------------------------------------------------------------------------------
 
 
-def table(name: str, numbers: np.ndarray) -> tuple[str, Array]:
+def table(name: str, numbers: AnyArray) -> tuple[str, Array]:
     """Return LLVM's definition of an array that is known and never written to, and the array."""
     dtype = numbers.dtype.str
     stored, kind = STORED[dtype]
@@ -272,14 +272,14 @@ def made(emitter: Emitter, shape: tuple[int, ...], dtype: str) -> Array:
     return Array(dtype, memory, shape, packed(shape), is_local=True)
 
 
-def is_local(value: Any) -> bool:
+def is_local(value: Value) -> bool:
     """Tell whether there is an array in it that is gone when its function returns."""
     if isinstance(value, Array):
         return value.is_local
     return any(map(is_local, entries(value) or ()))
 
 
-def placed(value: Any, *, is_local: bool) -> Any:
+def placed(value: Value, *, is_local: bool) -> Value:
     """Return the value with arrays that are, or are not, gone when the function at hand returns.
 
     What a function is given stays when it returns, and may be part of what that is.

@@ -3,16 +3,17 @@
 import ast
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+
+from fuselog.replay.engine.compiling.kinds import Value
 
 
 class _Names(ast.NodeVisitor):
     """Holds where names are given values and where they are used: branches and loops, and the order."""
 
     def __init__(self) -> None:
-        self.given: dict[str, list[tuple[tuple[Any, ...], int]]] = {}
-        self.used: dict[str, list[tuple[tuple[Any, ...], int]]] = {}
-        self._region: tuple[Any, ...] = ()
+        self.given: dict[str, list[tuple[tuple[Value, ...], int]]] = {}
+        self.used: dict[str, list[tuple[tuple[Value, ...], int]]] = {}
+        self._region: tuple[Value, ...] = ()
         self._order = 0
 
     def visit_Name(self, node: ast.Name) -> None:
@@ -53,7 +54,7 @@ class _Names(ast.NodeVisitor):
             if isinstance(each, ast.Name) and each.id not in own:
                 self.visit_Name(each)
 
-    def within(self, region: Any, nodes: Sequence[ast.AST]) -> None:
+    def within(self, region: Value, nodes: Sequence[ast.AST]) -> None:
         """Visit what lies in a branch or a loop."""
         before, self._region = self._region, (*self._region, region)
         for each in nodes:
@@ -76,7 +77,7 @@ def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
 
 
 def _is_placed(
-    given: list[tuple[tuple[Any, ...], int]], used: list[tuple[tuple[Any, ...], int]]
+    given: list[tuple[tuple[Value, ...], int]], used: list[tuple[tuple[Value, ...], int]]
 ) -> bool:
     """Tell whether some use may see another value than the one that stands nearest before it."""
     for region, order in used:

@@ -14,13 +14,14 @@ JPDA: Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Eng. 8(3), 1983. JIPDA: Mus
 IEEE TAES 50(4), 2014.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.families.tracking.association.clusters import (
     NONE,
@@ -131,10 +132,13 @@ def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
     """
     if column >= detections:
         return 0.0 if column - detections == row else np.inf
-    return -np.log(weights.detected[row, column] / weights.missed[row])
+    cost: float = -np.log(weights.detected[row, column] / weights.missed[row])
+    return cost
 
 
-ASSOCIATIONS = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
+# (weights, tracks, detections, probability, memory), as `nearest`.
+Associate = Callable[[Weights, int, int, Floats, AssociationMemory], int]
+ASSOCIATIONS: dict[str, Associate] = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
 
 
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
@@ -183,5 +187,5 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
 
 
 @cache
-def _compiled(association: str) -> Function:
+def _compiled(association: str) -> Associate:
     return compiled(ASSOCIATIONS[association], allocates=False)

@@ -1,16 +1,16 @@
 """Begins tracks at detections that belong to none, and ends those of which nothing is left."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Function
+from fuselog.replay.engine.arrays import Floats, Numbers, Settings
 from fuselog.replay.families.tracking.association.scanning import (
     ScanMemory,
     correlating,
 )
-from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
+from fuselog.replay.families.tracking.association.scans import Born, Scans, ScanSensor
 from fuselog.replay.families.tracking.association.track_management import MANAGEMENTS
 from fuselog.replay.families.tracking.association.tracker import (
     Newborn,
@@ -21,6 +21,7 @@ from fuselog.replay.families.tracking.association.tracker import (
 )
 from fuselog.replay.families.tracking.association.tracks import NEVER, Tracks, are_near, drop, expected
 from fuselog.replay.inference.kalman.predict import nothing
+from fuselog.replay.inference.kalman.steps import Workspace
 from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 
@@ -36,7 +37,7 @@ class Births(NamedTuple):
 
     begins: tuple[bool, ...]
     number: tuple[int, ...]
-    birth: Function
+    birth: Callable[[int, Numbers, Numbers, Settings], Born]
 
 
 def births_of(kinds: Sequence[ScanSensor]) -> Births:
@@ -47,7 +48,7 @@ def births_of(kinds: Sequence[ScanSensor]) -> Births:
     return Births(begins, number, choosing(births))
 
 
-def ending(tracker: Tracker) -> Function:
+def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     """Make `end_tracks(run, tracks, p)`: which tracks are over."""
     names = list(tracker.stage.model.state)
     x, y = place_of(tracker.stage.model)
@@ -55,7 +56,7 @@ def ending(tracker: Tracker) -> Function:
     velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
     _, _, is_over = MANAGEMENTS[tracker.management]
 
-    def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+    def is_another(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
         """Tell whether an older confirmed track is about where this one is, and moves alike."""
         for other in range(place if tracks.is_confirmed[run, place] else 0):
             if (
@@ -68,7 +69,7 @@ def ending(tracker: Tracker) -> Function:
                 return True
         return False
 
-    def end_tracks(run: int, tracks: Tracks, p: Any) -> None:
+    def end_tracks(run: int, tracks: Tracks, p: Settings) -> None:
         """Take out the tracks that are over, and second ones of a target."""
         place = 0
         while place < tracks.used[run]:
@@ -80,19 +81,37 @@ def ending(tracker: Tracker) -> Function:
     return end_tracks
 
 
-def beginning(tracker: Tracker) -> Function:
+class BeginTracks(Protocol):
+    """Begins tracks of a run with detections of a scan; returns how many had no room."""
+
+    def __call__(
+        self,
+        run: int,
+        scan: int,
+        count: int,
+        scans: Scans,
+        tracks: Tracks,
+        newborn: Newborn,
+        p: Settings,
+        memory: ScanMemory,
+        /,
+    ) -> int: ...
+
+
+def beginning(tracker: Tracker) -> BeginTracks:
     """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
     begins, birth_number, birth = births_of(kinds)
-    correlate, read_pair = nothing, tuple_of(2)
+    correlate: Callable[[int, Floats, Floats, Floats, Settings, Workspace], None] = nothing
+    read_pair = tuple_of(2)
     if shared_at < model.size:
         correlations = [
             correlating(model, kind, corner, tracker.names) for kind in kinds if kind.birth is not None
         ]
         correlate = choosing(correlations)
 
-    def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
+    def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Settings) -> bool:
         """Tell whether a confirmed track is too near for another one to begin."""
         for place in range(tracks.used[run]):
             apart = np.hypot(
@@ -103,7 +122,13 @@ def beginning(tracker: Tracker) -> Function:
         return False
 
     def first_existence(
-        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: ScanMemory
+        run: int,
+        detection: int,
+        at_x: float,
+        at_y: float,
+        tracks: Tracks,
+        p: Settings,
+        memory: ScanMemory,
     ) -> float:
         """Compute the probability that a detection is of a target without a track; 0 to begin none."""
         if p.undetected_per_m2 > 0.0:
@@ -120,7 +145,7 @@ def beginning(tracker: Tracker) -> Function:
         scans: Scans,
         tracks: Tracks,
         newborn: Newborn,
-        p: Any,
+        p: Settings,
         memory: ScanMemory,
     ) -> int:
         """Begin tracks with the detections that may be of no other; returns how many had no room."""

@@ -1,10 +1,11 @@
 """Writes what a tracker puts out after a scan: confirmed tracks, and associations with detections."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function, Integers, varying
+from fuselog.replay.engine.arrays import Floats, Integers, varying
 from fuselog.replay.families.tracking.association.scanning import (
     ScanMemory,
 )
@@ -54,7 +55,9 @@ class Rows(NamedTuple):
     probability: Floats
 
 
-def writing_pairs(modes: int) -> Function:
+def writing_pairs(
+    modes: int,
+) -> Callable[[int, int, int, Tracks, TrackOutputs, ScanMemory], None]:
     """Make `write_pairs(run, scan, count, tracks, outputs, memory)`: confirmed tracks' associations."""
 
     def write_pairs(
@@ -81,7 +84,9 @@ def writing_pairs(modes: int) -> Function:
     return write_pairs
 
 
-def writing_tracks(stage: Stage) -> Function:
+def writing_tracks(
+    stage: Stage,
+) -> Callable[[int, int, Tracks, TrackOutputs, ScanMemory], None]:
     """Make `write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
     belief_of, estimate = believing(stage), moving(stage).estimate
 

@@ -15,22 +15,24 @@ theirs, weighed by the modes' probabilities, and given that it is the track's, s
 afterwards, and its Gaussian the shares of this for probabilities (Blom, Bloem, IEEE TAC 45(2), 2000).
 """
 
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.models.states import PLANE_MOTION
-from fuselog.replay.engine.arrays import Booleans, Floats, Function, Integers, varying
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, Numbers, Settings, varying
 from fuselog.replay.families.tracking.association.clusters import AssociationMemory, Weights, memory_for
 from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
 from fuselog.replay.families.tracking.association.shared_bias import Pool, pool_of
 from fuselog.replay.families.tracking.association.tracks import Tracks
-from fuselog.replay.inference.kalman.steps import Workspace, workspace
+from fuselog.replay.inference.kalman.steps import CoreMemory, Workspace, workspace
 from fuselog.replay.inference.kalman.update import sensor_derivative
 from fuselog.replay.inference.linear_algebra.gaussian import Innovation, kalman_step, whiten, wrap
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
 from fuselog.replay.inference.model.corrections import correcting, sloping
+from fuselog.replay.inference.model.functions import OfParameters
 from fuselog.replay.inference.model.model import Model, Sensor
 from fuselog.replay.inference.model.stage import Stage, traced_sensor
 
@@ -59,7 +61,7 @@ class ScanMemory(NamedTuple):
         moment: (2, 2), and `shift` (2,), of the weighted innovations.
     """
 
-    motion: Any
+    motion: CoreMemory
     step: Workspace
     pool: Pool
     place: Floats
@@ -84,7 +86,7 @@ class ScanMemory(NamedTuple):
     shift: Floats
 
 
-def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> ScanMemory:
+def memory_of(stage: Stage, motion: CoreMemory, shared: int, places: int, detections: int) -> ScanMemory:
     """Make memory for so many errors that tracks share, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
     return ScanMemory(
@@ -114,12 +116,12 @@ def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: i
     )
 
 
-def target_of(model: Model) -> Function:
+def target_of(model: Model) -> Callable[[Numbers], Numbers]:
     """Make `target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
     names = list(model.state)
     places = tuple(names.index(name) if name in names else -1 for name in PLANE_MOTION)
 
-    def target(state: Any) -> Any:
+    def target(state: Numbers) -> Numbers:
         return tuple(state[place] if place >= 0 else 0.0 for place in places)
 
     return target
@@ -130,31 +132,31 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
     """Make a model's sensor of a kind of scan sensors, which may read parameters of these names."""
     target, inner = target_of(model), kind.measure
 
-    def measure(state: Any, reference: Any, parameters: Any) -> Any:
+    def measure(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
         return inner(target(state), reference, parameters)
 
     own = Sensor(kind.leaf, kind.schema, kind.measured, measure, fields={"origin": 2})
     return traced_sensor(model, own, names)
 
 
-def errors_at(component: int) -> Function:
+def errors_at(component: int) -> OfParameters:
     """Make `errors(parameters)`: where errors of a measured component stand in the state.
 
     -1 for nowhere.
     """
     names = (f"registration_at_{component}", f"correlated_at_{component}")
 
-    def errors(parameters: Any) -> tuple[float, ...]:
+    def errors(parameters: Settings) -> tuple[float, ...]:
         return tuple(getattr(parameters, name) for name in names)
 
     return errors
 
 
-def adding_errors(components: int) -> Function:
+def adding_errors(components: int) -> Callable[[Floats, Floats, Floats, Settings], None]:
     """Make `add(rows, predicted, mean, parameters)`: it adds the state's errors of the measurement."""
     errors = tuple(errors_at(component) for component in range(components))
 
-    def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
+    def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Settings) -> None:
         for i, errors_of in enumerate(errors):
             for place in errors_of(parameters):
                 if place >= 0.0:
@@ -164,7 +166,15 @@ def adding_errors(components: int) -> Function:
     return add
 
 
-def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Function:
+# (track, mode, mean, covariance, origin, parameters, memory), see `observing`.
+Observe = Callable[[int, int, Floats, Floats, Floats, Settings, ScanMemory], float]
+# (mean, covariance, origin, parameters, work), see `correlating`.
+Correlate = Callable[[Floats, Floats, Floats, Settings, Workspace], None]
+# (track, mode, detections, mean, covariance, memory), see `updating`.
+UpdateTrack = Callable[[int, int, int, Floats, Floats, ScanMemory], None]
+
+
+def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe:
     """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
 
     Fills the prediction of a track's mode and its whitened innovation covariance. Returns the density's
@@ -180,7 +190,7 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Functio
         mean: Floats,
         covariance: Floats,
         origin: Floats,
-        parameters: Any,
+        parameters: Settings,
         memory: ScanMemory,
     ) -> float:
         state, here = read_state(mean), read_origin(origin)
@@ -205,14 +215,15 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Functio
         add_noise(spread, noise(target(state), here, parameters))
         _, determinant = whiten(innovation, m)
         kalman_step(innovation, m, memory.step.step)
-        return np.exp(-0.5 * determinant) / (2.0 * np.pi) ** (0.5 * m)
+        factor: float = np.exp(-0.5 * determinant) / (2.0 * np.pi) ** (0.5 * m)
+        return factor
 
     return observe
 
 
 def correlating(
     model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
-) -> Function:
+) -> Correlate:
     """Make `correlate(mean, covariance, origin, parameters, work)`: adds sensor errors to a new track.
 
     The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
@@ -235,7 +246,7 @@ def correlating(
             covariance[k, y] += by_y * covariance[k, error]
 
     def correlate(
-        mean: Floats, covariance: Floats, origin: Floats, parameters: Any, work: Workspace
+        mean: Floats, covariance: Floats, origin: Floats, parameters: Settings, work: Workspace
     ) -> None:
         linearise(read_state(mean), read_origin(origin), parameters, work)
         a, b, c, d = work.rows[0, x], work.rows[0, y], work.rows[1, x], work.rows[1, y]
@@ -250,7 +261,7 @@ def correlating(
     return correlate
 
 
-def comparing(kind: ScanSensor) -> Function:
+def comparing(kind: ScanSensor) -> Callable[[int, int, int, ScanMemory], float]:
     """Make `compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
@@ -268,7 +279,7 @@ def comparing(kind: ScanSensor) -> Function:
     return compare
 
 
-def updating(model: Model, kind: ScanSensor) -> Function:
+def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
     """Make `update(track, mode, detections, mean, covariance, memory)`: by associations in the mode."""
     m, correct = len(kind.measured), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
@@ -315,7 +326,7 @@ def split_by_mode(
     """Fill a track's associations in one of its modes; returns how probable the mode is after them."""
     probability, given = memory.probability[track], memory.given
     given[0] = probability[0] * tracks.mode[run, track, mode]
-    after = given[0]
+    after: float = given[0]
     for detection in range(detections):
         given[1 + detection] = 0.0
         if probability[1 + detection] > 0.0:

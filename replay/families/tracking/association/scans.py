@@ -1,13 +1,19 @@
 """Holds unordered scans of detections in columns, and describes the kinds of sensors that give them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.log import Schema
-from fuselog.replay.engine.arrays import Floats, Function, Integers
+from fuselog.replay.engine.arrays import Floats, Integers, Numbers, Settings
 from fuselog.replay.engine.vectors.components import Components
+
+# (target, origin, parameters) -> numbers of a detection. A target is (x_m, vx_mps, y_m, vy_mps).
+OfTarget = Callable[[Numbers, Numbers, Settings], Numbers]
+# A position, the lower triangle of its covariance, and m^2 of the plane for each unit that is measured.
+Born = tuple[Numbers, Numbers, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +40,11 @@ class ScanSensor:
     schema: Schema
     fields: tuple[str, ...]
     measured: Components
-    measure: Function
-    noise: Function
-    detection: Function
-    clutter: Function
-    birth: Function | None = None
+    measure: OfTarget
+    noise: OfTarget
+    detection: Callable[[Numbers, Numbers, Settings], float]
+    clutter: Callable[[Numbers, Settings], float]
+    birth: Callable[[Numbers, Numbers, Settings], Born] | None = None
 
 
 class Scans(NamedTuple):

@@ -8,11 +8,12 @@
 All end a track that has been silent for too long.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.families.tracking.association.association import existence_after
 from fuselog.replay.families.tracking.association.clusters import Weights
 from fuselog.replay.families.tracking.association.tracks import Tracks
@@ -30,9 +31,9 @@ class Management(NamedTuple):
         is_over: (run, place, tracks, parameters) -> whether a track ends.
     """
 
-    wait: Function
-    judge: Function
-    is_over: Function
+    wait: Callable[[int, int, float, Tracks, Settings], None]
+    judge: Callable[[int, int, "Evidence", Tracks, Settings], None]
+    is_over: Callable[[int, int, Tracks, Settings], bool]
 
 
 class Evidence(NamedTuple):
@@ -50,13 +51,15 @@ class Evidence(NamedTuple):
     weights: Weights
 
 
-def is_silent(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
     """Tell whether no sensor that begins tracks has seen a track for too long."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
-    return silent_s > (p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s)
+    longest_s: float = p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s
+    is_over: bool = silent_s > longest_s
+    return is_over
 
 
-def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
+def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
     """Do nothing: time alone changes nothing."""
     return
 
@@ -69,12 +72,12 @@ def confirm(run: int, place: int, tracks: Tracks) -> None:
 # Existence
 
 
-def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
+def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
     """Let targets vanish at a steady rate."""
     tracks.existence[run, place] *= np.exp(-duration_s / p.survival_s)
 
 
-def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
     """Judge by Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
@@ -82,7 +85,7 @@ def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p:
     tracks.is_confirmed[run, place] = tracks.existence[run, place] >= needed
 
 
-def does_not_exist(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+def does_not_exist(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
     """Tell whether it is silent, or improbable."""
     return is_silent(run, place, tracks, p) or tracks.existence[run, place] < p.ending_existence
 
@@ -90,7 +93,7 @@ def does_not_exist(run: int, place: int, tracks: Tracks, p: Any) -> bool:
 # Hits
 
 
-def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
     """Count chances and hits; a miss counts only where a detection was to be expected."""
     is_hit = evidence.probability[0] < 0.5
     if is_hit or evidence.detectable >= CHANCE:
@@ -101,7 +104,7 @@ def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any)
         confirm(run, place, tracks)
 
 
-def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
     """Tell whether it is silent, or was not hit often enough in its first chances."""
     is_young = not tracks.is_confirmed[run, place]
     return is_silent(run, place, tracks, p) or (is_young and tracks.chances[run, place] >= p.chances)
@@ -110,7 +113,7 @@ def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Any) -> bool:
 # Score
 
 
-def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
+def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
     """Add sum_j b_j log(w_j / b_j), with the weights w of a target that exists.
 
     Where one map is chosen that is the log of its weight; with all maps of one track, log sum_j w_j.
@@ -131,7 +134,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any
         confirm(run, place, tracks)
 
 
-def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Any) -> bool:
+def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
     """Tell whether it is silent, or clutter explains it better since its birth or highest score."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))

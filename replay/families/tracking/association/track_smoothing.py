@@ -6,11 +6,11 @@ over them.
 """
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Integers
+from fuselog.replay.engine.arrays import Floats, Integers, Settings
+from fuselog.replay.inference.model.functions import ModelFunction
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import Estimates
 from fuselog.replay.inference.smoothing.backward_pass import (
@@ -25,7 +25,12 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 
 
 def smooth_tracks(
-    stage: Stage, parameters: Any, track: Integers, time_ns: Integers, mean: Floats, covariance: Floats
+    stage: Stage,
+    parameters: Settings,
+    track: Integers,
+    time_ns: Integers,
+    mean: Floats,
+    covariance: Floats,
 ) -> tuple[Floats, Floats]:
     """Smooth the filtered estimates of tracks: means (n, size) and covariances (n, size, size).
 
@@ -59,7 +64,12 @@ def smooth_tracks(
 
 
 def _nodes(
-    stage: Stage, parameters: Any, offsets: Integers, time_ns: Integers, mean: Floats, covariance: Floats
+    stage: Stage,
+    parameters: Settings,
+    offsets: Integers,
+    time_ns: Integers,
+    mean: Floats,
+    covariance: Floats,
 ) -> Nodes:
     """Make nodes of estimates, with how each comes from the one before.
 
@@ -84,7 +94,9 @@ def _nodes(
     )
 
 
-def _motion(stage: Stage, parameters: Any, mean: Floats, duration_s: Floats) -> tuple[Floats, Floats]:
+def _motion(
+    stage: Stage, parameters: Settings, mean: Floats, duration_s: Floats
+) -> tuple[Floats, Floats]:
     """Return the matrices (n, size, size) of a linear motion over so long each, and of its noise."""
     size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
     assert stage.motion.noise is not None
@@ -93,7 +105,8 @@ def _motion(stage: Stage, parameters: Any, mean: Floats, duration_s: Floats) -> 
         moved = stage.motion.move(tuple(unit), (), duration_s, parameters)
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
-    lower = stage.motion.noise(state, duration_s, parameters)
+    noise_of: ModelFunction = stage.motion.noise  # of many durations at once
+    lower = noise_of(state, duration_s, parameters)
     rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
     for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):
         noise[:, i, j] = noise[:, j, i] = entry

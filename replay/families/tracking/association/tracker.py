@@ -1,13 +1,14 @@
 """Puts a tracker together: the model of its targets, the kinds of its sensors, how tracks move."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar, cast
 
-from fuselog.replay.engine.arrays import Floats, Function
+from fuselog.replay.engine.arrays import AnyArgument, Floats
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.families.tracking.association.scans import ScanSensor
 from fuselog.replay.families.tracking.association.tracks import Tracks
 from fuselog.replay.inference.kalman.predict import linear_motion
-from fuselog.replay.inference.kalman.steps import Gaussian, Steps, gaussian_filter
+from fuselog.replay.inference.kalman.steps import Belief, Gaussian, Steps, gaussian_filter
 from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.stage import Stage
@@ -61,7 +62,13 @@ def moving(stage: Stage) -> Steps:
     return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
 
 
-def believing(stage: Stage) -> Function:
+class BeliefOf(Protocol):
+    """Gives the tracks of a run as the filters have them, first axis = place."""
+
+    def __call__(self, run: int, tracks: Tracks, /) -> Belief: ...
+
+
+def believing(stage: Stage) -> BeliefOf:
     """Make `belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
 
     def of_one(run: int, tracks: Tracks) -> Gaussian:
@@ -75,16 +82,22 @@ def believing(stage: Stage) -> Function:
     return of_modes if stage.modes else of_one
 
 
-def choosing(functions: list[Function]) -> Function:
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def choosing(
+    functions: list[Callable[Arguments, Result]],
+) -> Callable[Concatenate[int, Arguments], Result]:
     """Make `call(kind, ...)`: the function of this number."""
 
-    def call(kind: int, *arguments: Any) -> Any:
+    def call(kind: int, *arguments: AnyArgument) -> AnyArgument:
         for number in range_of(1, len(functions)):
             if kind == number:
-                return functions[number](*arguments)
-        return functions[0](*arguments)
+                return functions[number](*arguments)  # type: ignore[call-arg]
+        return functions[0](*arguments)  # type: ignore[call-arg]
 
-    return call
+    return cast(Callable[Concatenate[int, Arguments], Result], call)
 
 
 def place_of(model: Model) -> tuple[int, int]:

@@ -8,12 +8,12 @@ tracks; and a management says which tracks are those of targets, and which end (
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats, Function
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Columns, Floats, Numbers, Settings
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.families.tracking.association.association import ASSOCIATIONS
 from fuselog.replay.families.tracking.association.births import beginning, births_of, ending
@@ -46,8 +46,8 @@ from fuselog.replay.families.tracking.association.tracker import (
 from fuselog.replay.families.tracking.association.tracks import NEVER, Tracks
 from fuselog.replay.inference.kalman.steps import UNKNOWN, Interval
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
-from fuselog.replay.inference.model.settings import reading_settings
-from fuselog.replay.inference.run.loops import over_events
+from fuselog.replay.inference.model.settings import ReadSettings, reading_settings
+from fuselog.replay.inference.run.loops import Follow, over_events
 
 
 class ScanInputs(NamedTuple):
@@ -58,7 +58,7 @@ class ScanInputs(NamedTuple):
     newborn: Newborn
 
 
-def tracking(tracker: Tracker, read: Function) -> Function:
+def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
     """Make the loop over scans, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
@@ -110,12 +110,12 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     return over_events(take_scan, record, fails=False)
 
 
-def advancing(tracker: Tracker) -> Function:
+def advancing(tracker: Tracker) -> Callable[[int, int, Tracks, Settings, ScanMemory], None]:
     """Make `advance(run, time_ns, tracks, p, memory)`: the prediction of all tracks."""
     belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
-    def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: ScanMemory) -> None:
+    def advance(run: int, time_ns: int, tracks: Tracks, p: Settings, memory: ScanMemory) -> None:
         """Predict all tracks."""
         duration_s = (time_ns - tracks.time_ns[run]) * 1e-9
         if tracks.time_ns[run] != NEVER and duration_s > 0.0:
@@ -129,7 +129,11 @@ def advancing(tracker: Tracker) -> Function:
     return advance
 
 
-def association_weights(tracker: Tracker) -> Function:
+# (run, scan, count, scans, tracks, parameters, memory): takes the detections of a scan.
+TakeDetections = Callable[[int, int, int, Scans, Tracks, Settings, ScanMemory], None]
+
+
+def association_weights(tracker: Tracker) -> TakeDetections:
     """Make `weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
@@ -139,7 +143,9 @@ def association_weights(tracker: Tracker) -> Function:
     begins, birth_number, birth = births_of(kinds)
     read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
 
-    def detectable(run: int, place: int, kind: int, origin: Any, tracks: Tracks, p: Any) -> float:
+    def detectable(
+        run: int, place: int, kind: int, origin: Numbers, tracks: Tracks, p: Settings
+    ) -> float:
         """Compute how probable it is that a sensor detects a track's target."""
         total = 0.0
         for mode in range(modes):
@@ -148,7 +154,7 @@ def association_weights(tracker: Tracker) -> Function:
         return total
 
     def weigh(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Settings, memory: ScanMemory
     ) -> None:
         """Fill the weights of all pairs, and which detections are outside all gates."""
         kind, weights, origin = scans.kind[scan], memory.weights, read_pair(scans.origin[scan])
@@ -189,7 +195,7 @@ def association_weights(tracker: Tracker) -> Function:
     return weigh
 
 
-def processing(tracker: Tracker) -> Function:
+def processing(tracker: Tracker) -> TakeDetections:
     """Make `process(run, scan, count, scans, tracks, p, memory)`: updates by a scan's associations."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
@@ -210,7 +216,7 @@ def processing(tracker: Tracker) -> Function:
             tracks.log_mode[run, place, mode] = np.log(after) if after > 0.0 else -np.inf
 
     def process(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Settings, memory: ScanMemory
     ) -> None:
         """Update all tracks by the associations, and what is known of their targets' existence."""
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
@@ -238,7 +244,7 @@ BATCH = 1000
 
 
 @lru_cache(maxsize=16)
-def _compiled(tracker: Tracker) -> Callable[..., None]:
+def _compiled(tracker: Tracker) -> OverRuns:
     follow = tracking(tracker, reading_settings(tracker.names))
     return compile_over_runs(follow, allocates=False, title="a tracker")
 
@@ -258,7 +264,7 @@ def track_scans(
     Returns:
         The tracks after them; and by batch, its scans and their outputs.
     """
-    columns: Any = before
+    columns: Columns = before
     tracks = Tracks(*(column.copy() for column in columns))
     runs, places = tracks.number.shape
     begin, end = scans.offsets[:-1], scans.offsets[1:]

@@ -124,10 +124,11 @@ def are_near(
 ) -> bool:
     """Tell whether two components of two tracks' means, together, differ by less."""
     x, y = components
-    return (
+    is_near: bool = (
         np.hypot(
             expected(run, place, x, tracks) - expected(run, other, x, tracks),
             expected(run, place, y, tracks) - expected(run, other, y, tracks),
         )
         < within
     )
+    return is_near
