@@ -11,7 +11,7 @@ Tracking and Navigation, 2001, section 5.4; Durbin and Koopman, Time Series Anal
 Methods, 2nd ed. 2012, chapter 7.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -95,7 +95,7 @@ class Likelihood:
     readings: Mapping[str, Reading] = field(default_factory=dict)
     broad: Mapping[str, float] = field(default_factory=dict)
     later_ns: int = 0
-    _bound: dict[str, list[Bound]] = field(default_factory=dict)
+    _bound: dict[Hashable, list[Bound]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
         """Take a trial for the one that others are compared with; its innovations by topic.
@@ -103,7 +103,7 @@ class Likelihood:
         From the likeliest part of broad starts, where the log does not state one. Raises BadInput where
         the estimator cannot begin.
         """
-        bound = bind(self.label, [trial.source], trial.settings)
+        bound = self._bound_to(trial, _key(trial))
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
         later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
         self.starts = broad_starts(replace(trial.source, streams=later), bound)
@@ -119,7 +119,7 @@ class Likelihood:
             if topic not in reading.controls and len(trial.source.streams[topic])
         }
         scored = self._scored(trial, bound)
-        [parts] = self._innovations([trial], [scored])
+        [parts] = self._innovations(bound, [scored])
         found = max(parts, key=_stated)
         for name, reading in self.readings.items():
             if _topic(name) in found:
@@ -140,25 +140,25 @@ class Likelihood:
 
         Minus infinity where the estimator fails or loses measurements.
         """
-        together: dict[str, list[int]] = {}
+        together: dict[Hashable, list[int]] = {}
         for place, trial in enumerate(trials):
             together.setdefault(_key(trial), []).append(place)
         found = np.full((len(trials), count), -np.inf)
-        for places in (part for each in together.values() for part in self._parts(trials, each)):
-            of_key = [trials[place] for place in places]
+        for key, of_key in together.items():
             try:
-                bound = self._bound_to(of_key[0])
+                bound = self._bound_to(trials[of_key[0]], key)
             except BadInput:  # no run can be followed with these
                 continue
-            scored = [self._scored(trial, bound) for trial in of_key]
-            outputs = self._innovations(of_key, scored)
-            for place, part, of_run in zip(places, scored, outputs, strict=True):
-                found[place] = self._totals(part, of_run, count)
+            for places in self._parts(trials, of_key):
+                scored = [self._scored(trials[place], bound) for place in places]
+                outputs = self._innovations(bound, scored)
+                for place, part, of_run in zip(places, scored, outputs, strict=True):
+                    found[place] = self._totals(part, of_run, count)
         return found
 
     def disturbed(self, trial: Trial) -> list[MemorySource]:
         """Return copies of a trial's log with noise added to what drives."""
-        return disturbed(trial.source, self._bound_to(trial))
+        return disturbed(trial.source, self._bound_to(trial, _key(trial)))
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
         """Divide trials into portions that memory holds."""
@@ -166,8 +166,7 @@ class Likelihood:
         size = max(1, MOST_MESSAGES // max(messages, 1))
         return (places[first : first + size] for first in range(0, len(places), size))
 
-    def _bound_to(self, trial: Trial) -> list[Bound]:
-        key = _key(trial)
+    def _bound_to(self, trial: Trial, key: Hashable) -> list[Bound]:
         if key not in self._bound:
             self._bound[key] = bind(self.label, [trial.source], trial.settings)
         return self._bound[key]
@@ -203,22 +202,22 @@ class Likelihood:
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
-        self, trials: Sequence[Trial], scored: Sequence[Scored]
+        self, bound: Sequence[Bound], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
         """Return the innovations of trials of equal settings, by part and topic; none where it fails."""
         count = part_count(self.starts)
         sources = [each.source for each in scored for _ in range(count)]
         begins_ns = [each.begin_ns for each in scored]
         try:
-            bound = [
+            begun = [
                 begun_broadly(begun_at(each, self.starts), begins_ns, count)
                 if _is_free(each)
                 else begun_at(each, self.starts)
-                for each in self._bound_to(trials[0])
+                for each in bound
             ]
-            outputs = collect(replay(Ensemble(sources), bound, is_part=True))
+            outputs = collect(replay(Ensemble(sources), begun, is_part=True))
         except BadInput:  # no run can be followed with these
-            return [[{}] * count for _ in trials]
+            return [[{}] * count for _ in scored]
         innovations = {
             topic: rows
             for topic, rows in outputs.items()
@@ -256,7 +255,8 @@ class Likelihood:
             lacking = all_ - scored.beyond.get(name, 0) - len(stream)
             if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
                 return {}
-            stream = stream.take(first_of_each(stream, share))
+            if share < 1.0:
+                stream = stream.take(first_of_each(stream, share))
             is_in = stream["accepted"] != 0
             total = float(np.sum(stream["log_likelihood"][is_in]))
             if not is_in.all():
@@ -361,10 +361,10 @@ def _stated(innovations: Mapping[str, Stream]) -> float:
     return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
-def _key(trial: Trial) -> str:
+def _key(trial: Trial) -> Hashable:
     """Return what has to be equal of trials that are replayed together."""
-    stated = {topic: stream.metadata for topic, stream in trial.source.streams.items()}
-    return repr((sorted(trial.settings.items()), stated))
+    stated = [(topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items()]
+    return repr(sorted(trial.settings.items())), *stated
 
 
 def _extents(stream: Stream) -> Floats:

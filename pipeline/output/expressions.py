@@ -136,7 +136,8 @@ def parse(expression: str) -> ast.expr:
     return tree
 
 
-def names_in(expression: str) -> set[str]:
+@cache
+def names_in(expression: str) -> frozenset[str]:
     """Return the names of numbers in an expression; raises BadInput where it is none."""
     tree = parse(expression)
     nodes = list(ast.walk(tree))
@@ -149,7 +150,7 @@ def names_in(expression: str) -> set[str]:
         and isinstance(node.slice.value, str)
     }
     named = [node for node in nodes if isinstance(node, ast.Name)]
-    return {node.id for node in named if id(node) not in called | of_metrics}
+    return frozenset(node.id for node in named if id(node) not in called | of_metrics)
 
 
 def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:

@@ -13,6 +13,7 @@ from tests.claims.pages import stored
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("name", "runs"), [("bingham-2d", 3), ("bingham-4d", 5), ("ispace-stress", 3), ("los-moving", 3)]
 )

@@ -20,7 +20,7 @@ from tests.goldens.recipes import RECIPES, covered, index, unpack
 from tests.goldens.store import ALLOWED
 from tests.older_cpu import older_cpu
 
-pytestmark = pytest.mark.paper
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 SIMULATED = [name for name, recipe in RECIPES.items() if not recipe.importer]
 IMPORTED = [name for name, recipe in RECIPES.items() if recipe.importer]
