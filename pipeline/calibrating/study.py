@@ -17,6 +17,7 @@ from fuselog.pipeline.output.charts import coverage
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
 
 WIDE = (1000.0, 1000.0, 1.0)  # of a start, in m and rad
@@ -29,14 +30,21 @@ class CalibrationOptions(Parameters):
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.
+        motions: the motions to ask what they leave undetermined.
     """
 
     seeds: tuple[NonNegativeInt, ...] = ()
+    motions: tuple[str, ...] = (*MOTIONS,)
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: CalibrationOptions = setting.options
+    if unknown := [each for each in options.motions if each not in MOTIONS]:
+        raise BadInput(
+            f"options.motions: {unknown[0]!r} is no motion of study calibration; it has "
+            + ", ".join(MOTIONS)
+        )
     [(label, settings)] = experiment.estimators.items()
     wanted = settings | NOISE
     rows: list[dict[str, Any]] = []
@@ -55,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         )
         outcome.metrics[f"{label}.spread.{place}-{name}"] = spread
     outcome.figures["coverage"] = coverage("calibration of a car", held)
-    motions = [_left_open(label, wanted, motion) for motion in MOTIONS]
+    motions = [_left_open(label, wanted, motion) for motion in options.motions]
     outcome.tables["motions"] = pd.DataFrame(motions, columns=["motion", *NAMES])
     for name, *are_open in motions:
         outcome.metrics |= {

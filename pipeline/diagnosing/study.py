@@ -6,7 +6,7 @@ removing a fault gains in log-likelihood says whether it can be seen at all: of 
 scenarios some cannot, as a delay of the only sensor of a vehicle that nothing else moves.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters, merge
 from fuselog.recorders.recording import record_run
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
@@ -48,10 +49,13 @@ class Options(Parameters):
     """States what is diagnosed beside the scenarios.
 
     Attributes:
+        faults: the names of the faults to plant, such as `landmarks-bias`; `landmarks-none` is a log
+            without a fault. Without names all are planted.
         battery_seed: the first seed of the battery, see `fuselog.pipeline.diagnosing.battery.battery`.
         battery_runs: of each of its cells, and at most as many as of each fault; none unless given.
     """
 
+    faults: tuple[str, ...] = ()
     battery_seed: NonNegativeInt = 0
     battery_runs: NonNegativeInt = 0
 
@@ -200,19 +204,18 @@ SCENARIOS = {
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     rows: list[dict[str, Any]] = []
-    clean: list[MemorySource] = []
-    for name, scenario in SCENARIOS.items():
-        for fault_name, fault in {CLEAN_RUN: Fault(), **scenario.faults}.items():
-            title = f"{name}: {fault_name}"
-            for run in setting.progress(range(experiment.runs), title, experiment.runs):
-                source, faulty = _recorded(scenario, fault, experiment.seed, run)
-                found = diagnose(faulty, scenario.estimator, set=merge(fault.settings, OPEN))
-                row = {"scenario": name, "fault": fault_name, "run": run}
-                rows.append(
-                    {**row, "worth": _worth(scenario, fault, source, faulty), **_named_by(fault, found)}
-                )
-                if fault_name == CLEAN_RUN:
-                    clean.append(source)
+    clean: dict[tuple[str, int], MemorySource] = {}
+    for name, fault_name in _chosen(setting.options.faults):
+        scenario = SCENARIOS[name]
+        fault = scenario.faults.get(fault_name, Fault())
+        for run in setting.progress(range(experiment.runs), f"{name}: {fault_name}", experiment.runs):
+            source, faulty = _recorded(scenario, fault, experiment.seed, run)
+            found = diagnose(faulty, scenario.estimator, set=merge(fault.settings, OPEN))
+            row = {"scenario": name, "fault": fault_name, "run": run}
+            rows.append(
+                {**row, "worth": _worth(scenario, fault, source, faulty), **_named_by(fault, found)}
+            )
+            clean.setdefault((name, run), source)
     runs = pd.DataFrame(rows)
     faults = runs.groupby(["scenario", "fault"], sort=False).apply(_summary).reset_index()
     outcome = Outcome(tables={"faults": faults, "diagnosed": runs}, figures={"faults": _chart(faults)})
@@ -225,8 +228,22 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         tables, metrics = battery.results(seeds, setting.progress)
         outcome.tables |= tables
         outcome.metrics |= metrics
-    outcome.input_sha256 = hash_streams(clean)
+    outcome.input_sha256 = hash_streams([*clean.values()])
     return outcome
+
+
+def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
+    """Return the scenario and the fault of each name, or all of them without names."""
+    known = {
+        f"{name}-{fault}": (name, fault)
+        for name, scenario in SCENARIOS.items()
+        for fault in (CLEAN_RUN, *scenario.faults)
+    }
+    if unknown := [each for each in names if each not in known]:
+        raise BadInput(
+            f"options.faults: {unknown[0]!r} is no fault of study diagnosis; it has {', '.join(known)}"
+        )
+    return [where for name, where in known.items() if not names or name in names]
 
 
 def battery_seeds(options: Options, runs: int) -> range:

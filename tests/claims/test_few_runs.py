@@ -1,28 +1,10 @@
-"""Claims of few runs: decided by intervals or not at all, and never the other way than those of all."""
-
-from pathlib import Path
-
-import pytest
+"""Claims of few runs: decided by intervals or not at all."""
 
 from fuselog.pipeline.output.claims import decide
-from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of, run_experiment
+from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
 from fuselog.recorders.parameters import build
 from fuselog.recorders.registry import load
-from tests.claims.few_runs import opposite
 from tests.claims.pages import stored
-
-
-@pytest.mark.paper
-@pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize(
-    ("name", "runs"), [("bingham-2d", 3), ("bingham-4d", 5), ("ispace-stress", 3), ("los-moving", 3)]
-)
-def test_few_runs_never_say_the_opposite(name: str, runs: int, tmp_path: Path) -> None:
-    """As all shipped experiments that tests of studies run with fewer runs, see their `conftest`."""
-    _, experiment = load_experiment(name, {}, {"runs": runs})
-    result = run_experiment(name, experiment, tmp_path / "few", logs=0)
-    assert result.claims
-    assert opposite(name, result.settings, result.claims) == []
 
 
 def test_no_claim_of_few_runs_is_decided_without_an_interval() -> None:

@@ -67,9 +67,21 @@ def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(largest_m, runs, 
     assert found.verdict == verdict
 
 
-def test_a_drive_without_outage_is_named(fuselog, tmp_path):
-    command = ["run", "imu-grades", "--out", str(tmp_path / "out"), "--set"]
-    assert (
-        "0 outages; give exactly one"
-        in fuselog(*command, "gnss.outages_s=[]", "--set", "duration_s=12.0", "--set", "runs=1").err
-    )
+@pytest.mark.parametrize(
+    ("outages_s", "sentence"),
+    [
+        ("[]", "0 outages; give exactly one"),
+        ("[[8, 11]]", "no estimate is 10 s after the start of the outage; give a longer outage"),
+    ],
+)
+def test_a_drive_without_a_long_outage_is_refused(outages_s, sentence, fuselog, tmp_path):
+    command = [
+        "run",
+        "imu-grades",
+        "--out",
+        str(tmp_path / "out"),
+        "--set",
+        f"gnss.outages_s={outages_s}",
+    ]
+    assert sentence in fuselog(*command, "--set", "duration_s=12.0", "--set", "runs=1").err
+    assert not (tmp_path / "out").exists()

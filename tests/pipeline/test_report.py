@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import chdir
 from html.parser import HTMLParser
 from importlib import resources
 from itertools import pairwise
@@ -641,33 +640,3 @@ def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert {each for each in page if not each.isprintable()} <= {*"\n\t\u00a0\u2009\u202f"}
     assert "<title>a\\x9b2J\\x1b[2J\\x07\\u202e\\u2028b: fuselog report</title>" in page
-
-
-@pytest.mark.parametrize(
-    ("name", "smaller"),
-    [
-        ("relative-bearings", ["--runs", "2"]),
-        ("los-two-sensors", ["--runs", "2", "--set", "passes=1"]),
-        ("navigation-simulated", ["--runs", "1", "--set", "duration_s=12"]),
-        ("set-filter", ["--runs", "1", "--set", "duration_s=3"]),
-        ("vehicles-ctm4", ["--runs", "1", "--set", "duration_s=3", "--set", "options.few_runs=0"]),
-        ("vehicles-cv", ["--runs", "1", "--set", "duration_s=3"]),
-        ("warehouse-uwb", ["--runs", "1", "--set", "duration_s=5"]),
-    ],
-)
-def test_experiments_that_no_other_test_runs_are_run_reported_and_viewed(
-    name: str, smaller: list[str], tmp_path: Path, fuselog: Fuselog
-) -> None:
-    with chdir(tmp_path):
-        for command in (
-            ["run", name, *smaller, "--logs", "1", "--out", "result"],
-            ["report", "result", "--out", "page.html"],
-            ["view", "result", "--save", "saved.rrd"],
-        ):
-            said = fuselog(*command)
-            assert said.code == 0, said.err
-        assert Path("saved.rrd").stat().st_size > 1000
-        result = json.loads(Path("result/result.json").read_text())
-        assert not re.search(r"first-(?!1-)\d+-runs", " ".join(result["metrics"]))
-        assert "20 runs" not in " ".join(claim["claim"] for claim in result["claims"])
-        assert not re.search(r">\s*-?(nan|inf)\s*<", Path("page.html").read_text(), re.IGNORECASE)

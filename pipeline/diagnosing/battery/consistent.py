@@ -1,13 +1,14 @@
 """Counts the causes that are named in logs of the car with nothing wrong, whatever noise is the largest.
 
-The wheels have the noise of `car`. What they err by between two fixes is RATIOS times the error of a
-fix, and between two headings as many times that of a heading.
+The wheels have the noise of `car`. Their error between two fixes is a multiple of the error of a fix,
+and between two headings a multiple of that of a heading; the options list these ratios.
 """
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from itertools import product
+from typing import Annotated, Any, NamedTuple
 
 import pandas as pd
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from fuselog.pipeline.diagnosing.battery.car import (
     COMPASS_STEP_S,
@@ -22,17 +23,33 @@ from fuselog.pipeline.diagnosing.causes import seek
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.streams.sources import MemorySource
 
-TO_FIX = (0.1, 0.3, 1.0, 3.0, 10.0)
-TO_COMPASS = (None, 0.1, 1.0, 10.0)
+
+class FalseCausesOptions(Parameters):
+    """States which settings of the noise are tried: each of one with each of the other.
+
+    Attributes:
+        to_fix: ratios of the wheels' error between two fixes to the error of a fix.
+        to_compass: ratios of their error between two headings to that of a heading; 0 is no compass.
+    """
+
+    to_fix: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.1, 0.3, 1.0, 3.0, 10.0)
+    to_compass: Annotated[tuple[NonNegativeFloat, ...], Field(min_length=1)] = (0.0, 0.1, 1.0, 10.0)
+
+    def ratios(self) -> list["Ratios"]:
+        """Return all settings."""
+        return [
+            Ratios(to_fix, to_compass) for to_compass, to_fix in product(self.to_compass, self.to_fix)
+        ]
 
 
 class Ratios(NamedTuple):
     """States how many times larger the wheels' error between two messages is than a message's own."""
 
     to_fix: float
-    to_compass: float | None  # None: there is no compass
+    to_compass: float  # 0: there is no compass
 
     @property
     def noise(self) -> Noise:
@@ -42,17 +59,10 @@ class Ratios(NamedTuple):
         return Noise(fix_sigma_m=fix_sigma_m, compass_sigma_rad=compass_sigma_rad)
 
 
-def all_ratios() -> Iterator[Ratios]:
-    """Yield the settings of the car."""
-    for to_compass in TO_COMPASS:
-        for to_fix in TO_FIX:
-            yield Ratios(to_fix, to_compass)
-
-
 def log_of(ratios: Ratios, seed: int) -> MemorySource:
     """Return a log in which nothing is wrong."""
     car = drive(seed, noise=ratios.noise)
-    return recorded(car, has_compass=ratios.to_compass is not None, has_prior=True)
+    return recorded(car, has_compass=ratios.to_compass > 0.0, has_prior=True)
 
 
 def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
@@ -65,23 +75,24 @@ def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
-    outcome = Outcome()
-    for ratios in all_ratios():
-        title = f"to fixes {ratios.to_fix:g}, to compass {ratios.to_compass or 0:g}"
+    outcome, every = Outcome(), setting.options.ratios()
+    for ratios in every:
+        title = f"to fixes {ratios.to_fix:g}, to compass {ratios.to_compass:g}"
         own = [tried(ratios, seed) for seed in setting.progress(seeds, title, len(seeds))]
-        case = f"{ratios.to_fix:g}-{ratios.to_compass or 0:g}"
+        case = f"{ratios.to_fix:g}-{ratios.to_compass:g}"
         outcome.metrics[f"ekf.false_causes.{case}"] = float(sum(bool(each["cause"]) for each in own))
         rows += own
     found = pd.DataFrame(rows)
     outcome.metrics["ekf.false_causes.all"] = float((found["cause"] != "").sum())
     outcome.metrics["ekf.logs"] = float(len(found))
     outcome.tables["tried"] = found
-    outcome.input_sha256 = hash_streams([log_of(ratios, experiment.seed) for ratios in all_ratios()])
+    outcome.input_sha256 = hash_streams([log_of(ratios, experiment.seed) for ratios in every])
     return outcome
 
 
 FALSE_CAUSES = Study(
     "how often a diagnosis names a cause in a log with nothing wrong, whatever noise is the largest",
     study,
-    runs="logs of each of 20 settings of the noise",
+    FalseCausesOptions,
+    runs="logs of each setting of the noise, of which there are 20 unless options name others",
 )

@@ -97,12 +97,18 @@ def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
 
 
 def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -> pd.DataFrame:
-    """Find what each run's measurements tell least of: an eigenvalue, in priors, and its direction."""
+    """Find what each run's measurements tell least of: an eigenvalue, in priors, and its direction.
+
+    Rounding leaves a singular information matrix an eigenvalue of either sign, up to the precision of
+    its largest one: the least eigenvalue is stated as no less than that.
+    """
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})
     stream = found["/estimates/observability/observability"].stream
     directions = dict(zip(stream.components, stream["direction"].T, strict=True))
-    return pd.DataFrame({"least_eigenvalue": stream["eigenvalues"][:, 0], **directions})
+    eigenvalues = stream["eigenvalues"]
+    least = np.maximum(eigenvalues[:, 0], np.finfo(float).eps * eigenvalues[:, -1])
+    return pd.DataFrame({"least_eigenvalue": least, **directions})
 
 
 def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:

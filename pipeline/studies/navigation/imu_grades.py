@@ -21,6 +21,8 @@ from fuselog.recorders.simulators.navigation_parameters import NavigationParamet
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.errors.evaluation import Errors
 
+AFTER_S = (10.0, 20.0, 30.0)  # since the last fix: when errors become metrics
+
 
 class Options(Parameters):
     """States the grades.
@@ -56,8 +58,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     table = pd.concat(tables)
     largest = table.groupby(["grade", "estimator", "after_s"], sort=False)["error_m"].max().reset_index()
     for grade, estimator, after_s, error_m in largest.itertuples(index=False):
-        if after_s in (10.0, 20.0, 30.0):
+        if after_s in AFTER_S:
             outcome.metrics[f"{estimator}.horizontal_95_m.{grade}-{after_s:g}s"] = float(error_m)
+    if not outcome.metrics:
+        raise BadInput(
+            f"study imu-grades: no estimate is {AFTER_S[0]:g} s after the start of the outage; give a "
+            "longer outage, as gnss.outages_s=[[50, 80.5]], and estimates every 0.5 s"
+        )
     outcome.input_sha256 = hash_streams(sources)
     outcome.tables["largest"] = largest
     outcome.figures["outage"] = _chart(largest)

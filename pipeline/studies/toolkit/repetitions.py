@@ -65,8 +65,9 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
-    """Compute the mean of independent values, and Student's interval of it; NaN for one value."""
-    count, mean = len(values), float(np.mean(values))
+    """Compute the mean of independent values, and Student's interval; NaN for what they do not tell."""
+    count = len(values)
+    mean = float(np.mean(values)) if count else np.nan
     if count < 2:
         return Interval(mean, np.nan, np.nan)
     half = stdtrit(count - 1, 0.5 + probability / 2) * np.std(values, ddof=1) / np.sqrt(count)

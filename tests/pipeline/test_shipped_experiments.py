@@ -1,0 +1,128 @@
+"""Every shipped experiment that needs no data of others runs, and its result is reported and viewed."""
+
+import re
+from collections.abc import Callable
+from contextlib import chdir
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fuselog.pipeline.output.results import read_result
+from fuselog.pipeline.runs.experiment import load_experiment
+from fuselog.pipeline.runs.inputs import shipped
+from tests.claims.few_runs import opposite
+
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
+
+Fuselog = Callable[..., Any]
+
+# the smallest form of each: its options of `run`, then what --set sets
+SMALLEST: dict[str, tuple[str, ...]] = {
+    "acoustic": ("--runs 2", "shots=2", "options.multipliers=[1.0]", "options.maps.step_m=50.0"),
+    "acoustic-sequence": ("--runs 2", "shots=3", "mixture.kind=particles:20"),
+    "bingham-2d": ("--runs 2",),
+    "bingham-4d": ("--runs 2",),
+    "biometrics-sequential-simulated": (
+        "--runs 1",
+        "users=40",
+        "ratio.genuine_components=1",
+        "ratio.impostor_components=1",
+        "ratio.iterations=2",
+        "ratio.folds=2",
+        "options.sequences=50",
+        "options.replicates=20",
+        "options.watched=4",
+        "options.watched_probes=200",
+    ),
+    "biometrics-simulated": ("--runs 2", "users=30", "low_galleries=2", "options.replicates=5"),
+    "calibration": ("--runs 1", "options.seeds=[3000]", "options.motions=[]"),
+    "crossing": (
+        "--runs 1",
+        "duration_s=12",
+        "options.clutter_per_scan=[1.0]",
+        "options.detection_probability=[0.9]",
+    ),
+    "diagnosis": ("--runs 1", 'options.faults=["landmarks-bias"]', "options.battery_runs=0"),
+    "ellipsoid": ("--runs 1", "options.seeds=[5000]"),
+    "extended-target": ("--runs 2",),
+    "false-causes": ("--runs 1", "options.to_fix=[1.0]", "options.to_compass=[0.0]"),
+    "imu-grades": ("--runs 1", "duration_s=22", "gnss.outages_s=[[10, 21]]"),
+    "ispace": ("--runs 2", "steps=20"),
+    "ispace-stress": ("--runs 2",),
+    "landmarks": ("--runs 1", "duration_s=2"),
+    "lcd-sampling": ("--runs 1", "options.sizes=[[2, 5]]", "options.starts=1"),
+    "los-moving": ("--runs 2", "duration_s=2"),
+    "los-three-sensors": ("--runs 2", "passes=1"),
+    "los-two-sensors": ("--runs 2", "passes=1"),
+    "lrkf-dimension": (
+        "--runs 2",
+        "options.dimensions=[2]",
+        "options.functions=2",
+        "options.drives.landmarks.parameters.duration_s=3",
+        "options.drives.navigation.parameters.duration_s=12",
+        "rukf-12.kind=lrkf:rukf-1",
+        "rukf-4.kind=lrkf:rukf-1",
+    ),
+    "manoeuvres": ("--runs 1", "duration_s=5"),
+    "navigation-heading": ("--runs 1", "duration_s=12"),
+    "navigation-simulated": ("--runs 1", "duration_s=12"),
+    "navigation-unknown-heading": ("--runs 1", "duration_s=12"),
+    "reactor": ("--runs 2",),
+    "relative-bearings": ("--runs 2",),
+    "sensor-noise": ("--runs 1", "options.seeds=[1000]"),
+    "set-filter": ("--runs 1", "duration_s=3"),
+    "torus-filter": ("--runs 2", "options.grid_cells=16"),
+    "torus-propagation": ("--runs 2", "options.correlations=[0.0]", "options.couplings_rad=[0.5]"),
+    "tuning": ("--runs 2", "options.durations_s=[10.0]"),
+    "vehicles-ctm2": ("--runs 1", "duration_s=3"),
+    "vehicles-ctm4": ("--runs 1", "duration_s=3", "options.few_runs=0"),
+    "vehicles-cv": ("--runs 1", "duration_s=2"),
+    "vehicles-scaling": ("--runs 1", "duration_s=2", "options.vehicles=[2]"),
+    "warehouse-uwb": ("--runs 1", "duration_s=5"),
+}
+# studies of numbers, without a log to draw
+WITHOUT_TIMELINE = {
+    "calibration",
+    "diagnosis",
+    "ellipsoid",
+    "false-causes",
+    "lrkf-dimension",
+    "sensor-noise",
+    "torus-propagation",
+    "tuning",
+    "vehicles-scaling",
+}
+
+
+def test_each_that_ships_its_data_has_a_smallest_form() -> None:
+    """Others import data, and `test_report` makes pages of their kept results."""
+    assert {*SMALLEST} == {
+        name for name in shipped("experiments") if not load_experiment(name, {}, {})[1].import_
+    }
+
+
+@pytest.mark.parametrize("name", SMALLEST)
+def test_its_smallest_form_is_run_reported_and_viewed(
+    name: str, tmp_path: Path, fuselog: Fuselog
+) -> None:
+    runs, *settings = SMALLEST[name]
+    smaller = [*runs.split(), *(part for each in settings for part in ("--set", each))]
+    with chdir(tmp_path):
+        for command in (
+            ["run", name, *smaller, "--logs", "1", "--out", "result"],
+            ["report", "result", "--out", "page.html"],
+        ):
+            said = fuselog(*command)
+            assert said.code == 0, said.err
+        viewed = fuselog("view", "result", "--save", "saved.rrd")
+        assert viewed.code == 2 * (name in WITHOUT_TIMELINE), viewed.err
+        assert viewed.code or Path("saved.rrd").stat().st_size > 1000
+        result = read_result(Path("result"))
+        page = Path("page.html").read_text()
+    assert not re.search(r">\s*-?((?i:nan|inf)|None)\s*<", page)
+    assert result.metrics
+    few = int(runs.split()[1])
+    more = {n for n in re.findall(r"first-(\d+)-runs", " ".join(result.metrics)) if int(n) > few}
+    assert not more
+    assert opposite(name, result.settings, result.claims) == []
