@@ -11,10 +11,11 @@ from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.channels import numbered
 from fuselog.replay.estimators.localization.acoustic_streams import gather_detections
 from fuselog.replay.judging.errors.evaluation import Floats
-from fuselog.replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
+from fuselog.replay.timeline.drawing.canvas import Canvas, Scene, Timeline, Times, beside
 from fuselog.replay.timeline.drawing.events import above_events, draw_events
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
+    TRUE,
     Stroke,
     draw_ellipses,
     draw_lines,
@@ -54,9 +55,9 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     heard_ns = _draw_heard(canvas, scene, sensors, extent_m) if sensors else np.empty(0, np.int64)
     for truth in truths:
         then = truth.take(np.isin(truth.publish_time_ns, heard_ns))
-        _draw_shot(canvas, "truth", Stroke(TRUTH, 2.0), then, then["state"], cone)
+        _draw_shot(canvas, "truth", TRUE, then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
-        _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator), 1.5), stream, cone)
+        _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator)), stream, cone)
     name = "Map; the bullet's way ends in its shockwave"
     colours = scene.colours(CASE) | {"muzzle blast": MUZZLE_BLAST[:3], "shockwave": SHOCKWAVE[:3]}
     board = with_legend(canvas, ROOT, colours, plane_view(canvas, ROOT, [], [], shown, name=name))
@@ -122,7 +123,8 @@ def _draw_shot(
     lines = np.stack([np.stack([end, tip], axis=1) for end in (place, *wings)], axis=1)
     colours = np.tile(np.array((*stroke.colour, 255), np.uint8), (3 * len(states), 1))
     times_ns: Times = np.repeat(stream.publish_time_ns, 3)
-    draw_lines(canvas, f"{ROOT}/{name}/shot", times_ns, lines.reshape(-1, 2, 2), colours)
+    lines = lines.reshape(-1, 2, 2)
+    draw_lines(canvas, f"{ROOT}/{name}/shot", times_ns, lines, colours, stroke.radius_px)
 
 
 def _unit(angle: Floats) -> Floats:

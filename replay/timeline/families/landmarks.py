@@ -29,6 +29,7 @@ from fuselog.replay.timeline.drawing.plane import (
     TRUE,
     Stroke,
     draw_clouds,
+    draw_dots,
     draw_ellipses,
     draw_lines,
     draw_outlines,
@@ -107,7 +108,7 @@ def _draw_robot(
     draw_clouds(canvas, scene, robot, root)
     sights = draw_sights(canvas, scene, robot, tracks, landmarks)
     sights |= _draw_view(canvas, scene, robot, tracks)
-    _, areas = draw_sets(canvas, scene, robot, root)
+    _, areas, _ = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
     board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
     board = above_events(board, draw_events(canvas, scene, robot))
@@ -142,6 +143,8 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
     entity = f"{root}/{track.name}"
     if track.name == "truth":
         draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
+    if len(track.time_ns) == 1:  # which has no path
+        draw_dots(canvas, f"{entity}/place", track.time_ns, track.poses[:, :2], track.stroke)
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
     if np.isfinite(track.poses).all():
         length_m = ARROW_SHARE * extent_m
