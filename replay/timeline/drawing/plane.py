@@ -316,6 +316,7 @@ def draw_lines(
     lines: Floats,
     colours: NDArray[np.uint8],
     radius_px: float = 0.75,
+    interval_ns: float | None = None,
 ) -> None:
     """Draw the lines of one time, a look, together.
 
@@ -326,12 +327,14 @@ def draw_lines(
         time_ns: (n,), sorted.
         lines, colours: (n, points, 2) in m, (n, 4).
         radius_px: half of the lines' width in pixels; wide ones lie below narrow ones.
+        interval_ns: the usual time between looks; by default the median.
     """
     looks = np.unique(time_ns)
     looks = looks[thin(looks)]
     drawn = np.isin(time_ns, looks)
     counts = np.unique(time_ns[drawn], return_counts=True)[1]
-    shown_ns = int(SHOWN_INTERVALS * usual_interval_ns(looks))
+    usual_ns = usual_interval_ns(looks) if interval_ns is None else interval_ns
+    shown_ns = int(SHOWN_INTERVALS * usual_ns)
     times, sizes = _until_stale(canvas, looks, counts, shown_ns)
     columns = rr.LineStrips2D.columns(strips=lines[drawn].astype(np.float32), colors=colours[drawn])
     canvas.send(entity, times, columns.partition(sizes))

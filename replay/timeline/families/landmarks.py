@@ -49,6 +49,8 @@ from fuselog.replay.timeline.families.sets import draw_sets
 HEADING = "heading_rad"
 # An arrow is so long, as a share of the scene.
 ARROW_SHARE = 0.04
+# A single place is a dot so much wider than a path.
+SINGLE = 1.5
 # Schemas of what is seen of a landmark, and the field that has its number.
 SIGHTINGS = {
     schemas.RANGE_BEARING.full_name: "target_id",
@@ -144,7 +146,8 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
     if track.name == "truth":
         draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
     if len(track.time_ns) == 1:  # which has no path
-        draw_dots(canvas, f"{entity}/place", track.time_ns, track.poses[:, :2], track.stroke)
+        stroke = Stroke(track.stroke.colour, SINGLE * track.stroke.radius_px)
+        draw_dots(canvas, f"{entity}/place", track.time_ns, track.poses[:, :2], stroke)
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
     if np.isfinite(track.poses).all():
         length_m = ARROW_SHARE * extent_m
