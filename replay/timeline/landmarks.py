@@ -29,6 +29,7 @@ from fuselog.replay.timeline.drawing.plane import (
     TRUE,
     Stroke,
     draw_clouds,
+    draw_dots,
     draw_ellipses,
     draw_lines,
     draw_outlines,
@@ -48,6 +49,8 @@ from fuselog.replay.timeline.drawing.registered import draw_registered
 HEADING = "heading_rad"
 # An arrow is so long, as a share of the scene.
 ARROW_SHARE = 0.04
+# A single place is a dot so much wider than a path.
+SINGLE = 1.5
 # Schemas of what is seen of a landmark, and the field that has its number.
 SIGHTINGS = {
     schemas.RANGE_BEARING.full_name: "target_id",
@@ -142,6 +145,9 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
     entity = f"{root}/{track.name}"
     if track.name == "truth":
         draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
+    if len(track.time_ns) == 1:  # which has no path
+        stroke = Stroke(track.stroke.colour, SINGLE * track.stroke.radius_px)
+        draw_dots(canvas, f"{entity}/place", track.time_ns, track.poses[:, :2], stroke)
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
     if np.isfinite(track.poses).all():
         length_m = ARROW_SHARE * extent_m

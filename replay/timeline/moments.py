@@ -35,11 +35,11 @@ def read_moments(rrd: Path) -> list[Moment]:
 def worst_at(moments: Sequence[Moment], at: str) -> Moment:
     """Return the moment that `worst`, or `worst:ESTIMATOR`, names.
 
-    Raises BadInput if no estimate has an error, or none is of that estimator.
+    Raises BadInput if there are no errors, or none of that estimator.
     """
     estimator = at.partition(":")[2]
     if not moments:
-        raise BadInput(f"--at {at}: no estimate is judged by a truth; give seconds, such as --at 30")
+        raise BadInput(f"--at {at}: the timeline has no errors of estimates; give seconds, as --at 30")
     known = list(dict.fromkeys(moment.estimator for moment in moments))
     if estimator and estimator not in known:
         raise BadInput(f"--at {at}: no estimator with this name has errors; {choices(estimator, known)}")

@@ -10,9 +10,11 @@ from mkdocs.config import load_config
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from PIL import Image
 
 from fuselog.pipeline.runs.inputs import shipped
-from tests.docs import gallery, hooks, notebooks, reference
+from tests.docs import first_views, gallery, hooks, notebooks, reference
+from tests.replay.timeline.test_first_view import FIRST
 
 ROOT = Path(__file__).parents[2]
 
@@ -79,6 +81,17 @@ def test_the_gallery_has_every_experiment() -> None:
     shown = {name: gallery.picture_of(name) for name in shipped("experiments")}
     assert [name for name, picture in shown.items() if picture is None] == ["false-causes"]
     assert all(picture.is_relative_to(gallery.DOCS) for picture in shown.values() if picture)
+
+
+def test_every_simulated_scenario_has_its_first_view() -> None:
+    """Small enough to stay in the repository: all in less than 1.2 MB."""
+    assert first_views.sections().keys() == FIRST.keys()
+    pictures = [first_views.PICTURES / f"{name}.webp" for name in FIRST]
+    assert {*first_views.PICTURES.iterdir()} == {*pictures}
+    assert sum(picture.stat().st_size for picture in pictures) < 1_200_000
+    for picture in pictures:
+        with Image.open(picture) as image:
+            assert image.size == first_views.SIZE
 
 
 def test_the_reference_has_every_name() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from fuselog.replay.timeline.viewer import PACKAGES
 from tests.house.sources import PATHS, nodes_of, text_of
 
 ROOT = Path(__file__).parents[2]
@@ -93,7 +94,9 @@ def test_ci_runs_the_two_commands_everywhere() -> None:
     assert matrix["python"] == ["3.11", "3.12", "3.13", "3.14"]
     assert f">={matrix['python'][0]}" == PYPROJECT["project"]["requires-python"]
     assert job["defaults"]["run"]["shell"] == "bash"
-    demo, older, test = [step for step in job["steps"] if "run" in step][-3:]
+    driver, demo, older, test = [step for step in job["steps"] if "run" in step][-4:]
+    assert driver["if"] == "runner.os == 'Linux'"
+    assert set(PACKAGES.split()) <= set(driver["run"].split())  # else tests of pictures are skipped
     assert [demo["run"], test["run"]] == ["make demo PYTHON=python", "make test PYTHON=python"]
     [own], [one] = matrix["cpu"], matrix["include"]
     assert one["cpu"] != own

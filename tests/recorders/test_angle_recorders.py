@@ -38,11 +38,19 @@ def test_lines_of_sight_are_the_biased_model_plus_noise() -> None:
 def test_nominal_attitude_goes_through_its_quaternion() -> None:
     """A nominal attitude and a bias of the same angles give the same angles in the sensor's frame."""
     turned = [(5.0, 10.0, -20.0)] * 3
-    nominal = record("optical-los", nominal_attitude_deg=turned)
+    nominal = record("optical-los", nominal_attitude_deg=turned, bias_deg=None)
     biased = record("optical-los", bias_deg=turned)
     one, other = (stream(each, "/sensor1/line_of_sight") for each in (nominal, biased))
     np.testing.assert_array_equal(one["azimuth_rad"], other["azimuth_rad"])
     assert stream(nominal, "/sensor1/attitude")["quaternion"][0, 0] < 1.0
+    for_all = stream(record("optical-los", bias_deg=turned[:1]), "/sensor1/line_of_sight")
+    np.testing.assert_array_equal(for_all["azimuth_rad"], other["azimuth_rad"])
+
+
+def test_sensors_are_turned_otherwise_than_stated_by_default() -> None:
+    """So that the first view shows what the scenario is about."""
+    truth = stream(record("optical-los"), "/truth")
+    np.testing.assert_allclose(truth["state"][:, 9:], np.radians(1.0))
 
 
 def test_field_of_view_and_a_target_on_a_sensor() -> None:
@@ -89,7 +97,7 @@ def test_noise_is_as_stated() -> None:
 @pytest.mark.parametrize(
     ("scenario", "parameters", "sentence"),
     [
-        ("optical-los", {"bias_deg": [(1.0, 1.0, 1.0)]}, "bias_deg has 1 rows for 3 sensors"),
+        ("optical-los", {"bias_deg": [(1.0, 1.0, 1.0)] * 2}, "bias_deg has 2 rows for 3 sensors"),
         ("optical-los", {"sigma_rad": 0.0}, "sigma_rad"),
         ("acoustic-shots", {"interval_s": 0.1}, "give a longer interval_s"),
         ("acoustic-shots", {"mach_number": 1.0}, "mach_number"),

@@ -31,9 +31,10 @@ class OpticalParameters(Parameters):
     Attributes:
         sensor_position_m: where the sensors are (x, y, z).
         target_position_m: where the targets are (x, y, z).
-        nominal_attitude_deg: yaw, pitch and roll that each sensor states; without any all are 0.
-        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs; without any all are
-            0.
+        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row for each or for all;
+            without any all are 0.
+        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs, one row for each or
+            for all; without any all are 0.
         sigma_rad: standard deviation of azimuth and elevation.
         interval_s: time between sightings.
         passes: number of passes over all targets.
@@ -46,7 +47,7 @@ class OpticalParameters(Parameters):
     sensor_position_m: Triples = [(-5500, 950, 15), (-230, 2720, 45), (5900, 50, 20)]
     target_position_m: Triples = [(-2860, 6820, 0), (-235.9, 8152, 0), (2413, 6451, 0)]
     nominal_attitude_deg: Triples | None = None
-    bias_deg: Triples | None = None
+    bias_deg: Triples | None = [(1.0, 1.0, 1.0)]
     sigma_rad: PositiveFloat = 0.34e-3
     interval_s: PositiveFloat = 1.0
     passes: PositiveInt = 10
@@ -66,9 +67,12 @@ class OpticalParameters(Parameters):
 
     def _per_sensor(self, name: str, given_deg: list[Triple] | None) -> Array:
         sensors = len(self.sensor_position_m)
-        if given_deg is not None and len(given_deg) != sensors:
-            raise BadInput(f"{name} has {len(given_deg)} rows for {sensors} sensors; give one for each")
-        return np.zeros((sensors, 3)) if given_deg is None else np.radians(given_deg)
+        rows_deg = [(0.0, 0.0, 0.0)] if given_deg is None else given_deg
+        if len(rows_deg) not in (1, sensors):
+            raise BadInput(
+                f"{name} has {len(rows_deg)} rows for {sensors} sensors; give one for each, or one"
+            )
+        return np.broadcast_to(np.radians(rows_deg), (sensors, 3))
 
 
 def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recording:

@@ -11,10 +11,18 @@ from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.channels import numbered
 from fuselog.replay.families.acoustic.estimator import gather_detections
 from fuselog.replay.judging.errors.evaluation import Floats
-from fuselog.replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
+from fuselog.replay.timeline.drawing.canvas import (
+    Canvas,
+    Scene,
+    Timeline,
+    Times,
+    beside,
+    usual_interval_ns,
+)
 from fuselog.replay.timeline.drawing.events import above_events, draw_events
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
+    TRUE,
     Stroke,
     draw_ellipses,
     draw_lines,
@@ -34,10 +42,17 @@ CONE_SHARE = 0.7
 
 
 class Cone(NamedTuple):
-    """Describes how a shot is drawn: the length of the bullet's way, half the shockwave's opening."""
+    """Describes how a shot is drawn.
+
+    Attributes:
+        length_m: of the bullet's way.
+        mach_angle_rad: half the shockwave's opening.
+        interval_ns: the usual time between shots.
+    """
 
     length_m: float
     mach_angle_rad: float
+    interval_ns: float
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
@@ -49,14 +64,15 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     truths = scene.truths_of(CASE)
     shown = np.concatenate([places, *(truth["state"][:1, :2] for truth in truths)])
     extent_m = extent_of(shown)
-    cone = Cone(CONE_SHARE * extent_m, _mach_angle_rad(scene, sensors))
     draw_points(canvas, f"{ROOT}/sensors", np.array(sensors, np.int64), places)
     heard_ns = _draw_heard(canvas, scene, sensors, extent_m) if sensors else np.empty(0, np.int64)
+    mach_angle_rad = _mach_angle_rad(scene, sensors)
+    cone = Cone(CONE_SHARE * extent_m, mach_angle_rad, usual_interval_ns(np.sort(heard_ns)))
     for truth in truths:
         then = truth.take(np.isin(truth.publish_time_ns, heard_ns))
-        _draw_shot(canvas, "truth", Stroke(TRUTH, 2.0), then, then["state"], cone)
+        _draw_shot(canvas, "truth", TRUE, then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
-        _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator), 1.5), stream, cone)
+        _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator)), stream, cone)
     name = "Map; the bullet's way ends in its shockwave"
     colours = scene.colours(CASE) | {"muzzle blast": MUZZLE_BLAST[:3], "shockwave": SHOCKWAVE[:3]}
     board = with_legend(canvas, ROOT, colours, plane_view(canvas, ROOT, [], [], shown, name=name))
@@ -122,7 +138,9 @@ def _draw_shot(
     lines = np.stack([np.stack([end, tip], axis=1) for end in (place, *wings)], axis=1)
     colours = np.tile(np.array((*stroke.colour, 255), np.uint8), (3 * len(states), 1))
     times_ns: Times = np.repeat(stream.publish_time_ns, 3)
-    draw_lines(canvas, f"{ROOT}/{name}/shot", times_ns, lines.reshape(-1, 2, 2), colours)
+    lines = lines.reshape(-1, 2, 2)
+    look = (stroke.radius_px, cone.interval_ns)
+    draw_lines(canvas, f"{ROOT}/{name}/shot", times_ns, lines, colours, *look)
 
 
 def _unit(angle: Floats) -> Floats:

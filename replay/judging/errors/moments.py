@@ -16,7 +16,8 @@ class Moment(NamedTuple):
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
-        quantity: `nees`, or the error of `Errors.main`, such as `position_error_m`.
+        quantity: `nees`, or the error of the position, else of the orientation, else of all components
+            in the unit of the first, such as `error_m` of several targets.
         value: how large it is there.
         run: the number of the run.
         time_ns: the stamp.
@@ -47,10 +48,10 @@ class Moments:
     def add(self, errors: Errors) -> None:
         """Add a block of errors."""
         if not errors.is_bound:
-            main = errors.main
-            length = main.scale * np.sqrt(errors.squared[:, main.columns].sum(axis=1))
+            name, columns, scale = _main(errors)
+            length = scale * np.sqrt(errors.squared[:, columns].sum(axis=1))
             self._add(errors, NEES, errors.nees)
-            self._add(errors, main.rmse.replace("rmse", "error"), length)
+            self._add(errors, name, length)
 
     def _add(self, errors: Errors, quantity: str, values: Floats) -> None:
         if np.isnan(values).all():
@@ -80,6 +81,18 @@ class Moments:
 def worst_of(moments: Iterable[Moment]) -> Moment | None:
     """Return the moment of the largest NEES; if none has a NEES, that of the largest error."""
     return max(moments, key=lambda each: (each.quantity == NEES, _size(each)), default=None)
+
+
+def _main(errors: Errors) -> tuple[str, list[int], float]:
+    """Return the name of an estimate's main error, its columns, and the factor to its unit."""
+    name, columns, scale = errors.main
+    if errors.position or errors.rotation:
+        return name.replace("rmse", "error"), columns, scale
+    unit = errors.components[0].rpartition("_")[2]
+    alike = [index for index, each in enumerate(errors.components) if each.endswith(f"_{unit}")]
+    if len(alike) > 1:
+        return f"error_{unit}", alike, scale
+    return f"error_{errors.components[0]}", columns, scale
 
 
 def _size(moment: Moment) -> tuple[float, int, int]:

@@ -14,6 +14,9 @@ from fuselog.replay.timeline.drawing.canvas import MUTED, Canvas, Colour
 from fuselog.replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
 from fuselog.replay.timeline.sinks import open_recording
 
+# Numbers of an axis are this share of the panel inside its edge.
+LABEL_SHARE = 0.08
+
 
 class CurvePanel(NamedTuple):
     """Holds the curves of a view: a name with its axes, positive places (n, 2) by curve, its strokes."""
@@ -67,15 +70,21 @@ def _drawn(places: Floats) -> Floats:
 
 
 def _draw_decades(canvas: Canvas, entity: str, low: Floats, high: Floats) -> None:
-    """Draw lines at the powers of ten, each with its number at the lower or left end."""
+    """Draw lines at 1, 2 and 5 times the powers of ten, each with its number near its lower or left end.
+
+    Of more than two decades there are only the powers.
+    """
     lines, at, labels = [], [], []
-    for axis, power in product(range(2), range(-30, 31)):
-        if low[axis] <= power <= high[axis]:
+    inside = low + LABEL_SHARE * (high - low)
+    steps = (1, 2, 5) if float(np.max(high - low)) <= 2.0 else (1,)
+    for axis, power, step in product(range(2), range(-30, 31), steps):
+        place = power + np.log10(step)
+        if inside[axis] <= place <= high[axis]:
             ends = np.stack([low, high])
-            ends[:, axis] = power
+            ends[:, axis] = place
             lines.append(ends)
-            at.append(ends[0])
-            labels.append(f"1e{power}")
+            at.append(np.where(np.arange(2) == axis, place, inside))
+            labels.append(f"{step * 10.0**power:g}")
     strips = rr.LineStrips2D(lines, colors=[GRID], radii=rr.Radius.ui_points(0.5), draw_order=-1.0)
     canvas.fix(entity, strips)
     numbers = rr.Points2D(at, labels=labels, colors=[MUTED], radii=rr.Radius.ui_points(1.0))

@@ -17,11 +17,11 @@ from fuselog.replay.timeline.drawing.plane import TRAIL_S, trail_of
 
 # Fixes up to these standard deviations in m: an ambiguity that is fixed, one that floats, code alone.
 QUALITIES: tuple[tuple[float, Colour], ...] = (
-    (0.05, (0, 158, 115)),
-    (0.5, (240, 228, 66)),
-    (5.0, (230, 159, 0)),
+    (0.05, (180, 255, 120)),
+    (0.5, (130, 190, 85)),
+    (5.0, (90, 135, 60)),
 )
-POOR: Colour = (204, 121, 167)
+POOR: Colour = (120, 95, 60)
 SHOWN_SHARE = 0.9
 # So many times the shown extent beyond it is far off.
 FAR = 10.0

@@ -310,7 +310,13 @@ def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> F
 
 
 def draw_lines(
-    canvas: Canvas, entity: str, time_ns: Times, lines: Floats, colours: NDArray[np.uint8]
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    lines: Floats,
+    colours: NDArray[np.uint8],
+    radius_px: float = 0.75,
+    interval_ns: float | None = None,
 ) -> None:
     """Draw the lines of one time, a look, together.
 
@@ -320,16 +326,22 @@ def draw_lines(
         canvas, entity: what is drawn on, and where.
         time_ns: (n,), sorted.
         lines, colours: (n, points, 2) in m, (n, 4).
+        radius_px: half of the lines' width in pixels; wide ones lie below narrow ones.
+        interval_ns: the usual time between looks; by default the median.
     """
     looks = np.unique(time_ns)
     looks = looks[thin(looks)]
     drawn = np.isin(time_ns, looks)
     counts = np.unique(time_ns[drawn], return_counts=True)[1]
-    shown_ns = int(SHOWN_INTERVALS * usual_interval_ns(looks))
+    usual_ns = usual_interval_ns(looks) if interval_ns is None else interval_ns
+    shown_ns = int(SHOWN_INTERVALS * usual_ns)
     times, sizes = _until_stale(canvas, looks, counts, shown_ns)
     columns = rr.LineStrips2D.columns(strips=lines[drawn].astype(np.float32), colors=colours[drawn])
     canvas.send(entity, times, columns.partition(sizes))
-    canvas.fix(entity, rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(0.75)))
+    style = rr.LineStrips2D.from_fields(
+        radii=rr.Radius.ui_points(radius_px), draw_order=20.0 - radius_px
+    )
+    canvas.fix(entity, style)
 
 
 def _until_stale(

@@ -319,9 +319,17 @@ def quality(errors: Sequence[Errors], case: str) -> tuple[dict[str, Wanted], Tit
 
 def _worst(errors: Errors) -> Wanted:
     """The events of the largest NEES and of the largest error, in order of time."""
-    quantity, columns, scale = errors.main
+    units = [name.rpartition("_")[2] for name in errors.components]
+    alike = [column for column, unit in enumerate(units) if unit == units[0]]
+    quantity, columns, scale = f"error_{units[0]}", alike, 1.0
+    if errors.position:
+        quantity, columns = "position_error_m", errors.position
+    elif errors.rotation:
+        quantity, columns, scale = "orientation_error_deg", errors.rotation, 180.0 / np.pi
+    elif len(alike) == 1:
+        quantity = f"error_{errors.components[0]}"
     length = scale * np.linalg.norm(errors.error[:, columns], axis=1)
-    found = [("NEES", errors.nees), (quantity.replace("rmse", "error"), length)]
+    found = [("NEES", errors.nees), (quantity, length)]
     rows = sorted((int(np.nanargmax(values)), name, np.nanmax(values)) for name, values in found)
     of = f" of {errors.case}" * bool(errors.case)
     texts = [f"{errors.estimator}: largest {name} {value:.3g}{of}" for _, name, value in rows]

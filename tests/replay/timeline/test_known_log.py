@@ -169,7 +169,8 @@ def test_each_number_of_a_sensor_is_a_curve_under_its_name(moving: dict[str, Col
 def test_fixes_lie_where_they_are_in_the_colour_of_their_deviation(moving: dict[str, Columns]) -> None:
     fixes = moving["/geodetic/gps"]
     np.testing.assert_allclose(np.array(fixes["GeoPoints:positions"])[:, 0], DEGREES)
-    colours = [packed((0, 158, 115)), packed((240, 228, 66)), packed((230, 159, 0))]
+    colours = [packed((180, 255, 120)), packed((130, 190, 85)), packed((90, 135, 60))]
+    assert not {*colours} & {packed(colour) for colour in PALETTE}
     found = [each >> 8 for (each,) in fixes["GeoPoints:colors"]]
     assert found[1:3] == colours[1:]
     assert found[0] == colours[0]

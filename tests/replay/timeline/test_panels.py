@@ -144,23 +144,25 @@ def test_many_components_are_in_tabs_by_quantity() -> None:
 
 
 def test_a_single_estimate_is_a_point_between_the_ends_of_its_band(tmp_path: Path) -> None:
-    truth = make_stream(
-        "/truth", schemas.TRUTH_STATE, STAMPS[:1], metadata=state_metadata(["x_m"]), state=[[2]]
-    )
-    told = {**state_metadata(["x_m"]), "truth": "/truth"}
+    told = state_metadata(["x_m", "y_m"])
+    truth = make_stream("/truth", schemas.TRUTH_STATE, STAMPS[:1], metadata=told, state=[[2, 7]])
+    told = {**told, "truth": "/truth"}
     estimate = make_stream(
         "/estimates/ekf/state",
         schemas.GAUSSIAN_ESTIMATE,
         STAMPS[:1],
         metadata=told,
-        mean=[[5]],
-        covariance=[[4]],
+        mean=[[5, 8]],
+        covariance=[[4, 0, 0, 4]],
     )
     source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
     outputs = {estimate.topic: gather([estimate])}
     errors = [each for each in Judge([source], {}, gap_limit_s=2.0).add(outputs).errors if each]
     show(source, outputs, errors, save=tmp_path / "one.rrd")
-    assert read(tmp_path / "one.rrd")["/plots/error_x_m/ekf"]["Scalars:scalars"] == [[3.0, -4.0, 4.0]]
+    moving = read(tmp_path / "one.rrd")
+    assert moving["/plots/error_x_m/ekf"]["Scalars:scalars"] == [[3.0, -4.0, 4.0]]
+    for name, place in (("truth", [2.0, 7.0]), ("ekf", [5.0, 8.0])):  # which has no path on the map
+        assert moving[f"/map/{name}/place"]["Points2D:positions"] == [[place]]
     still = read(tmp_path / "one.rrd", static=True)
     assert "SeriesPoints:markers" in still["/plots/error_x_m/ekf"]
-    assert "SeriesPoints:names" in still["/plots/nees_1/ekf"]
+    assert "SeriesPoints:names" in still["/plots/nees_2/ekf"]

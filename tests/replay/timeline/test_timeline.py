@@ -681,7 +681,7 @@ def test_a_timeline_keeps_its_worst_moments(rrd: Path, ensemble: Replayed, tmp_p
     with pytest.raises(BadInput, match=r"--at worst:efk: .* did you mean 'ekf'"):
         worst_at(moments, "worst:efk")
     show(ensemble.sources[RUN], {}, [], save=tmp_path / "log.rrd")
-    with pytest.raises(BadInput, match="--at worst: no estimate is judged by a truth"):
+    with pytest.raises(BadInput, match="--at worst: the timeline has no errors of estimates"):
         worst_at(read_moments(tmp_path / "log.rrd"), "worst")
 
 
