@@ -44,6 +44,7 @@ def _other_origin(_: Any, time: Any) -> Any:
 @pytest.mark.paper
 def test_no_alarm_where_all_is_well(log: MemorySource) -> None:
     assert not replay(log, ["ekf", "ukf", "smoother:ekf", "smoother:iterated"]).alarms
+    assert not replay(record("vehicles", seed=7), ["ekf", "vehicle-kalman"]).alarms
 
 
 def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -> None:
