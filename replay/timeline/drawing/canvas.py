@@ -353,7 +353,8 @@ def gap_limit_ns(time_ns: Times) -> int:
     A stream without a rate, such as of shots or of what a camera happens to see, comes in bursts: it is
     compared with the pauses in which half of its time passes, apart from the longest.
     """
-    intervals, usual_ns = np.sort(np.diff(np.unique(time_ns))), usual_interval_ns(time_ns)
+    intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)
+    usual_ns = usual_interval_ns(time_ns)
     near = np.abs(intervals - usual_ns) <= RATE_JITTER * usual_ns
     if len(intervals) > 1 and np.count_nonzero(near) < 0.5 * len(intervals):
         passed = np.cumsum(intervals[:-1])
