@@ -140,7 +140,7 @@ def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
 
 def dominating_run(nees: "pd.Series[float]") -> str:
     """Say which run has more of the mean NEES than all others together; empty if none has."""
-    values = nees.to_numpy(dtype=float)
+    values = np.asarray(nees, np.float64)
     place = dominating(values)
     if place is None:
         return ""

@@ -112,7 +112,7 @@ def test_the_table_begins_with_whom_to_take() -> None:
     )
     sheet, _ = sheets(findings(result, {"runs": rows}))
     assert sheet is not None
-    assert sheet.columns == ["c", "b", "a"]
+    assert sheet.columns == ["c", "a", "b"]
     assert [cell.look for cell in sheet.groups["Accuracy"][0].cells] == ["best", "", ""]
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fuselog.pipeline.output.report.choosing import broken_of, choice_of, in_order
+from fuselog.pipeline.output.report.choosing import choice_of
 from fuselog.pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
 from fuselog.pipeline.output.results import Measured, MetricTable
 from fuselog.pipeline.output.words import (
@@ -72,8 +72,8 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
 
     Whom to take stands in the first column, which is seen first where the table is wider than the page.
     """
-    take, equal = choice_of(found)
-    columns = [*in_order(found, broken_of(found), take, equal), *found.bounds]
+    take, _ = choice_of(found)
+    columns = list(dict.fromkeys([*filter(None, [take]), *found.labels, *found.bounds]))
     tables = [table for table in found.tables if any(table.quantities.values())]
     if not tables or not columns:
         return None, []
