@@ -4,6 +4,7 @@ Everything raises BadInput as the commands do, with the same sentences. docs/pyt
 it; `fuselog.pipeline.api.replays` has the replay.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ from fuselog.pipeline.api.catalog import LISTS, Entries, Entry
 from fuselog.pipeline.api.lists import listed
 from fuselog.pipeline.output.outputs import LOG, check_files, check_folder
 from fuselog.pipeline.output.results import Result, read_table
+from fuselog.pipeline.output.showing import Shown, shown_metrics
 from fuselog.pipeline.output.summary import summary_table
+from fuselog.pipeline.output.terminal import PrintedTable
 from fuselog.pipeline.runs.ensemble import Progress, no_progress
 from fuselog.pipeline.runs.executors import PoolFactory, pool_for
 from fuselog.pipeline.runs.experiment import (
@@ -99,7 +102,7 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
     write_log(path, given)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ResultFolder:
     """Represents a result folder, and what its result.json says.
 
@@ -110,6 +113,21 @@ class ResultFolder:
 
     folder: Path
     result: Result
+
+    def __repr__(self) -> str:
+        return self._shown.text
+
+    def _repr_html_(self) -> str:
+        return self._shown.html
+
+    @property
+    def _shown(self) -> Shown:
+        verdicts = Counter(claim.verdict for claim in self.result.claims)
+        counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+        sentences = [each.words for each in self.result.alarms[:1]]
+        sentences += [f"claims: {counted}"] if counted else []
+        title = f"Result of {self.result.experiment} in {self.folder}"
+        return shown_metrics(title, sentences, self.result.metrics, self.result.bounds)
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -293,7 +311,14 @@ class Catalog(Mapping[str, Entry]):
 
     def __repr__(self) -> str:
         width = max(map(len, self), default=0)
-        return "\n".join(f"{name:{width}}  {what}" for name, what in listed(f"{self._kind}s").items())
+        return "\n".join(f"{name:{width}}  {what}" for name, what in self._listed().items())
+
+    def _repr_html_(self) -> str:
+        rows = list(self._listed().items())
+        return Shown(f"{self._kind}s", tables=[PrintedTable("", ["name", "what"], rows)]).html
+
+    def _listed(self) -> dict[str, Any]:
+        return listed(f"{self._kind}s")
 
 
 scenarios = Catalog("scenario")

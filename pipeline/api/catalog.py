@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from fuselog.pipeline.output.terminal import print_json, print_table, say
+from fuselog.pipeline.output.showing import Shown
+from fuselog.pipeline.output.terminal import PrintedTable, print_json, print_table, say
 from fuselog.pipeline.runs.experiment import Experiment, Study
 from fuselog.pipeline.runs.inputs import load_scenario, shipped
 from fuselog.recorders.errors import BadInput, choices
@@ -27,7 +28,7 @@ from fuselog.replay.inference.requirements import requirements_of
 from fuselog.replay.judging.metrics.measuring import Metric
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Entry:
     """Describes one thing to choose: a line on it, more facts, its parameters, and values it sets.
 
@@ -43,7 +44,17 @@ class Entry:
     stated: Collection[str] = ()
     prefix: str = ""
 
+    def __repr__(self) -> str:
+        return f"{self.name}: {self.what}"
 
+    def _repr_html_(self) -> str:
+        rows = rows_of(self)
+        tables = [PrintedTable("", PARAMETER_COLUMNS, rows)] if rows else []
+        facts = PrintedTable("", ["", ""], list(self.facts.items()))
+        return Shown(repr(self), tables=[facts, *tables]).html
+
+
+PARAMETER_COLUMNS = ("parameter", "default", "unit", "accepts", "meaning")
 Entries = dict[str, Callable[[], Entry]]  # by name, each made when it is asked for
 
 
@@ -230,7 +241,7 @@ def _print_details(entry: Entry) -> None:
         say(f"{key}: {fact}")
     rows = rows_of(entry)
     if rows and entry.parameters:
-        print_table(["parameter", "default", "unit", "accepts", "meaning"], rows)
+        print_table(PARAMETER_COLUMNS, rows)
         for place, text in explain(entry.parameters).items():
             for line in ("", *([place] if place else []), *text.splitlines()):
                 say(line)

@@ -25,7 +25,8 @@ from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.charts import draw
 from fuselog.pipeline.output.coverage import coverage_table, sentences
 from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
-from fuselog.pipeline.output.results import in_order, result_folder, write_outcome
+from fuselog.pipeline.output.results import in_order, plain, result_folder, write_outcome
+from fuselog.pipeline.output.showing import Shown, shown_metrics
 from fuselog.pipeline.output.summary import error_charts, summarise, summary_table
 from fuselog.pipeline.runs.ensemble import Pass, Settings, judge_logs
 from fuselog.pipeline.runs.estimates import add_to_hash
@@ -151,13 +152,19 @@ class Replay:
         return self.done.judge
 
     def __repr__(self) -> str:
+        return self._shown.text
+
+    def _repr_html_(self) -> str:
+        return self._shown.html
+
+    @property
+    def _shown(self) -> Shown:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        lines = [f"Replay of {runs} by {', '.join(self.settings)}"]
-        lines += [each.words for each in self.alarms[:1]]
-        lines += self.judge.components_without_truth
-        return "\n".join(
-            [*lines, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
-        )
+        sentences = [each.words for each in self.alarms[:1]]
+        sentences += [*self.judge.components_without_truth, *self.failures, *self.losses]
+        metrics = in_order(plain(self.judge.metrics), self.settings)
+        title = f"Replay of {runs} by {', '.join(self.settings)}"
+        return shown_metrics(title, sentences, metrics, self.judge.bounds)
 
     @cached_property
     def metrics(self) -> pd.DataFrame:

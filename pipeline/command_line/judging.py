@@ -130,7 +130,7 @@ def evaluate(
 @command(
     "Compare estimators over the same runs, with a verdict on every metric.",
     "fuselog compare out/before out/after",
-    "fuselog compare a.mcap b.mcap -e ekf -e ukf",
+    "fuselog compare out/landmarks/logs -e ekf -e smoother:ekf",
 )
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
 @click.option(

@@ -7,7 +7,7 @@ from fuselog.pipeline.exploring.curves import LINES, Case
 from fuselog.pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
 from fuselog.pipeline.exploring.session import Played
 from fuselog.pipeline.exploring.sliders import Slider, in_words
-from fuselog.pipeline.exploring.verdict import Verdict, numbers_of
+from fuselog.pipeline.exploring.verdict import LIKELIHOOD, Verdict, numbers_of
 from fuselog.pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
@@ -35,6 +35,12 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
         f'{escape(slider.words(slider.own))}">▾</span>'
         f"<span>{escape(slider.words(slider.high))}</span></div></div>"
     )
+
+
+def pre_html(text: str, width: int | None = None) -> str:
+    """Write a text to copy, in so many pixels if they are given."""
+    fixed = f";width:{width}px" if width else ""
+    return f'<pre style="white-space:pre-wrap;margin:4px 0{fixed}">{escape(text)}</pre>'
 
 
 def heading_html(log: str) -> str:
@@ -101,6 +107,6 @@ def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
 
 
 def _number(name: str, value: float, unit: str) -> str:
-    if name == "log-likelihood":
+    if name == LIKELIHOOD:
         return f"{value:,.0f}".replace("-", MINUS)
     return escape(in_words(value, unit) if unit else number(value))

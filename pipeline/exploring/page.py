@@ -12,7 +12,7 @@ from bokeh.models import Div, Select, Span
 from bokeh.models import Slider as SliderWidget
 
 from fuselog.pipeline.exploring.curves import instant_of, true_path
-from fuselog.pipeline.exploring.markup import SIDE, head_html, heading_html, label_of
+from fuselog.pipeline.exploring.markup import SIDE, head_html, heading_html, label_of, pre_html
 from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.plots import (
     PINNED,
@@ -44,6 +44,8 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import schemas, topics_of
 
 WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
+# The sliders are to the left of the plots, and below them where there is no room beside.
+SIDE_LAST = WRAP | {"flex-direction": "row-reverse", "justify-content": "flex-end"}
 GROW = {"flex": "1 1 350px"}
 
 
@@ -66,6 +68,7 @@ class Page:
         self._at_s: float | None = None
         self._known = dict(session.filters)  # those that were given can be chosen again
         self._is_setting = False
+        self._along: Callable[..., None] = lambda **_: None
         self._make()
         self._first()
 
@@ -80,6 +83,7 @@ class Page:
         status = {"role": "status"}  # a screen reader says what changes
         self._head = Div(name="verdict", sizing_mode="stretch_width", html_attributes=status)
         self._sentences = Div(name="said", sizing_mode="stretch_width", html_attributes=status)
+        self._command = Div(name="command", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
         self._time = time = time_range(self.session.source.epoch_ns)  # its ends come with estimates
@@ -107,9 +111,10 @@ class Page:
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
         left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
-        main = column(self._head, self._sentences, both, sizing_mode="stretch_width", styles=GROW)
+        words = (self._head, self._command, self._sentences)
+        main = column(*words, both, sizing_mode="stretch_width", styles=GROW)
         main.html_attributes = {"role": "main"}
-        self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
+        self._document.add_root(row(main, self._side, sizing_mode="stretch_width", styles=SIDE_LAST))
         self._document.title = f"fuselog explore: {self.session.source.name}"
         self._fill_side()
 
@@ -117,7 +122,8 @@ class Page:
         """Fill all that is to the left: filters, buttons, sliders."""
         session = self.session
         heading = Div(text=heading_html(session.source.name), width=SIDE)
-        choices = filter_choices(session.filters, self._known)
+        names = list(dict.fromkeys([*self._known, *session.methods]))
+        choices = filter_choices(session.filters, names)
         for choice in choices:
             choice.on_change("value", partial(self._choose_filters, choices))
         acts: dict[str, Callable[[], None]] = {
@@ -128,7 +134,6 @@ class Page:
             "Estimate": self._estimate,
             "Timeline": self._timeline,
             "Save as TOML": self._save,
-            "Command": self._command,
         }
         self._widgets: dict[str, tuple[Slider, SliderWidget, Div]] = {}
         shown: list[Any] = [
@@ -164,6 +169,7 @@ class Page:
         """Show another case or component."""
         if 0 in self.played:
             self._show()
+            self._along(case=self._chosen_case())
 
     def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
         """Look at other filters with the same values."""
@@ -257,15 +263,8 @@ class Page:
         self._replay()
 
     def _save(self) -> None:
-        self._offer(lambda: self.session.toml(self.values))
-
-    def _command(self) -> None:
-        self._offer(lambda: self.session.command(self.values))
-
-    def _offer(self, text: Callable[[], str]) -> None:
         try:
-            style = f"white-space:pre-wrap;width:{SIDE - 20}px"
-            self._saved.text = f'<pre style="{style}">{escape(text())}</pre>'
+            self._saved.text = pre_html(self.session.toml(self.values), SIDE - 20)
         except BadInput as error:
             self._tell(str(error))
 
@@ -322,19 +321,21 @@ class Page:
                 self._later(lambda: self._take_and_show(played))
             if active is None:
                 return
-            points = []
+            points: list[tuple[float, Mapping[str, float]]] = []
             for point in session.likelihoods(self._label_of(0), values, active.name):
                 if is_newer():
                     return
                 points.append(point)
             now = values.get(active.name, active.own)
-            self._later(lambda: show_likelihood(self.plots["likelihood"], active, points, now))
-            self._later(self._rest)
+            along = partial(show_likelihood, self.plots["likelihood"], active, points, now=now)
+            self._later(lambda: self._rest(along))
 
         self._work.ask(work)
 
-    def _rest(self) -> None:
+    def _rest(self, along: Callable[..., None]) -> None:
         """Show the likelihood, and name what the plots show, once a slider rests."""
+        self._along = along
+        self._along(case=self._chosen_case())
         self.plots["likelihood"].show_if_drawn()
         for plot in self.plots.values():
             plot.name()
@@ -382,6 +383,10 @@ class Page:
         estimated = {name: self.session.slider(name) for name in self.session.estimated}
         case = self._chosen_case()
         self._head.text = head_html(self.session.filters, self.played, case, estimated)
+        try:
+            self._command.text = pre_html(self.session.command(self.played[0].values))
+        except BadInput as error:  # of an estimator of one's own
+            self._command.text = f"<p>{escape(str(error))}</p>"
 
     def _chosen_case(self) -> str:
         return str(self._case_choice.value or "")

@@ -330,9 +330,14 @@ def show_lens(
 
 
 def show_likelihood(
-    plot: Plot, slider: Slider, points: Sequence[tuple[float, float]], now: float
+    plot: Plot,
+    slider: Slider,
+    along: Sequence[tuple[float, Mapping[str, float]]],
+    case: str,
+    now: float,
 ) -> None:
-    """Draw the likelihood along a parameter, its peak, and where its value is now."""
+    """Draw a case's likelihood along a parameter, its peak, and where its value is now."""
+    points = [(value, each[case]) for value, each in along if np.isfinite(each.get(case, np.nan))]
     if not points:
         return
     places = np.array([slider.place(value) for value, _ in points])

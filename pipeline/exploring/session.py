@@ -1,11 +1,11 @@
 """Keeps a log in memory and the filters on it, without server or browser: replays what changes."""
 
 import json
-import math
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import tomli_w
@@ -21,7 +21,7 @@ from fuselog.pipeline.exploring.verdict import Verdict, verdict_of
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.runs.settings import parameters_by_label, with_settings
 from fuselog.pipeline.tuning.objective import Run, in_memory
-from fuselog.pipeline.tuning.tuning import OPEN, tune
+from fuselog.pipeline.tuning.tuning import OPEN, gate_of, tune
 from fuselog.recorders.atomic import scratch_folder
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import field_of, flat, merge, nested
@@ -29,13 +29,14 @@ from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.foreign.naming import allowed, name_of
-from fuselog.replay.inference.all_methods import modelled
+from fuselog.replay.inference.all_methods import METHODS, modelled
 from fuselog.replay.inference.estimators import model_of
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline import viewer
 
 Values = Mapping[str, float]
 MOST = 2  # filters side by side
+NO_FILTERS = ("bound",)  # methods that estimate nothing
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,16 @@ class Session:
         model = model_of(kind) if isinstance(kind, Estimator) else None
         return {**like, "kind": modelled(model, method) if model else method}
 
+    @property
+    def methods(self) -> list[str]:
+        """Return the methods by which another filter can follow the log, with the first's settings."""
+        found = []
+        for method in METHODS:
+            with suppress(BadInput):
+                if method not in NO_FILTERS and bind(method, [self.source], self.like_first(method)):
+                    found.append(method)
+        return found
+
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
         """Return the same log with other filters; raises BadInput where one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
@@ -122,7 +133,8 @@ class Session:
     def play(self, label: str, values: Values) -> Played:
         """Replay one filter with some parameters set, and judge it.
 
-        Raises BadInput where it refuses them, or cannot begin.
+        The log-likelihood is that with an open gate, as `likelihoods` has it. Raises BadInput where it
+        refuses the parameters, or cannot begin.
         """
         begin = time.perf_counter()
         bound = self._bound(label, values, self._run.ensemble)
@@ -131,6 +143,9 @@ class Session:
         judged = judge.add(outputs)
         estimated = self.settings(label, values).get("estimate", ())
         cases = cases_of(outputs, judged.errors, self.source.epoch_ns, estimated)
+        if gate_of(bound) < 1.0:
+            opened = self._likelihoods(label, {**values, **OPEN})
+            cases = {name: replace(case, log_likelihood=opened[name]) for name, case in cases.items()}
         parameters = bound[0].parameters
         stated = {label: parameters.model_dump()} if parameters is not None else {}
         alarms, failures = alarms_of(judge, stated), judge.failures
@@ -139,20 +154,23 @@ class Session:
 
     def likelihoods(
         self, label: str, values: Values, name: str, count: int = 15
-    ) -> Iterator[tuple[float, float]]:
-        """Yield the log-likelihood along one parameter: value and likelihood, from its least value on.
+    ) -> Iterator[tuple[float, Mapping[str, float]]]:
+        """Yield the log-likelihood of each case along one parameter, from its least value on.
 
-        The gate is open: likelihoods of other measurements are not to be compared.
+        One of the parameter's values is that which it has. The gate is open: likelihoods of other
+        measurements are not to be compared.
         """
+        slider = self.slider(name)
         opened = OPEN if name not in OPEN and self._takes(label, *OPEN) else {}
-        for value in self.slider(name).values(count):
-            try:
-                cases = self.play(label, {**values, **opened, name: value}).cases
-            except BadInput:
-                continue
-            likelihood = sum(case.log_likelihood for case in cases.values())
-            if math.isfinite(likelihood):
-                yield value, likelihood
+        for value in sorted({*slider.values(count), values.get(name, slider.own)}):
+            with suppress(BadInput):
+                yield value, self._likelihoods(label, {**values, **opened, name: value})
+
+    def _likelihoods(self, label: str, values: Values) -> dict[str, float]:
+        """Return the log-likelihood of each case by a replay that is not judged."""
+        outputs = collect(replay(self._run.ensemble, self._bound(label, values, self._run.ensemble)))
+        cases = cases_of(outputs, [], self.source.epoch_ns)
+        return {name: case.log_likelihood for name, case in cases.items()}
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
         """Find the best values of some parameters, the others as they are set, and by what.

@@ -10,6 +10,7 @@ from fuselog.pipeline.exploring.curves import Case
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
 
+LIKELIHOOD = "log-likelihood, open gate"
 Level = Literal["good", "doubtful", "failed"]
 
 
@@ -95,5 +96,5 @@ def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:
     if not math.isnan(nis := mean_nis(case)):
         found["NIS, aim 1"] = nis, ""
     if not math.isnan(case.log_likelihood):
-        found["log-likelihood"] = case.log_likelihood, ""
+        found[LIKELIHOOD] = case.log_likelihood, ""
     return found

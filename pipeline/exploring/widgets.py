@@ -1,6 +1,6 @@
 """Makes the page's sliders, buttons, choices and the axis of time, as Bokeh has them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,11 +12,9 @@ from fuselog.pipeline.exploring.markup import SIDE
 from fuselog.pipeline.exploring.plots import COLOURS
 from fuselog.pipeline.exploring.sliders import STEPS, Slider
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS
-from fuselog.replay.inference.all_methods import METHODS
 
 NONE = "none"
 A_ROW = 2  # buttons
-NO_FILTERS = ("bound",)  # methods that estimate nothing
 YEAR_2000_NS = 946_684_800_000_000_000  # clocks that show less do not show the date
 # Bokeh's sliders have no name for a screen reader, and say a place from 0 to 1: tags hold both in words.
 NAME_SLIDERS = """
@@ -67,10 +65,9 @@ def time_range(epoch_ns: int) -> Range1d:
     return Range1d(0.0, 1.0, name=f"seconds since {began:%Y-%m-%d %H:%M:%S} UTC")
 
 
-def filter_choices(filters: Iterable[str], known: Iterable[str]) -> list[Any]:
-    """Make the choices of both filters, the second of which may be none: those at hand, methods."""
+def filter_choices(filters: Iterable[str], names: Sequence[str]) -> list[Any]:
+    """Make the choices of both filters, the second of which may be none."""
     width = (SIDE - 20) // 2
-    names = list(dict.fromkeys([*known, *(each for each in METHODS if each not in NO_FILTERS)]))
     first, second = [*filters, NONE][:2]
     return [
         Select(title="Filter", name="filter", options=names, value=first, width=width),

@@ -5,7 +5,7 @@ limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error tha
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,9 +15,13 @@ from fuselog.replay.engine.replaying.usage import SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import LOST
 from fuselog.replay.judging.consistency.consistency import CONSISTENT
 from fuselog.replay.judging.errors.constant import Constant
+from fuselog.replay.judging.errors.differences import FEWEST_DOMINATED, dominating
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.measuring import metric_key
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 USUAL_GATE = 0.99  # where it is not known
 RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
@@ -109,6 +113,7 @@ def _of_errors(judge: Judge) -> Iterator[Alarm]:
                 yield _of_constant(estimator, case, constants[what])
             elif key == of_state:
                 words = f"{_name(*what)}: NEES is {nees:.3g}, {_expected(nees, low, high)}"
+                words += _of_one_run(judge, estimator, case)
                 if (lacking := judge.unestimated.get(what)) and nees > high:
                     more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
                     words += (
@@ -121,6 +126,26 @@ def _of_errors(judge: Judge) -> Iterator[Alarm]:
             else:
                 continue
             break
+
+
+def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
+    """Name the run that dominates the mean NEES; empty if none does."""
+    if judge.runs < FEWEST_DOMINATED:
+        return ""
+    table = judge.runs_table
+    own = table[(table["estimator"] == estimator) & (table["case"] == case)]
+    found = dominating_run(own.set_index("run")["nees"].dropna())
+    return f"; {found}" if found else ""
+
+
+def dominating_run(nees: "pd.Series[float]") -> str:
+    """Say which run has more of the mean NEES than all others together; empty if none has."""
+    values = np.asarray(nees, np.float64)
+    place = dominating(values)
+    if place is None:
+        return ""
+    rest = float(np.delete(values, place).mean())
+    return f"run {nees.index[place]} dominates it with {values[place]:.3g}: without that run {rest:.3g}"
 
 
 def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:

@@ -11,9 +11,10 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from io import StringIO
 from statistics import median
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -137,9 +138,29 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+class PrintedTable(NamedTuple):
+    """Holds a table as it is printed."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> None:
     """Print a table; columns of numbers are set right, long texts are broken into lines."""
-    body = [list(row) for row in rows]
+    out.print(_drawn(PrintedTable(title, columns, list(rows))))
+
+
+def printed(table: PrintedTable) -> str:
+    """Return a table as text."""
+    console = Console(file=StringIO(), highlight=False, markup=False, emoji=False, width=1000)
+    with console.capture() as captured:
+        console.print(_drawn(table))
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())
+
+
+def _drawn(printed: PrintedTable) -> Table:
+    title, columns, body = printed
     table = Table(
         title=printable(title) or None,
         title_justify="left",
@@ -152,7 +173,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
         table.add_column(printable(column), justify="right" if numeric else "left", overflow="fold")
     for row in body:
         table.add_row(*(printable(format_value(value)) for value in row))
-    out.print(table)
+    return table
 
 
 def format_value(value: object) -> str:
@@ -187,7 +208,11 @@ def is_value(value: object) -> bool:
 
 def has_many_cases(metrics: Mapping[str, MetricValue]) -> bool:
     """Tell whether metrics are of so many cases that they are summarised."""
-    return len({split_metric(key)[2] for key in metrics} - {""}) > MOST_CASES
+    return _number_of_cases(metrics) > MOST_CASES
+
+
+def _number_of_cases(metrics: Mapping[str, MetricValue]) -> int:
+    return len({split_metric(key)[2] for key in metrics} - {""})
 
 
 def print_metrics(
@@ -202,24 +227,35 @@ def print_metrics(
     of runs there is also the mean NEES over them, see `metric_tables`. Of many cases there is one table
     of their medians; `details` says where each of them is.
     """
+    for title, columns, rows in tables_of(metrics, bounds, runs):
+        print_table(columns, rows, title)
+    if has_many_cases(metrics):
+        say(f"each of the {_number_of_cases(metrics)} cases by itself: {details}")
+
+
+def tables_of(
+    metrics: Mapping[str, MetricValue],
+    bounds: Mapping[str, Bounds],
+    runs: "pd.DataFrame | None" = None,
+    most_cases: int = MOST_CASES,
+) -> list[PrintedTable]:
+    """Return the tables of metrics, see `print_metrics`; of more cases than `most_cases` the medians."""
     tables = metric_tables(metrics, bounds, runs)
-    cases = [table for table in tables if table.case]
-    summarised = has_many_cases(metrics)
+    is_summarised = _number_of_cases(metrics) > most_cases
+    found = []
     for table in tables:
-        if table.case and summarised:
+        if table.case and is_summarised:
             continue
         rows = []
         for quantity, values in table.quantities.items():
             cells = [values.get(estimator, Measured()) for estimator in table.estimators]
             rows.append([quantity, *map(_with_bounds, cells)])
-        print_table(["", *table.estimators], rows, table.case)
-    if summarised:
-        _print_cases(cases)
-        say(f"each of the {len(cases)} cases by itself: {details}")
+        found.append(PrintedTable(table.case, ["", *table.estimators], rows))
+    return [*found, _over_cases([table for table in tables if table.case])] if is_summarised else found
 
 
-def _print_cases(tables: Sequence[MetricTable]) -> None:
-    """Print the medians over cases, the least and the greatest: a row per quantity with numbers."""
+def _over_cases(tables: Sequence[MetricTable]) -> PrintedTable:
+    """Return the medians over cases, the least and the greatest: a row per quantity with numbers."""
     found: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for quantity, values in table.quantities.items():
@@ -234,7 +270,7 @@ def _print_cases(tables: Sequence[MetricTable]) -> None:
         if of
     ]
     title = f"{len(tables)} cases: the median of those that have it, and from the least to the greatest"
-    print_table(["", *estimators], rows, title)
+    return PrintedTable(title, ["", *estimators], rows)
 
 
 def _spread(values: Sequence[float]) -> str | None:

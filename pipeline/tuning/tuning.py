@@ -134,7 +134,7 @@ def tune(
     _refuse_random(label, bound, by)
     start = np.array([each.start for each in searched])
     others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
-    opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
+    opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and gate_of(bound) < 1.0 else settings
     names = [each.name for each in searched]
 
     with _pool(workers, scheduler, executor) as pool:
@@ -167,7 +167,7 @@ def tune(
         costs=costs,
         held_out_costs=held_out_costs,
         folds=pd.DataFrame(rows),
-        gate=_gate(bound) if opened is not settings else 1.0,
+        gate=gate_of(bound) if opened is not settings else 1.0,
     )
 
 
@@ -186,7 +186,7 @@ def _criterion(run: Run, bound: Sequence[Bound]) -> By:
     return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
 
 
-def _gate(bound: Sequence[Bound]) -> float:
+def gate_of(bound: Sequence[Bound]) -> float:
     """Return the probability that a measurement is let in by the gate, if there is one."""
     return float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
 

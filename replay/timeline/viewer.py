@@ -153,7 +153,7 @@ def view_inline(rrd: Path) -> None:
         from rerun_notebook import Viewer
     except ImportError:
         raise BadInput(
-            "to show a timeline in a notebook: pip install "
+            "to show a timeline in a notebook, install fuselog's extra `notebook`: pip install "
             f"rerun-notebook=={rr.__version__}; or write it with save=FILE.rrd"
         ) from None
     widget = Viewer(width="auto", height="auto")

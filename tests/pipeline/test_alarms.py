@@ -44,6 +44,20 @@ def _other_origin(_: Any, time: Any) -> Any:
 @pytest.mark.paper
 def test_no_alarm_where_all_is_well(log: MemorySource) -> None:
     assert not replay(log, ["ekf", "ukf", "smoother:ekf", "smoother:iterated"]).alarms
+    assert not replay(record("vehicles", seed=7), ["ekf", "vehicle-kalman"]).alarms
+
+
+def test_a_run_that_dominates_the_mean_nees_is_named(log: MemorySource) -> None:
+    """The truth of one of three runs is of another origin for a tenth of the time."""
+    logs = [
+        log,
+        record("landmarks", seed=6, duration_s=30.0),
+        record("landmarks", seed=7, duration_s=30.0),
+    ]
+    late = _truth_moved(logs[1], lambda _, time: (np.where(time > 0.9, 0.5, 0.0), 0.0 * time))
+    [found] = [each for each in replay([logs[0], late, logs[2]], "ekf").alarms if each.kind == "errors"]
+    assert "; run 1 dominates it with " in found.words
+    assert not any("dominates" in each.words for each in replay([late], "ekf").alarms)
 
 
 def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -> None:

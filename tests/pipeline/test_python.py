@@ -18,6 +18,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
+from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.output.results import read_result
 from fuselog.replay.engine.replaying.estimator import Estimator
 
@@ -473,6 +474,25 @@ def test_a_figure_shows_a_case() -> None:
     assert done.figure().get_suptitle().startswith("robot1, 1 run")
     with pytest.raises(fl.BadInput, match="nothing with the name 'robot3' was judged"):
         done.figure("robot3")
+
+
+def test_replays_results_and_entries_are_short_and_tables_in_a_notebook(world: Path) -> None:
+    """Of several cases the medians; what a folder's name may hold is no HTML."""
+    logs = [fl.record("landmarks", seed=seed, robots=9, **SHORT) for seed in (1, 2)]
+    done = fl.replay(logs, {"ekf": {"sigma_range_m": 0.01}, "ukf": {}})
+    saved = ResultFolder(Path("<i>result"), read_result(world / "result"))
+    for shown in (done, saved):
+        text, page = repr(shown), shown._repr_html_()
+        assert len(text.splitlines()) < 25
+        for nees in shown.metrics.pivot_table("value", "quantity", "estimator", "median").loc["nees"]:
+            assert f" {nees:.4g} (" in text
+            assert f"<td>{nees:.4g} (" in page
+    assert done.alarms[0].words in repr(done)
+    assert "<i>" not in saved._repr_html_()
+    robot = fl.models["robot"]
+    assert repr(robot) == f"robot: {robot.what}"
+    assert "<td>sigma_range_m</td><td>from the log</td><td>m</td>" in robot._repr_html_()
+    assert f"<td>robot</td><td>{robot.what}</td>" in fl.models._repr_html_()
 
 
 def test_lists_are_mappings_of_names() -> None:

@@ -18,10 +18,11 @@ from fuselog.pipeline.output.report.evidence import Consistency, Spread, finding
 from fuselog.pipeline.output.report.gauge import gauge
 from fuselog.pipeline.output.report.kinds import how_many_differ, opening
 from fuselog.pipeline.output.report.naming import title_of
-from fuselog.pipeline.output.report.sheet import table_of_pairs
+from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
 from fuselog.pipeline.output.report.story import Story, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
+from fuselog.replay.judging.errors.differences import dominating
 
 
 def _told(
@@ -81,6 +82,38 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
         r"c errs 0\.98\d m more than [ab] in the mean over runs \(95 % 0\.9\d+ to 1\.0\d m\)\.",
         difference,
     )
+
+
+def test_a_run_that_dominates_the_mean_nees_is_named() -> None:
+    """Of five runs the third has 400, and the others 3 on average; only one filter has such a run."""
+    errors = [1.0, 1.1, 1.2, 1.1, 1.0]
+    bad = {"position_rmse_m": errors, "nees": [2.0, 4.0, 400.0, 2.5, 3.5]}
+    told = _told({"bad": bad, "good": {"position_rmse_m": errors, "nees": [3.0] * 5}})
+    notes = {card.estimator: " ".join(card.notes) for card in told.cards}
+    assert "Mean NEES: run 2 dominates it with 400: without that run 3." in notes["bad"]
+    assert "dominates" not in notes["good"]
+    assert [dominating(np.array(each)) for each in ([1.0, 9.0], [9.0, 4.0, 5.0], [9.0, 4.0, 4.9])] == [
+        None,
+        None,
+        0,
+    ]
+
+
+def test_the_table_begins_with_whom_to_take() -> None:
+    """So that on a phone its column is seen first, whatever the order of the experiment."""
+    runs = {"a": 3.0 + NOISE[0], "b": 2.0 + NOISE[1], "c": 1.0 + NOISE[2]}
+    rows = pd.concat(
+        pd.DataFrame({"estimator": label, "case": "", "run": range(20), "position_rmse_m": each})
+        for label, each in runs.items()
+    )
+    metrics = {f"{label}.position_rmse_m": float(each.mean()) for label, each in runs.items()}
+    result = Result(
+        experiment="x", fuselog="1", settings={}, input_sha256="", metrics=metrics, claims=[]
+    )
+    sheet, _ = sheets(findings(result, {"runs": rows}))
+    assert sheet is not None
+    assert sheet.columns == ["c", "a", "b"]
+    assert [cell.look for cell in sheet.groups["Accuracy"][0].cells] == ["best", "", ""]
 
 
 def test_who_diverged_is_not_called_overconfident() -> None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from fuselog.pipeline.output.report.choosing import choice_of
 from fuselog.pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
 from fuselog.pipeline.output.results import Measured, MetricTable
 from fuselog.pipeline.output.words import (
@@ -67,8 +68,12 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """Return the table of a result, and of several cases one each; None without numbers."""
-    columns = [*found.labels, *found.bounds]
+    """Return the table of a result, and of several cases one each; None without numbers.
+
+    Whom to take stands in the first column, which is seen first where the table is wider than the page.
+    """
+    take, _ = choice_of(found)
+    columns = list(dict.fromkeys([*filter(None, [take]), *found.labels, *found.bounds]))
     tables = [table for table in found.tables if any(table.quantities.values())]
     if not tables or not columns:
         return None, []

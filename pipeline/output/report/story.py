@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from fuselog.pipeline.output.alarming import dominating_run
 from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
 from fuselog.pipeline.output.report import choosing
 from fuselog.pipeline.output.report.doubts import doubts_of
@@ -316,6 +317,8 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
         notes += _in_how_many(found, take)
     elif best and each.error and best.value and each.error.value > 1.05 * best.value:
         notes.append(f"{number(each.error.value / best.value, 2)} times the error of {take}.")
+    if one_run := dominating_run(found.by_run(each.estimator, "nees")):
+        notes.append(f"Mean NEES: {one_run}.")
     outside, cases = each.outside
     if cases > 1:
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")

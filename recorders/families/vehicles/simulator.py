@@ -99,8 +99,8 @@ class VehiclesParameters(Parameters):
     Attributes:
         duration_s: length of the run.
         step_s: length of a time step, during which an acceleration holds.
-        stochastic: whether starts are drawn from the prior and accelerations act; filters assume both in
-            any case.
+        stochastic: whether starts are drawn from the prior and accelerations act. Filters assume both in
+            any case; without them, as in the paper, their covariances are too large.
         start: states (x, vx, y, vy) of the vehicles at the start, in m and m/s.
         vehicles: above 0, so many start anywhere in the field instead.
         speed_mps: speed of vehicles that start anywhere.
@@ -116,7 +116,7 @@ class VehiclesParameters(Parameters):
 
     duration_s: PositiveFloat = 100.0
     step_s: PositiveFloat = 1.0
-    stochastic: bool = False
+    stochastic: bool = True
     start: tuple[State, ...] = PAPER_START
     vehicles: Annotated[int, Field(ge=0, le=60)] = 0
     speed_mps: NonNegativeFloat = 2.0

@@ -60,6 +60,20 @@ TARGETS: dict[str, Target] = {
 }
 
 
+FEWEST_DOMINATED = 3  # numbers, of which one may be more than all others together
+
+
+def dominating(values: Floats) -> int | None:
+    """Return the place of the number (n,), none below zero, that is more than all others together.
+
+    None if there is none, or if there are too few.
+    """
+    if len(values) < FEWEST_DOMINATED:
+        return None
+    greatest = int(np.argmax(values))
+    return greatest if 2.0 * values[greatest] > values.sum() else None
+
+
 class Difference(NamedTuple):
     """States the difference of a metric of two estimators over the same runs.
 

@@ -48,6 +48,8 @@ DRAWN_ROWS = 5000
 # A stream is silent after so many of its usual intervals, but not before so long.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
+# A stream has a rate if half of its intervals are within this share of the usual one.
+RATE_JITTER = 0.25
 ESTIMATES = (
     schemas.GAUSSIAN_ESTIMATE,
     schemas.DENSITY_ESTIMATE,
@@ -352,8 +354,18 @@ def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
 
 
 def gap_limit_ns(time_ns: Times) -> int:
-    """Return how long a stream with these times, sorted, may be silent before it is missed."""
-    return int(max(GAP_INTERVALS * usual_interval_ns(time_ns), GAP_S * 1e9))
+    """Return how long a stream with these times, sorted, may be silent before it is missed.
+
+    A stream without a rate, such as of shots or of what a camera happens to see, comes in bursts: it is
+    compared with the pauses in which half of its time passes, apart from the longest.
+    """
+    intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)
+    usual_ns = usual_interval_ns(time_ns)
+    near = np.abs(intervals - usual_ns) <= RATE_JITTER * usual_ns
+    if len(intervals) > 1 and np.count_nonzero(near) < 0.5 * len(intervals):
+        passed = np.cumsum(intervals[:-1])
+        usual_ns = float(intervals[np.searchsorted(passed, 0.5 * passed[-1])])
+    return int(max(GAP_INTERVALS * usual_ns, GAP_S * 1e9))
 
 
 def usual_interval_ns(time_ns: Times) -> float:

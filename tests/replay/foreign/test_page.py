@@ -51,7 +51,7 @@ def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_fil
     assert said in text
     Path("silent.c").write_text(text.replace(said, ""), encoding="utf-8")
     silent = compile_filter(Path("silent.c").resolve())
-    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=4.0)
+    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=4.0, stochastic=False)
     given = {"kind": "lib", "in_process": True}
     loud, mute = ({"mine": given | {"path": str(path)}} for path in (drifter, silent))
     tuned = [fl.tune(log, loud, "drift_density", by="rmse"), fl.tune(log, mute, "drift_density")]

@@ -11,7 +11,7 @@ from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.judge import Judge
-from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
+from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour, gap_limit_ns
 from fuselog.replay.timeline.show import Drawing
 from tests.replay.timeline.test_timeline import Columns, read, told
 
@@ -195,6 +195,16 @@ def test_all_that_happens_is_told_at_its_stamp_with_its_level(moving: dict[str, 
     silent = moving["/events/wheels"]
     assert silent["utc"] == [BEGIN_NS + 3 * SECOND]
     assert told(silent) == ["wheels: silent for 27.0 s"]
+
+
+def test_pauses_between_bursts_are_no_silence() -> None:
+    """Shots with echoes, four times as long apart once; a sensor with a rate is missed as before."""
+    shots = np.cumsum([0, 5, 5, 5, 20, 5, 5, 5]) * SECOND
+    echoes = np.array([0, 80, 130, 290]) * 1_000_000
+    assert np.diff(shots).max() < gap_limit_ns((shots[:, None] + echoes).ravel()) < 30 * SECOND
+    rated = np.delete(np.arange(60), np.arange(20, 50)) * SECOND
+    jittered = rated + np.arange(len(rated)) % 3 * 50_000_000
+    assert gap_limit_ns(rated) == 5 * SECOND < gap_limit_ns(jittered) < 6 * SECOND
 
 
 def test_stamps_that_are_no_dates_have_those_of_the_recorder(tmp_path: Path) -> None:

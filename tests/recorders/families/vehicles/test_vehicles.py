@@ -41,7 +41,7 @@ def test_frames_are_inverse_and_the_nominal_vehicles_meet() -> None:
     """A point into the sensor's frame and back; vehicles 1 and 2 are one point at t = 50, as 4 and 5."""
     pose, point = (60.0, -40.0, 2.0), np.array([3.0, 7.0])
     assert_allclose(out_of_frame(pose, into_frame(pose, point)), point, atol=1e-12)
-    streams = recorded(duration_s=60.0)
+    streams = recorded(stochastic=False, duration_s=60.0)
     truth = [streams[f"/vehicle{number}/truth"]["state"] for number in range(1, 6)]
     assert_allclose(truth[0][50, 0::2], truth[1][50, 0::2], atol=1e-9)
     assert_allclose(truth[3][50, 0::2], truth[4][50, 0::2], atol=1e-9)

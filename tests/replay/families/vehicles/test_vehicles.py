@@ -49,7 +49,8 @@ METHODS = ("known-topology", "set", "hungarian-topology", "hungarian-registratio
 @pytest.fixture(scope="module")
 def runs() -> list[MemorySource]:
     """Forty runs of the paper's scenario in which two vehicles turn."""
-    return record_ensemble("vehicles", {"turn_rate_radps": [0.0, 0.05, 0.0, -0.05, 0.0]}, 1, 40)
+    values = {"turn_rate_radps": [0.0, 0.05, 0.0, -0.05, 0.0], "stochastic": False}
+    return record_ensemble("vehicles", values, 1, 40)
 
 
 @pytest.fixture(scope="module")
@@ -271,6 +272,7 @@ def test_rates_delays_and_losses_mixed(order: str) -> None:
     late = {"latency_jitter_s": 0.3}
     values = {
         "duration_s": 40.0,
+        "stochastic": False,
         "fix": {"dropout_probability": 0.2, **late},
         "network": {"detection_probability": 0.8, **late},
         "infrastructure": {"rate_hz": 3.0, "latency_s": 0.1},
