@@ -146,8 +146,8 @@ class Judge:
             self._measured.add(topic, output)
         for name, kind in self._kinds.items():
             with foreign_code(f"judge {name}"):
-                own = kind.add(outputs)
-            for topic, found in own:
+                others = kind.add(outputs)
+            for topic, found in others:
                 judged.others.append(found)
                 self._measured.add(topic, found)
             for topic, why in kind.unjudged.items():
