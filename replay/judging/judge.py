@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
 from fuselog.recorders.log.planes import Origin
-from fuselog.recorders.registry import available, load
+from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.bounds import Bounds
@@ -97,7 +97,9 @@ class Judge:
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
         runs = JudgedRuns(sources, self._truths, gap_limit_s, first_run)
-        self._kinds: list[KindJudge] = [load("judges", name, type)(runs) for name in available("judges")]
+        self._kinds: dict[str, KindJudge] = {
+            name: load("judges", name, type)(runs) for name in available("judges")
+        }
         self._notes: dict[str, None] = {}
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
@@ -144,8 +146,10 @@ class Judge:
                 self._bounds.setdefault(split_topic(topic), Bounds()).add(output)
             self._means.add(output)
             self._measured.add(topic, output)
-        for kind in self._kinds:
-            for topic, found in kind.add(outputs):
+        for name, kind in self._kinds.items():
+            with foreign_code(f"judge {name}"):
+                others = kind.add(outputs)
+            for topic, found in others:
                 judged.others.append(found)
                 self._measured.add(topic, found)
             for topic, why in kind.unjudged.items():
@@ -192,7 +196,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._kinds, self._on_errors = (), [], [], None
+        self._sources, self._truths, self._kinds, self._on_errors = (), [], {}, None
         self._steps.clear()
         for of_topic in self._uninformed.values():
             of_topic.first.clear()

@@ -1,6 +1,7 @@
 """What the repository says of itself: the rooms, the commands, the systems it is tried on."""
 
 import ast
+import os
 import re
 import tomllib
 from importlib.metadata import version
@@ -12,6 +13,7 @@ import yaml
 
 from fuselog.replay.timeline.viewer import PACKAGES
 from tests.house.sources import PATHS, nodes_of, text_of
+from tests.replay.engine.processes import printed
 
 ROOT = Path(__file__).parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -50,6 +52,40 @@ def test_families_are_the_same_in_all_rooms_and_no_part_of_the_core_may_import_o
     families = {f"fuselog.{room}.families" for room in rooms}
     assert {*contract["forbidden_modules"]} == families
     assert {*contract["source_modules"]} == parts - families
+
+
+WITHOUT_FAMILIES = """
+import sys
+from pathlib import Path
+from fuselog.recorders import registry
+
+class Nowhere:
+    def find_spec(self, name, path=None, target=None):
+        if ".families" in name:
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Nowhere())
+everywhere = registry.available
+registry.available = lambda kind: {
+    name: each for name, each in everywhere(kind).items() if ".families." not in each.value
+}
+import fuselog as fl
+from fuselog.replay.timeline.show import show
+
+run = fl.record("landmarks", duration_s=3.0)
+done = fl.replay(run, ["ekf", "dead-reckoning"])
+rmse_m = done.metrics[done.metrics["quantity"] == "position_rmse_m"]["value"].tolist()
+print(0.0 < rmse_m[0] < rmse_m[1])
+show(run, {}, [], save=Path("run.rrd"))
+print(Path("run.rrd").exists())
+"""
+
+
+@pytest.mark.paper
+def test_the_core_works_without_any_family(tmp_path: Path) -> None:
+    """A robot is recorded, followed, judged and drawn where no family can be imported."""
+    [said] = printed([WITHOUT_FAMILIES], tmp_path, os.environ, "ignore")
+    assert said.split() == ["True", "True"]
 
 
 def test_the_groups_of_entry_points_are_those_that_are_told() -> None:

@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fuselog.recorders.families.acoustic import models as acoustic
+from fuselog.recorders.families.directional import headings
 from fuselog.recorders.families.los import models as optical
+from fuselog.recorders.families.sampling import extended_target, reactor
+from fuselog.recorders.families.sets import models as relative_bearing
+from fuselog.recorders.families.vehicles import models as vehicles
+from fuselog.recorders.models import constant_velocity, geodesy, planar
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.tracing import traced
 from fuselog.replay.tracing.functions import Derivative
@@ -371,8 +375,18 @@ MODELS = [
     ("geodesy.earth_centred(x[0], x[1])", 2, 3),
 ]
 NOISE, MEDIUM = acoustic.Noise(0.02, 0.03, 0.001, 1.0), acoustic.Medium()
-MODULES = {name for call, _, _ in MODELS for name in re.findall(r"(\w+)\.\w+\(", call)}
-NAMES = {name: import_module(f"fuselog.recorders.models.{name}") for name in MODULES}
+NAMES = {
+    "acoustic": acoustic,
+    "constant_velocity": constant_velocity,
+    "extended_target": extended_target,
+    "geodesy": geodesy,
+    "headings": headings,
+    "optical": optical,
+    "planar": planar,
+    "reactor": reactor,
+    "relative_bearing": relative_bearing,
+    "vehicles": vehicles,
+}
 
 
 @cache
