@@ -378,12 +378,15 @@ def _faults(names: Names) -> list[Hypothesis]:
 
 
 def _alike(ranked: Sequence[Named]) -> Names:
-    """Return the likeliest, and those that a log does not tell from it; the usual names first."""
+    """Return the likeliest, and those that a log does not tell from it; the usual names first.
+
+    Before all others is a delay that is set and too large.
+    """
     least = ranked[0][0].score(ranked[0][1]) - RIVAL
     near = [
         pair for pair in ranked if pair[0].score(pair[1]) >= least or _is_other_name(pair, ranked[0])
     ]
-    return sorted(near, key=_is_early)
+    return sorted(near, key=lambda pair: (not _takes_back(pair), _is_early(pair)))
 
 
 def _is_physical(of: Hypothesis) -> bool:
@@ -468,12 +471,12 @@ def _companion(
 
 
 def _is_other_name(pair: Named, first: Named) -> bool:
-    """Tell whether a topic is late by as much as the likeliest cause has another early.
+    """Tell whether a topic is late by as much as the likeliest cause has another early, or reversely.
 
     These are one fault but for what is at the ends of the log.
     """
     (at, of), (best, early) = pair, first
-    if not _is_early(first) or of.kind != early.kind or of.topic == early.topic:
+    if of.kind != early.kind or of.topic == early.topic or not (_is_early(first) or _takes_back(pair)):
         return False
     return abs(at.value + best.value) < SAME_SIZE * abs(best.value) and at.gain > SAME_GAIN * best.gain
 
@@ -481,7 +484,14 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 def _is_early(pair: Named) -> bool:
     """Tell whether it is the less usual name of a fault: one topic is late, or all others are early."""
     at, of = pair
-    return of.kind in ("delay", "clock drift") and isinstance(at.value, float) and at.value < 0.0
+    is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
+    return is_of_stamps and of.already + at.value < 0.0
+
+
+def _takes_back(pair: Named) -> bool:
+    """Tell whether it takes back part of a delay that is set: the setting is too large."""
+    at, of = pair
+    return of.already > 0.0 > at.value and not _is_early(pair)
 
 
 def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> list[Peak]:

@@ -61,7 +61,7 @@ class SearchOutcome(NamedTuple):
         at_edge: parameters beside whose values a run fails, or uses fewer measurements.
         begins_alike: whether filters begin with the optimum where they began in the search.
         held: parameters of a calibration that the motion does not determine; they stay at their start.
-        lacks: the sentence that says so.
+        lacks: the sentences that say so, and of which other parameters the values depend on these.
     """
 
     coordinates: Coordinates
@@ -74,7 +74,7 @@ class SearchOutcome(NamedTuple):
     at_edge: Sequence[str] = ()
     begins_alike: bool = True
     held: Sequence[str] = ()
-    lacks: str = ""
+    lacks: Sequence[str] = ()
 
 
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
@@ -93,6 +93,34 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     unknown = np.sum(vectors[:, ~rises] ** 2, axis=1) > INVOLVED**2
     covariance[unknown, unknown] = np.inf
     return Confidence(places, curvature, covariance)
+
+
+def with_noise(curvature: Floats, noise: Floats) -> Floats:
+    """Reduce a curvature to that with which its inverse is the covariance of parameters.
+
+    If slopes vary more than the curvature says, the estimates' covariance is that of the slopes between
+    two inverse curvatures: White, Maximum likelihood estimation of misspecified models, Econometrica 50,
+    1982. The curvature counts the noise that slopes are linear in already, so that in each direction
+    the larger of the two is used.
+
+    Args:
+        curvature: (m, m), the second derivatives of the cost.
+        noise: (m, m), the covariance of its first derivatives by the noise of what drives the motion.
+
+    Returns:
+        The curvature (m, m), smaller along directions in which the noise is larger than it.
+
+    >>> with_noise(np.diag([4.0, 4.0]), np.diag([1.0, 16.0])).round(6).tolist()
+    [[4.0, 0.0], [0.0, 1.0]]
+    """
+    values, vectors = np.linalg.eigh(curvature)
+    rises = values > 0.0
+    root = vectors[:, rises] * np.sqrt(values[rises])
+    inverse = vectors[:, rises] / np.sqrt(values[rises])
+    times, along = np.linalg.eigh(inverse.T @ noise @ inverse)
+    turned = root @ along
+    rest = (vectors[:, ~rises] * values[~rises]) @ vectors[:, ~rises].T
+    return (turned / np.maximum(times, 1.0)) @ turned.T + rest
 
 
 def doubts(confidence: Confidence, coordinates: Coordinates) -> Iterator[str]:

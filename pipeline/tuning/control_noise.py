@@ -7,6 +7,11 @@ already, and less where it is averaged or attenuated. So the corrected log-likel
 c is the mean of L(u + n) and L(u - n) less L(u): the noise then enters all alternatives alike. Nakamura,
 Corrected score function for errors-in-variables models, Biometrika 77, 1990; Cook and Stefanski,
 Simulation-extrapolation estimation, JASA 89, 1994.
+
+An error of the mean over few copies moves the estimates of all logs of one length in the same way. So
+the signs of the noise are those of a Hadamard matrix: over all copies the products of nearby messages
+cancel, and only messages that are further apart than there are pairs leave an error. Bekas, Kokiopoulou
+and Saad, An estimator for the diagonal of a matrix, Applied Numerical Mathematics 57, 2007.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import hadamard
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.altering.entries import entries_of
@@ -22,7 +28,7 @@ from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
-PAIRS = 8  # of copies with opposite noise
+PAIRS = 8  # of copies with opposite noise; a power of two
 SEED = 62
 FEWEST = 20  # messages that tell noise
 MAD = 1.4826  # of a normal distribution: its standard deviation by its median absolute value
@@ -37,25 +43,26 @@ class _Noise(NamedTuple):
     sigma: float
 
 
-def disturbed(source: MemorySource, bound: Sequence[Bound], log: int = 0) -> list[MemorySource]:
+def disturbed(
+    source: MemorySource, bound: Sequence[Bound], log: int = 0, pairs: int = PAIRS
+) -> list[MemorySource]:
     """Return copies of a log with noise added to its controls: each with its opposite after it.
 
     The noise is as large as the model states, but no larger than what is seen in the control. There are
     no copies if a model states none, or none is seen. Of several logs each has noise of its own, by its
-    number `log`.
+    number `log`. `pairs` is a power of two.
     """
     noises = [noise for each in bound for noise in _noises(source, each)]
     rng = np.random.default_rng([SEED, log])
-    copies = list[MemorySource]()
-    for _ in range(PAIRS if noises else 0):
-        pair = [source, source]
-        for each in noises:
-            noise = rng.normal(0.0, each.sigma, len(source.streams[each.topic]))
-            for number, way in enumerate((1.0, -1.0)):
-                streams = pair[number].streams
-                noisy = alter.added(each.field, each.place, streams[each.topic], way * noise)
-                pair[number] = replace(source, streams={**streams, each.topic: noisy})
-        copies += pair
+    copies = [source] * (2 * pairs if noises else 0)
+    for each in noises:
+        count = len(source.streams[each.topic])
+        signs = hadamard(pairs)[:, np.arange(count) % pairs] * rng.choice([-1.0, 1.0], count)
+        for number, copy in enumerate(copies):
+            pair, is_opposite = divmod(number, 2)
+            noise = (-1.0 if is_opposite else 1.0) * each.sigma * signs[pair]
+            noisy = alter.added(each.field, each.place, copy.streams[each.topic], noise)
+            copies[number] = replace(copy, streams={**copy.streams, each.topic: noisy})
     return copies
 
 

@@ -6,15 +6,16 @@ below one is not determined: no pseudo-inverse, which would give it a small stan
 directions by motion: Yang et al., arXiv 2201.09170; wheels: Censi et al., IEEE T-RO 2013.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.pipeline.tuning.objective import Objective, Run, innovations_in
-from fuselog.pipeline.tuning.search import Free
+from fuselog.pipeline.tuning.search import MOVES, Free
 from fuselog.recorders.log import Stream
 from fuselog.replay.judging.consistency.whiteness import whitened
 
@@ -22,6 +23,7 @@ Floats = NDArray[np.float64]
 STEP = 0.01  # of the differences, in useful units
 LEAST = 1.0  # an eigenvalue: a standard error as large as is useful
 INVOLVED = 0.3  # of a parameter's axis in what is not determined
+FURTHEST = float(MOVES[-1])  # useful units that what is held may be wrong by
 NAMED = 0.1  # of a direction, beside its largest part
 
 
@@ -105,6 +107,41 @@ def in_words(
         f"the motion in the logs does not determine {', '.join([*alone, *together])}: held where they "
         f"started ({stay}), without an interval; record turns in both senses at changing speed"
     )
+
+
+def conditions(
+    scaled: Floats, places: Sequence[int], free: Sequence[Free], held: Sequence[str]
+) -> Iterator[str]:
+    """Yield a sentence for each parameter whose interval is right only if one that is held is right.
+
+    What is held may be wrong by as much as the logs leave open, at most by `FURTHEST` useful units.
+
+    Args:
+        scaled: (m, m), the information in useful units.
+        places: of these m parameters among the free ones.
+        free: all parameters.
+        held: the names of those that stay where they started.
+    """
+    names, useful = np.array([(free[place].name, free[place].useful) for place in places], object).T
+    stays = np.isin(names, held)
+    if stays.all():
+        return
+    errors = np.sqrt(np.diagonal(np.linalg.inv(scaled + np.diag(stays / FURTHEST**2))))[stays]
+    covariance = np.linalg.pinv(scaled[np.ix_(~stays, ~stays)])
+    shifts = -covariance @ scaled[np.ix_(~stays, stays)]
+    is_moved = np.abs(shifts) * errors > QUANTILE * np.sqrt(np.diagonal(covariance))[:, None]
+    for name, unit, row, counts in zip(names[~stays], useful[~stays], shifts, is_moved, strict=True):
+        moves = [
+            f"{by * unit:+.2g} if {other} is larger by {step:g}"
+            for other, step, by in zip(
+                names[stays][counts], useful[stays][counts], row[counts], strict=True
+            )
+        ]
+        if moves:
+            yield (
+                f"{name}: the value and its interval are right only if what is held is right: the value "
+                f"changes by {', by '.join(moves)}"
+            )
 
 
 def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, Stream]:

@@ -25,7 +25,7 @@ from fuselog.pipeline.tuning.broad_starts import (
     part_count,
     with_find,
 )
-from fuselog.pipeline.tuning.control_noise import disturbed
+from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, schemas, topics_of
 from fuselog.recorders.parameters import merge, nested
@@ -313,7 +313,7 @@ class Objective:
 
         With such delays they give no innovation, so that likelihoods could not be compared.
         """
-        self.left_out, runs = {}, []
+        runs = []
         for run in self.runs:
             [source] = run.ensemble
             streams = dict(source.streams)
@@ -339,16 +339,22 @@ class Objective:
         noise out of the likelihood that they are found by.
         """
         noises: set[str] = set()
-        runs = []
-        for number, run in enumerate(self.runs):
+        for run in self.runs:
             bound = self._bound(values, run)
-            runs.append(run._replace(disturbed=disturbed(run.ensemble[0], bound, number)))
             readings = [each.reading for each in bound if isinstance(each, Recursive) and each.reading]
             noises |= {name for reading in readings for name in reading().noises}
-        self.runs = runs
+        self.runs = self.with_pairs(values, PAIRS).runs
         self.held = {
             place: float(values[place]) for place, name in enumerate(self.names) if name in noises
         }
+
+    def with_pairs(self, values: Floats, pairs: int) -> "Objective":
+        """Return the same, corrected by this number of pairs of copies of each log, see `correct`."""
+        runs = [
+            run._replace(disturbed=disturbed(run.ensemble[0], self._bound(values, run), number, pairs))
+            for number, run in enumerate(self.runs)
+        ]
+        return replace(self, runs=runs)
 
     def leave_noise(self) -> None:
         """Take the correction back."""
@@ -465,9 +471,8 @@ class Objective:
 
     def _count(self, outputs: Mapping[str, Ragged]) -> int:
         """Count the messages compared: innovations alone, if there are; a delay adds estimates."""
-        if CRITERIA[self.by].is_smooth:
-            return sum(len(stream) for _, stream in innovations_in(outputs))
-        return sum(len(rows) for rows in outputs.values())
+        innovations = sum(len(stream) for _, stream in innovations_in(outputs))
+        return innovations or sum(len(rows) for rows in outputs.values())
 
     def _measured(self, run: Run, outputs: Mapping[str, Ragged]) -> Sums:
         return CRITERIA[self.by].sums(run, outputs, self.gap_limit_s)

@@ -237,8 +237,7 @@ class Tuning:
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
                 )
-        if found.lacks:
-            yield found.lacks
+        yield from found.lacks
         if not found.begins_alike:
             yield (
                 "with these values the filter begins elsewhere than in the search that found them, and "

@@ -24,7 +24,8 @@ ITERATIONS = 200
 TOLERANCE = 1e-13  # of a cost: what a step has to gain
 DESCENTS = 20  # each of which ends where another parameter's change costs less
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
-MOVES = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # of a calibration's parameter, in useful units
+# of a calibration's parameter in a scan, in useful units
+MOVES = np.array([-10.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 10.0])
 LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
 FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches

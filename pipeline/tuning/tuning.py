@@ -18,8 +18,15 @@ from fuselog.pipeline.altering.changes import is_of_topic
 from fuselog.pipeline.altering.sources import split_settings
 from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
 from fuselog.pipeline.runs.executors import WorkerPool, pool_for
-from fuselog.pipeline.tuning.confidence import QUANTILE, Confidence, SearchOutcome, confidence, unknown
-from fuselog.pipeline.tuning.information import in_words, information, undetermined
+from fuselog.pipeline.tuning.confidence import (
+    QUANTILE,
+    Confidence,
+    SearchOutcome,
+    confidence,
+    unknown,
+    with_noise,
+)
+from fuselog.pipeline.tuning.information import conditions, in_words, information, undetermined
 from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.pipeline.tuning.objective import (
     CRITERIA,
@@ -35,8 +42,10 @@ from fuselog.pipeline.tuning.objective import (
 from fuselog.pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from fuselog.pipeline.tuning.search import (
     CURVATURE_STEP,
+    LOOKS,
     MOVES,
     Coordinates,
+    Cost,
     Free,
     coordinates_of,
     curvature,
@@ -54,8 +63,11 @@ from fuselog.replay.foreign.naming import allowed
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
 OPEN = {"gate_probability": 1.0}
-MOVED = 0.5  # of log-likelihood, by which the noise of the controls may change within a standard error
-NOISY_STEP = 0.2  # of the differences where they are corrected, in coordinates: two standard errors
+MOVED = 0.5  # of log-likelihood, by which the noise of the controls may change it
+REACHES = np.array([1.0, 3.0, 10.0])  # standard errors off the optimum, where that is looked at
+NOISY_STEP = 0.2  # of differences where they are corrected, in coordinates: two standard errors
+NOISY_REACH = 5.0  # standard errors, to which they reach at most if another step is useful
+NOISY_PAIRS = 32  # of copies that tell what the noise of the controls adds to slopes; a power of two
 DIVERGED = 2.0  # NIS per component: twice what it should be
 ROUNDS = 4  # of searches, each from where filters begin with the values of the one before
 ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
@@ -279,8 +291,10 @@ def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutco
     """
     start = np.array([each.start for each in free])
     try:
+        if reaches_s := _blocked(objective, _held(objective, free, start)[0], start):
+            objective.begin_after(start, reaches_s)
         found = _settled(objective, free, grid)
-        if reaches_s := _blocked(objective, found):
+        if reaches_s := _blocked(objective, found.coordinates.free, found.optimum):
             objective.begin_after(start, reaches_s)
             found = _settled(objective, free, grid)
         if _is_moved_by_noise(objective, found):
@@ -296,40 +310,42 @@ def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutco
         return SearchOutcome(coordinates, best.point, best.evaluations, was_stopped=True)
 
 
-def _blocked(objective: Objective, found: SearchOutcome) -> dict[str, float]:
-    """Return how far calibrated parameters may reach that beside the optimum give fewer measurements.
+def _blocked(objective: Objective, free: Sequence[Free], values: Floats) -> dict[str, float]:
+    """Return how far calibrated parameters may reach that beside values (k,) give fewer measurements.
 
     A delay does so if it puts a message before the start.
     """
-    free = found.coordinates.free
-    if not CRITERIA[objective.by].is_smooth:
+    places = [place for place, each in enumerate(free) if each.useful and not each.is_kept]
+    if not places:
         return {}
-    steps = np.diag([each.useful for each in free])
-    costs = objective(found.optimum + steps)
+    steps = np.diag([each.useful for each in free])[places]
     return {
-        each.name: value + float(MOVES[-1]) * each.useful
-        for each, value, cost in zip(free, found.optimum.tolist(), costs, strict=True)
-        if each.useful and not each.is_kept and not np.isfinite(cost)
+        free[place].name: float(values[place] + MOVES[-1] * free[place].useful)
+        for place, cost in zip(places, objective(values + steps), strict=True)
+        if not np.isfinite(cost)
     }
 
 
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
-    """Correct the cost for the noise of the controls, if that changes it beside the optimum.
+    """Correct the cost for the noise of the controls, if that noise may decide where it is least.
 
-    If it changes by MOVED or more within a standard error of a parameter, the noise may decide where the
-    cost is least.
+    That is if it changes the cost by MOVED or more, and by half of what the cost rises, a few standard
+    errors of a parameter away. At less than one it may not: where stamps are shifted by half a step, the
+    noise gains most, and about equally much on both sides.
     """
     if found.confidence is None:
         return False
-    places, point = list(found.confidence.places), found.coordinates.of(found.optimum)
+    point = found.coordinates.of(found.optimum)
+    errors = np.zeros(len(point))
+    errors[list(found.confidence.places)] = np.nan_to_num(found.confidence.errors, posinf=0.0)
+    ways = np.outer([*REACHES, *(-REACHES)], errors)[:, :, None] * np.eye(len(point))
+    points = found.coordinates.values(np.array([point, *(point + ways.reshape(-1, len(point)))]))
+    rises = objective(points) - objective(points[:1])
     objective.correct(found.optimum)
-    moves = [place not in objective.held for place in places]
-    if objective.is_corrected and any(moves):
-        errors = np.nan_to_num(found.confidence.errors, posinf=0.0)
-        steps = (errors[:, None] * np.eye(len(point))[places])[moves]
-        points = found.coordinates.values(np.array([point, *(point + steps), *(point - steps)]))
+    points[:, list(objective.held)] = found.optimum[list(objective.held)]
+    if objective.is_corrected:
         lost = objective.lost_by_noise(points).mean(axis=(1, 2))
-        if np.max(np.abs(lost - lost[0])) > MOVED:
+        if np.any(np.abs(lost - lost[0]) > np.maximum(MOVED, 0.5 * rises)):
             return True
     objective.leave_noise()
     return False
@@ -371,7 +387,8 @@ def _held(
     if objective.by != "likelihood" or not places:
         return list(free), {}
     useful = np.array([each.useful for each in free])
-    lacking = undetermined(information(objective, values, useful, places))
+    known = information(objective, values, useful, places)
+    lacking = undetermined(known)
     held = [
         free[place].name
         for number, place in enumerate(places)
@@ -381,7 +398,7 @@ def _held(
         return list(free), {}
     sentence = in_words([free[place].name for place in places], lacking, free, held)
     kept = [each.kept if each.name in held else each for each in free]
-    return kept, {"held": held, "lacks": sentence}
+    return kept, {"held": held, "lacks": [sentence, *conditions(known, places, free, held)]}
 
 
 def _search(
@@ -404,7 +421,7 @@ def _search(
         point = coordinates.of(begin)
     is_smooth = CRITERIA[objective.by].is_smooth
     point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
-    known, at_edge = _confidence_at(objective, coordinates, point)
+    point, known, at_edge = _confidence_at(objective, coordinates, point)
     if known is not None and (places := unknown(known, coordinates)):
         kept = [each.kept if place in places else each for place, each in enumerate(free)]
         nearer = replace(coordinates, free=kept)
@@ -412,8 +429,8 @@ def _search(
         ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
         best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
         if cost - best < ENOUGH:
-            coordinates, point = nearer, ended
-            known, at_edge = _confidence_at(objective, coordinates, point)
+            coordinates = nearer
+            point, known, at_edge = _confidence_at(objective, coordinates, ended)
     optimum, evaluations = coordinates.values(point), objective.best.evaluations
     return SearchOutcome(
         coordinates, optimum, evaluations, known, has_converged=has_converged, at_edge=at_edge
@@ -422,46 +439,127 @@ def _search(
 
 def _confidence_at(
     objective: Objective, coordinates: Coordinates, point: Floats
-) -> tuple[Confidence | None, list[str]]:
-    """Compute how well a search tells what lies at no bound, and name that beside which runs fail."""
+) -> tuple[Floats, Confidence | None, list[str]]:
+    """Compute how well a search tells what lies at no bound, and name that beside which runs fail.
+
+    If the cost is corrected for the noise of the controls, the point is moved too, see `_levelled`.
+    """
     inner = np.flatnonzero(~coordinates.at_bounds(point))
     if objective.by != "likelihood" or not len(inner):
-        return None, []
+        return point, None, []
     steps = np.full(len(inner), CURVATURE_STEP)
     if objective.is_corrected:
-        steps[[not coordinates.free[place].is_positive for place in inner.tolist()]] = NOISY_STEP
-    bent = curvature(objective, coordinates, point, inner.tolist(), steps)
+        steps = _noisy_steps(objective, coordinates, point, inner.tolist())
+        point = _levelled(objective, coordinates, point, inner.tolist(), steps)
+    bent = _curvature(objective, coordinates, point, inner.tolist(), steps)
     is_known = np.isfinite(np.diagonal(bent))
     if not np.isfinite(bent[np.ix_(is_known, is_known)]).all():
         is_known[:] = False
     at_edge = [coordinates.free[place].name for place in inner[~is_known].tolist()]
     if not is_known.any():
-        return None, at_edge
+        return point, None, at_edge
     places, steps, bent = inner[is_known].tolist(), steps[is_known], bent[np.ix_(is_known, is_known)]
     if objective.is_corrected:
-        bent = _with_noise(objective, coordinates, point, places, bent, steps)
-    return confidence(places, bent), at_edge
+        noise = _noise_of_slopes(objective, coordinates, point, places, steps)
+        if not np.isfinite(noise).all():  # copies fail
+            return point, None, [coordinates.free[place].name for place in inner.tolist()]
+        bent = with_noise(bent, noise)
+    return point, confidence(places, bent), at_edge
 
 
-def _with_noise(
+def _noisy_steps(
+    objective: Objective, coordinates: Coordinates, point: Floats, places: Sequence[int]
+) -> Floats:
+    """Choose steps (m,) of differences of a cost that the noise of the controls makes jagged.
+
+    Where shifted stamps meet those of a control, the cost has an edge, by chance up or down. So
+    differences by a calibration's parameter are as wide as its useful error, but at most NOISY_REACH
+    standard errors.
+    """
+    free, units = [coordinates.free[place] for place in places], coordinates.units[list(places)]
+    useful = np.array([0.0 if each.is_positive else each.useful for each in free]) / units
+    others = np.where([each.is_positive for each in free], CURVATURE_STEP, NOISY_STEP)
+    steps = np.where(useful > 0.0, useful, others)
+    for _ in range(LOOKS):
+        ahead, here, behind = _beside(objective, coordinates, point, places, steps)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nearer = NOISY_REACH * steps / np.sqrt(ahead - 2.0 * here + behind)
+        nearer = np.where(np.isfinite(ahead + behind), nearer, 0.5 * steps)
+        steps = np.where((useful > 0.0) & (nearer < steps), nearer, steps)
+    return steps
+
+
+def _curvature(
     objective: Objective,
     coordinates: Coordinates,
     point: Floats,
     places: Sequence[int],
-    bent: Floats,
     steps: Floats,
 ) -> Floats:
-    """Reduce a curvature (m, m) by what the noise of the controls adds to the slopes of the cost.
+    """Compute a curvature (m, m), by twice the steps if the cost is corrected.
 
-    The estimates' covariance is that of the slopes between two inverse curvatures. White, Maximum
-    likelihood estimation of misspecified models, Econometrica 50, 1982.
+    Then an edge next to the point changes it as it does the differences of slopes over these steps.
+    """
+    times = 2.0 if objective.is_corrected else 1.0
+    return curvature(objective, coordinates, point, places, times * steps)
+
+
+def _beside(
+    cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int], steps: Floats
+) -> tuple[Floats, float, Floats]:
+    """Compute what it costs a step (m,) ahead along each place, at the point, and a step behind."""
+    along = steps[:, None] * np.eye(len(point))[list(places)]
+    costs = cost(coordinates.values(np.array([point, *(point + along), *(point - along)])))
+    return costs[1 : 1 + len(steps)], float(costs[0]), costs[1 + len(steps) :]
+
+
+def _levelled(
+    objective: Objective,
+    coordinates: Coordinates,
+    point: Floats,
+    places: Sequence[int],
+    steps: Floats,
+) -> Floats:
+    """Move a point to where it costs as much a step (m,) ahead as behind, if such a point is near.
+
+    There the mean of the cost over these steps is least, which no edge of the cost attracts.
+    """
+    low, high = coordinates.bounds
+    rows = list(places)
+    bent = _curvature(objective, coordinates, point, places, steps)
+    if not np.isfinite(bent).all() or np.linalg.eigvalsh(bent)[0] <= 0.0:
+        return point
+    level = point
+    for _ in range(LOOKS):
+        ahead, _, behind = _beside(objective, coordinates, level, places, steps)
+        move = -np.linalg.solve(bent, (ahead - behind) / (2.0 * steps))
+        if not np.isfinite(move).all():
+            return point
+        level = level.copy()
+        level[rows] = np.clip(level[rows] + np.clip(move, -steps, steps), low[rows], high[rows])
+    return level
+
+
+def _noise_of_slopes(
+    objective: Objective,
+    coordinates: Coordinates,
+    point: Floats,
+    places: Sequence[int],
+    steps: Floats,
+) -> Floats:
+    """Compute the covariance (m, m) of the cost's slopes by the noise of the controls.
+
+    Not finite where the copies fail.
     """
     along = steps[:, None] * np.eye(len(point))[list(places)]
     points = coordinates.values(np.concatenate([point + along, point - along]))
-    lost = objective.lost_by_noise(points)
+    wider = objective.with_pairs(coordinates.values(point), NOISY_PAIRS)
+    lost = wider.lost_by_noise(points)
+    lost = lost[:, np.isfinite(lost).all(axis=(0, 2))]
+    if lost.shape[1] < 2:
+        return np.full((len(steps), len(steps)), np.nan)
     ahead, behind = np.split(0.5 * (lost[:, :, 0] - lost[:, :, 1]), 2)
-    of_slopes = bent + np.atleast_2d(np.cov((ahead - behind) / (2.0 * steps[:, None])))
-    return bent @ np.linalg.pinv(of_slopes) @ bent
+    return np.atleast_2d(np.cov((ahead - behind) / (2.0 * steps[:, None])))
 
 
 def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:

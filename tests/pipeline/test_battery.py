@@ -308,6 +308,16 @@ def test_what_a_parameter_undoes_is_not_said_of_the_log(fault: str, settings: di
     assert found["mended"] == []
 
 
+@pytest.mark.paper
+def test_a_delay_that_is_set_too_large_is_what_is_advised() -> None:
+    """Without a compass, wheels that are late are as likely as fixes that are taken back too far."""
+    log = recorded(late(0.25)(drive(12)), has_compass=False, has_prior=True)
+    first = fl.diagnose(log, "ekf", set={"fix_delay_s": 0.35}).sentences[0]
+    name, _, value = first.setting.partition("=")
+    assert name == "fix_delay_s"
+    assert float(value) == pytest.approx(0.25, abs=0.02)
+
+
 def test_fixes_of_another_name_are_offered() -> None:
     log = recorded(drive(SEED), has_compass=False, has_prior=True)
     renamed = {

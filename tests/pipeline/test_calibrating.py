@@ -1,5 +1,6 @@
 """Calibration: car C of the sheet of sensors, section 2, and what its motion does not determine."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from scipy.stats import binom
 
 import fuselog as fl
 from fuselog.pipeline.altering.alterations import delayed
@@ -27,11 +29,16 @@ from fuselog.pipeline.calibrating.car import (
 )
 from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from fuselog.pipeline.calibrating.manoeuvres import _simulated, advice, gain
-from fuselog.pipeline.diagnosing.battery.car import arcs
+from fuselog.pipeline.diagnosing.battery.car import arcs, late, stamps_ns
+from fuselog.pipeline.diagnosing.battery.car import drive as battery_drive
+from fuselog.pipeline.diagnosing.battery.car import recorded as battery_recorded
 from fuselog.pipeline.tuning.command import progress_of
+from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.pipeline.tuning.information import information
 from fuselog.pipeline.tuning.objective import Best, Objective, in_memory
-from fuselog.recorders.common_streams import fix_stream, prior_stream
+from fuselog.pipeline.tuning.search import Coordinates, Free
+from fuselog.pipeline.tuning.tuning import _levelled
+from fuselog.recorders.common_streams import fix_stream, prior_stream, truth_stream
 from fuselog.recorders.log import RunMetadata
 from fuselog.recorders.models.inertial import from_mounting
 from fuselog.recorders.recording import Recording
@@ -239,12 +246,12 @@ def driven(
     pose = np.cumsum(moved, axis=0) - moved
     x, y, heading = pose[first::every].T
     antenna = np.stack([x + lever_m * np.cos(heading), y + lever_m * np.sin(heading)], axis=1)
-    stamps_ns = np.rint(1e9 * step_s * np.arange(count)).astype(np.int64)
+    ticks_ns = stamps_ns(step_s * np.arange(count))
     noise = rng.standard_normal((count, 2)) * densities / step_s**0.5
     wheels = fl.make_stream(
         "/robot1/odometry",
         fl.schemas.ODOMETRY,
-        stamps_ns,
+        ticks_ns,
         metadata=dict(
             zip(("forward_noise_density", "turn_noise_density"), map(repr, densities), strict=True)
         ),
@@ -254,7 +261,7 @@ def driven(
     fixes = antenna + sigma_m * rng.standard_normal(antenna.shape)
     start = np.diag([0.1, 0.1, 0.1])
     prior = prior_stream("/robot1/prior", 0, ("x_m", "y_m", "heading_rad"), np.zeros(3), start)
-    streams = [wheels, fix_stream("/robot1/fix", stamps_ns[first::every], fixes, sigma_m**2), prior]
+    streams = [wheels, fix_stream("/robot1/fix", ticks_ns[first::every], fixes, sigma_m**2), prior]
     return memory_source(Recording(streams), RunMetadata("driven", epoch_ns=0))
 
 
@@ -287,6 +294,80 @@ def test_a_delay_is_in_its_interval_beside_noisy_wheels(delay_s: float) -> None:
     assert row["low"] < delay_s < row["high"]
     assert row["high"] - row["low"] < 0.08
     assert any(each.startswith("the noise of the control") for each in found.notes_of_search)
+
+
+@pytest.mark.paper
+def test_intervals_of_delays_hold_the_truth_as_often_as_they_say() -> None:
+    """Wheels that err by more than the fixes, of which each is at a stamp of theirs: 12 logs."""
+    time_s = 0.1 * np.arange(300)
+    speed, turn = 1.5 + 0.8 * np.sin(0.4 * time_s), 0.3 * np.sin(0.25 * time_s) + 0.05
+    rows = []
+    for seed in range(9000, 9012):
+        log = driven(seed, speed, turn, 0.1, (0.05, 0.003), 0.01, every=1)
+        rows.append(fl.tune(log, "ekf", "fix_delay_s").parameters.iloc[0])
+    found = pd.DataFrame(rows)
+    covered = int(((found["low"] < 0.0) & (found["high"] > 0.0)).sum())
+    assert covered >= binom.ppf(0.005, len(found), 0.95)
+    assert found["value"].abs().median() < 0.016  # 0.02 if an edge of the likelihood attracts it
+    assert (found["high"] - found["low"]).median() < 0.08
+
+
+def test_noise_that_is_added_cancels_among_nearby_messages() -> None:
+    log = recorded(drive(1, duration_s=10.0))
+    bound = bind("ekf", [log], {"kind": "ekf"})
+    speed = np.array([
+        each.streams["/car/odometry"]["forward_mps"] - log.streams["/car/odometry"]["forward_mps"]
+        for each in disturbed(log, bound)
+    ])  # fmt: skip
+    products = speed.T @ speed / len(speed)
+    near = np.abs(np.subtract.outer(np.arange(100), np.arange(100))) < PAIRS
+    variance = 0.05**2 / 0.1
+    assert np.allclose(np.where(near, products, 0.0), np.eye(100) * products[0, 0], atol=1e-12)
+    assert 0.5 * variance < products[0, 0] <= 1.001 * variance
+    assert np.allclose(speed.sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_a_level_point_is_not_attracted_by_an_edge() -> None:
+    """A parabola whose least is at 0.1, with an edge at 0 that moves the least cost to 0.3."""
+
+    class Edged:
+        is_corrected = True
+
+        def __call__(self, points: Floats) -> Floats:
+            x = points[:, 0]
+            return 50.0 * (x - 0.1) ** 2 - 20.0 * np.abs(x)
+
+    free = [Free("delay_s", 0.0, -10.0, 10.0, is_positive=False, useful=1.0)]
+    coordinates = Coordinates(free, np.ones(1))
+    level = _levelled(Edged(), coordinates, np.array([0.3]), [0], np.ones(1))  # type: ignore[arg-type]
+    assert level[0] == pytest.approx(0.1 / (1.0 - 20.0 / 100.0), abs=0.01)
+
+
+@pytest.mark.paper
+def test_a_delay_can_be_tuned_by_the_error() -> None:
+    """A delay adds estimates, and puts the first fix before the prior: neither stops the search."""
+    car = late(0.3)(battery_drive(5, duration_s=40.0))
+    log, at_s = battery_recorded(car, has_prior=True), np.arange(0.0, 40.0, 0.05)
+    pose = ("x_m", "y_m", "heading_rad")
+    truth = truth_stream("/car/truth", stamps_ns(at_s), pose, car.truth.at(at_s))
+    log = replace(log, streams={**log.streams, truth.topic: truth})
+    found = fl.tune(log, "ekf", "fix_delay_s", by="rmse")
+    assert found.parameters.loc[0, "value"] == pytest.approx(0.3, abs=0.05)
+
+
+@pytest.mark.paper
+def test_what_depends_on_a_value_that_is_held_is_said() -> None:
+    """Fixes that are 0.3 s late, along a short straight line, are a scale of 0.95."""
+    errors = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.3, 0.0])
+    log = recorded(drive(None, straight, 8.0, errors), (0.05, 0.05, 0.02))
+    found = fl.calibrate(log, "ekf")
+    assert "fix_delay_s" in found.found.held
+    scale = found.parameters.set_index("parameter").loc["forward_scale"]
+    assert scale["high"] < 0.97
+    [sentence] = [each for each in found.notes_of_search if each.startswith("forward_scale: ")]
+    said = re.search(r"(\S+) if fix_delay_s is larger by 0.05", sentence)
+    assert said is not None
+    assert scale["value"] + 6.0 * float(said[1]) == pytest.approx(1.0, abs=0.005)
 
 
 def test_a_search_without_a_usable_value_says_so() -> None:

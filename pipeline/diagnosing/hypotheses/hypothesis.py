@@ -66,6 +66,7 @@ class Hypothesis:
         size: of how many numbers it is.
         floor: of the magnitude: what is less is no fault.
         reported: the number as tables have it: a factor, where it is searched by its logarithm.
+        already: how much of it a parameter undoes already, which the number adds to.
     """
 
     kind: Kind
@@ -80,6 +81,7 @@ class Hypothesis:
     size: int = 1
     floor: float = 0.0
     reported: Callable[[float], float] = float
+    already: float = 0.0
 
     @property
     def has_end(self) -> bool:

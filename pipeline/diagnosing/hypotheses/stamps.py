@@ -75,6 +75,7 @@ def of_stamps(
         mend_late,
         tuple(SPECIAL_S),
         floor=hold_s,
+        already=set_s,
     )
     clock = in_topic(topic, alter.drifted(first_ns))
     yield Hypothesis("clock drift", topic, "", RATES, LARGEST_RATE, clock, gaining, mend_gaining)
