@@ -4,7 +4,7 @@ import gc
 import os
 import sys
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from fuselog.recorders.environment import CORES
 from fuselog.recorders.recording import import_run
+from fuselog.replay.engine.compiling.compile import core_count, use_cores
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 pytest_plugins = ["tests.goldens.keeping"]
@@ -48,6 +50,15 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
     monkeypatch.setattr(np, "empty", _unwritten)
+
+
+@pytest.fixture
+def on_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    """Have kernels use a number of cores, until the test ends."""
+    before = core_count()
+    monkeypatch.setenv(CORES, str(before))  # so that what was there is put back
+    yield use_cores
+    use_cores(before)
 
 
 def _unwritten(shape: Any, dtype: Any = float, **options: Any) -> np.ndarray:

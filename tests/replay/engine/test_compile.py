@@ -22,7 +22,7 @@ from fuselog.recorders.importers.ros.files import ros1_file
 from fuselog.recorders.importers.ulog import loops as ulog_loops
 from fuselog.recorders.log import loops
 from fuselog.replay.engine.compiling.cache import cache_folder, in_turn
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
+from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled, core_count
 from fuselog.replay.engine.compiling.kernel_cache import load
 from fuselog.replay.engine.compiling.kernels import native
 from fuselog.replay.engine.compiling.kernels.native import Kernel
@@ -415,7 +415,7 @@ def fill(run: int, values: np.ndarray, found: np.ndarray, work: np.ndarray) -> N
     found[run] = total
 
 
-def test_the_loop_does_every_run_once_whatever_the_cores(monkeypatch: pytest.MonkeyPatch):
+def test_the_loop_does_every_run_once_whatever_the_cores(on_cores: Callable[[int], None]):
     """Scratch memory is each core's own: a race would mix the runs."""
     loop = compile_over_runs(fill, allocates=False)
     values = np.random.default_rng(1).uniform(size=(503, 200))
@@ -423,7 +423,7 @@ def test_the_loop_does_every_run_once_whatever_the_cores(monkeypatch: pytest.Mon
     for run in range(503):
         fill(run, values, expected, np.empty(200))
     for cores in (1, 2, 7, 1000):
-        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", cores)
+        on_cores(cores)
         found = np.full(503, np.nan)
         loop(503, values, found, scratch=lambda: np.empty(200))
         assert_array_equal(found, expected)
@@ -584,5 +584,5 @@ def test_cores_work_in_memory_of_their_own_also_in_a_forked_process(tmp_path: Pa
     """Made once for each, and once to compile; a fork has none of the threads that its parent has."""
     told = imported(FORKED, tmp_path, tmp_path / "cache", "ignore")
     made, total = told[0].split()
-    assert int(made) <= numba.config.NUMBA_NUM_THREADS + 1
+    assert int(made) <= core_count() + 1
     assert (float(total), told[1]) == (499500.0, "0")

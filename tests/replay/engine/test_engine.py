@@ -1,10 +1,10 @@
 """The replay: ensembles, blocks, files and memory give the same numbers, bit for bit."""
 
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -88,11 +88,11 @@ def ensemble() -> list[MemorySource]:
 
 @pytest.mark.parametrize("cores", [1, 2, 5])
 def test_an_ensemble_is_its_runs_alone(
-    cores: int, ensemble: list[MemorySource], monkeypatch: pytest.MonkeyPatch
+    cores: int, ensemble: list[MemorySource], on_cores: Callable[[int], None]
 ):
     """Whatever the schedules of the other runs, and on however many cores."""
     alone = [replayed([source]) for source in ensemble]
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", cores)
+    on_cores(cores)
     together = replayed(ensemble)
     for run, single in enumerate(alone):
         assert_equal(of_run(together, run), of_run(single, 0))

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -274,7 +273,7 @@ def test_noise_through_the_control_and_added_beside_it() -> None:
 
 
 def test_a_run_alone_in_blocks_and_on_other_cores_is_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, on_cores: Callable[[int], None]
 ) -> None:
     """With ticks before the first measurement, which must not seed the run."""
     sources = [scalar.source(scalar.simulate(seed)[: 20 + seed]) for seed in range(5)]
@@ -291,7 +290,7 @@ def test_a_run_alone_in_blocks_and_on_other_cores_is_the_same(
     for found in in_blocks(sources[0], tmp_path, replayed):
         assert_same(found, replayed(sources[0]))
     for cores in (1, 7):
-        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", cores)
+        on_cores(cores)
         again = outputs(SCALAR, "particles", sources, **values)
         assert_equal(again["state"].stream, together["state"].stream)
     ticks = together["state"].of_run(0)["mean"][0], together["state"].of_run(1)["mean"][0]
