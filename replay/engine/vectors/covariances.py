@@ -6,7 +6,6 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Na
 import numpy as np
 from numpy.typing import NDArray
 
-
 Array = NDArray[np.float64]
 
 # A share of a variance below this is rounding.
@@ -58,7 +57,7 @@ def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
         _factors(np.where(both, covariance, np.eye(error.shape[-1]))), axis1=-2, axis2=-1
     )
     determinant = 2.0 * np.sum(np.log(pivots), axis=-1)
-    logarithm: NDArray[np.float64] = -0.5 * (squared + determinant + known.sum(axis=-1) * np.log(2.0 * np.pi))
+    logarithm: Array = -0.5 * (squared + determinant + known.sum(axis=-1) * np.log(2.0 * np.pi))
     return logarithm
 
 
