@@ -81,7 +81,8 @@ def read_set(source: Path | Traversable, name: SetName) -> Array | None:
     if archive is None:
         return None
     with np.load(io.BytesIO(archive)) as sets:
-        return sets.get(str(name))
+        known: Array | None = sets.get(str(name))
+        return known
 
 
 def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:

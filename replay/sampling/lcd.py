@@ -98,4 +98,5 @@ def moment_corrected(points: Array) -> Array:
     variances, axes = np.linalg.eigh(centred.T @ centred / len(points))
     if not variances[0] > 1e-12 * variances[-1]:
         raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions; give more")
-    return centred @ (axes / np.sqrt(variances)) @ axes.T
+    corrected: Array = centred @ (axes / np.sqrt(variances)) @ axes.T
+    return corrected

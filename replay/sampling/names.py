@@ -40,7 +40,7 @@ PROBLEMS = {"missing": "is missing", "extra_forbidden": "is not known"}
 PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-z]+(=[^:=]+)?)*)")
 
 
-class Sampling(BaseModel, ABC):
+class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
     """Names a way to sample N(0, I) in any dimension; `str` gives its name back."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,7 +72,7 @@ class Sampling(BaseModel, ABC):
         return "".join([self.family, number, *options])
 
 
-class Unscented(Sampling):
+class Unscented(Sampling):  # type: ignore[explicit-any]
     """Names the points of the unscented transform; equal weights by default."""
 
     family = "ukf"
@@ -82,7 +82,7 @@ class Unscented(Sampling):
         return fixed(unscented(dimension, self.kappa))
 
 
-class GaussianFilter(Sampling):
+class GaussianFilter(Sampling):  # type: ignore[explicit-any]
     """Names points on the axes only, as many on each as wanted."""
 
     family = "gf"
@@ -93,7 +93,7 @@ class GaussianFilter(Sampling):
         return fixed(axis_points(dimension, self.per_axis))
 
 
-class RandomisedUnscented(Sampling):
+class RandomisedUnscented(Sampling):  # type: ignore[explicit-any]
     """Names unscented sets, turned and stretched at random, new ones for every run and step."""
 
     family = "rukf"
@@ -104,7 +104,7 @@ class RandomisedUnscented(Sampling):
         return randomised(dimension, self.iterations)
 
 
-class SmartSampling(Sampling):
+class SmartSampling(Sampling):  # type: ignore[explicit-any]
     """Names the S2KF's LCD samples; rotation 0 leaves the set as it was found."""
 
     family = "s2kf"

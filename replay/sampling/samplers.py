@@ -130,4 +130,5 @@ def _orthonormal(normals: Array) -> Array:
     The QR decomposition is uniform only where its R has a positive diagonal (Mezzadri 2007).
     """
     q, r = np.linalg.qr(normals)
-    return q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]
+    turned: Array = q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]
+    return turned

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from fuselog.replay.engine.arrays import RowSlice
 from fuselog.replay.sampling.distance import Array
 from fuselog.replay.sampling.samplers import Sampler
 
@@ -31,7 +32,7 @@ class SampleSets(NamedTuple):
 
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
-) -> Iterator[tuple[slice, SampleSets]]:
+) -> Iterator[tuple[RowSlice, SampleSets]]:
     """Yield the sets of all runs, as many runs at once as memory should hold.
 
     Args:
