@@ -15,11 +15,10 @@ from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps
 from fuselog.pipeline.output.report.evidence import Consistency, Spread, findings
-from fuselog.pipeline.output.report.gauge import gauge
 from fuselog.pipeline.output.report.kinds import how_many_differ, opening
 from fuselog.pipeline.output.report.naming import title_of
 from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
-from fuselog.pipeline.output.report.story import Story, story
+from fuselog.pipeline.output.report.story import Story, gauge, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
 from fuselog.replay.judging.errors.differences import dominating

@@ -15,7 +15,6 @@ import pandas as pd
 
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from fuselog.pipeline.output.claims import NO_VERDICT, Verdict
-from fuselog.pipeline.output.report.choosing import MOST_CARDS
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
     MATERIAL,
@@ -24,7 +23,7 @@ from fuselog.pipeline.output.report.evidence import (
     findings,
     runs_of,
 )
-from fuselog.pipeline.output.report.story import Card, Story, story
+from fuselog.pipeline.output.report.story import MOST_CARDS, Card, Story, story
 from fuselog.pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from fuselog.pipeline.output.results import Measured, MetricTable, Result, read_table
 from fuselog.pipeline.output.words import (

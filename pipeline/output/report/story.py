@@ -4,16 +4,16 @@ It is data: sentences and numbers. The template only sets it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from fuselog.pipeline.output.alarming import dominating_run
 from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
-from fuselog.pipeline.output.report import choosing
-from fuselog.pipeline.output.report.doubts import doubts_of
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
+    MATERIAL,
+    Consistency,
     Evidence,
     Findings,
     Spread,
@@ -21,7 +21,6 @@ from fuselog.pipeline.output.report.evidence import (
     is_withheld,
     relation,
 )
-from fuselog.pipeline.output.report.gauge import Gauge, gauge, numbers_of
 from fuselog.pipeline.output.words import (
     MISSING,
     Scale,
@@ -41,7 +40,49 @@ TIMED_S = 0.02  # if it was measured for so long
 
 NONE_SOUND = "Believe none of them as they are set."
 NONE_SOUND_AT_BEST = "Where each errs least, none of them can be believed."
+MOST_CARDS = 4
+MOST_NAMED = 4  # more estimators are counted
+# What the checks of a replay found, of the estimators that they found it of.
+_OF_COVARIANCES = {"innovations": "innovations", "errors": "errors"}
+_CHECKS: dict[str, Callable[[str], str]] = {
+    "uninformed": lambda whose: (
+        f"components that {whose} cannot estimate, as no measurement informs the method of them"
+    ),
+    "origin": lambda whose: (
+        f"the error of {whose}, most of which is constant: truth and estimate may have other origins"
+    ),
+    "lever arm": lambda whose: (
+        f"the error of {whose}, most of which turns along: the truth may be of another point of the body"
+    ),
+    "minimum": lambda whose: (
+        f"the search of {whose}, which may have ended at a minimum that is not the least"
+    ),
+    "digits": lambda whose: f"the digits of {whose}, of whose covariances rounding leaves few or none",
+    "unused": lambda whose: f"{whose}, as measurements came to nothing",
+    "gates": lambda _: "likelihoods: the gates differ, so that they are of different measurements",
+}
+# It goes from a third of the aim to ten times the aim, evenly in the logarithm.
+GAUGE_ENDS = (1 / 3, 10.0)
 Look = Literal["broken", "careful", "best", "fair", "claims"]
+
+
+class Gauge(NamedTuple):
+    """Shows where a mean of squares lies, in percent of a scale from too careful to too sure.
+
+    Attributes:
+        honest: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
+        aim, value: the right value, and the one that was found.
+        spread: where the latter lies with 95 %; both ends at it where that is not known.
+        is_beyond: whether the value lies beyond the scale's end.
+        words: the same for who cannot see it.
+    """
+
+    honest: tuple[float, float]
+    aim: float
+    value: float
+    spread: tuple[float, float]
+    is_beyond: bool
+    words: str
 
 
 @dataclass(frozen=True)
@@ -100,20 +141,20 @@ def story(
     Causes, what each cost, and alarms are told where they are known.
     """
     known = [each for each in found.of.values() if each.error is not None]
-    broken = choosing.broken_of(found)
+    broken = broken_of(found)
     own = scale(quantity(found.main).unit, *(each.error.value for each in known if each.error))
-    take, equal = choosing.choice_of(found)
-    ordered = choosing.in_order(found, broken, take, equal)
+    take, equal = choice_of(found)
+    ordered = in_order(found, broken, take, equal)
     by_label = {each.estimator: each for each in causes}
     cards = [
         _card(found, found.of[label], take, equal, own, by_label.get(label), timings or {})
-        for label in ordered[: choosing.MOST_CARDS]
+        for label in ordered[:MOST_CARDS]
     ]
-    draws, differences = _pairs(found, take, ordered[: choosing.MOST_CARDS], own)
+    draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
     none_sound = NONE_SOUND_AT_BEST if at_best else NONE_SOUND
     verdict = _verdict(found, broken, take, equal, own, by_label, timings or {}, none_sound)
     doubts = doubts_of(found, alarms, take, equal)
-    return Story(verdict, cards, draws, differences, ordered[choosing.MOST_CARDS :], doubts)
+    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], doubts)
 
 
 def _verdict(
@@ -172,8 +213,8 @@ def _advice(
     of_cases = f" ({how} of {cases} cases)" if cases > 1 else ""
     if equal:
         tied = [take, *equal]
-        both = listed(tied) if len(tied) <= choosing.MOST_CARDS else f"{take} and {len(equal)} others"
-        whom, left = choosing.of_the_tied(found, tied)
+        both = listed(tied) if len(tied) <= MOST_CARDS else f"{take} and {len(equal)} others"
+        whom, left = of_the_tied(found, tied)
         if all(relation(found, take, each) == "draw" for each in equal):
             return f"{both} tie in {main}: {whom}{_cheapest(left, timings)}."
         if any(relation(found, take, each) == "withheld" for each in equal):
@@ -297,7 +338,7 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
         return ("broken", "✕", "Overconfident") if is_far else ("careful", "✕", "Slightly overconfident")
     if each.estimator in (take, *equal) and len(found.labels) > 1:
         others = [label for label in (take, *equal) if label != each.estimator]
-        as_who = listed(others) if len(others) < choosing.MOST_CARDS else f"{len(others)} others"
+        as_who = listed(others) if len(others) < MOST_CARDS else f"{len(others)} others"
         if others and state == "too careful":
             return "careful", "○", f"As accurate as {as_who}, but too careful"
         return "best", "✓", f"As good as {as_who}" if others else "Take this one"
@@ -413,3 +454,205 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
             errs = f"{near.with_unit(size)} {more} than {take}"
             differences.append(f"{label} errs {errs} in the mean over runs ({ends}).")
     return draws, differences
+
+
+# Whom to take
+
+
+def broken_of(found: Findings) -> list[Evidence]:
+    """List who cannot be believed: who fails, then who is too sure, the worst first."""
+
+    def badness(each: Evidence) -> float:
+        return math.inf if each.state == "failed" else each.decisive.factor if each.decisive else 0.0
+
+    bad = [each for each in found.of.values() if each.state in ("failed", "too sure")]
+    return sorted(bad, key=badness, reverse=True)
+
+
+def choice_of(found: Findings) -> tuple[str, list[str]]:
+    """Choose whom to take, empty where there is none, and who draws with it, of the believable.
+
+    Of those that draw, whose covariances are too large comes last.
+    """
+    sound = [
+        each
+        for each in found.of.values()
+        if each.error is not None and each.state not in ("failed", "too sure")
+    ]
+    if not sound:
+        return "", []
+    best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
+    others = [each.estimator for each in sound if each.estimator != best]
+    alike = ("draw", "unclear", "withheld")
+    tied = [best, *(label for label in others if relation(found, best, label) in alike)]
+    first, *equal = sorted(tied, key=lambda label: found.of[label].state == "too careful")
+    return first, equal
+
+
+def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
+    """Order estimators: whom to take, who cannot be believed, worst first, the others by error."""
+    rest = sorted(
+        found.labels,
+        key=lambda label: error.value if (error := found.of[label].error) else math.inf,
+    )
+    first = [each.estimator for each in broken]
+    return list(dict.fromkeys([*filter(None, [take]), *equal, *first, *rest]))
+
+
+def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
+    """Choose whom to take of estimators that err alike, and these: not too careful ones, if any."""
+    careful = [label for label in tied if found.of[label].state == "too careful"]
+    left = [label for label in tied if label not in careful] or tied
+    whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"
+    if careful == tied:
+        return f"take {whom}, but mend its covariance, which is too large", left
+    if careful:
+        whom = " or ".join(left) if len(left) <= MOST_CARDS else "any of the others"
+        are = "is" if len(careful) == 1 else "are"
+        return f"take {whom}, as {listed(careful)} {are} too careful", left
+    return f"take {whom}", left
+
+
+# What is doubtful
+
+
+def doubts_of(found: Findings, alarms: Sequence[Alarm], take: str, equal: Sequence[str]) -> list[str]:
+    """Return what is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
+    compared = found.compared if len(found.labels) > 1 else []
+    return [
+        *_of_covariances(found, alarms),
+        *_of_checks(alarms),
+        *_of_failures(found),
+        *_of_cases(found, take, equal),
+        *_of_chance(found, compared, take, equal),
+        *_of_what_is_not_known(found),
+    ]
+
+
+def named(labels: Sequence[str], among: int = 0) -> str:
+    """Name estimators where they are few; `among` is how many there are."""
+    if len(labels) == among > 1:
+        return "both" if among == 2 else f"all {among}"
+    if len(labels) > MOST_NAMED:
+        return f"{', '.join(labels[:MOST_NAMED])} and {len(labels) - MOST_NAMED} more"
+    return listed(list(labels))
+
+
+def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
+    """Say whose covariances are not right, by what."""
+    states = {label: each.state for label, each in found.of.items()}
+    sentences = []
+    diverged = [label for label in found.labels if found.of[label].has_diverged]
+    if diverged:
+        sentences.append(f"the estimates of {named(diverged, len(found.labels))}, which diverged")
+    for size, state in (("small", "too sure"), ("large", "too careful")):
+        whose = [label for label in found.labels if states[label] == state and label not in diverged]
+        if whose:
+            of = named(whose, len(found.labels))
+            sentences.append(f"the covariances of {of}, which are too {size}")
+    for kind, what in _OF_COVARIANCES.items():
+        whose = [each.estimator for each in alarms if each.kind == kind]
+        little = [label for label in dict.fromkeys(whose) if states.get(label) == "honest"]
+        if little:
+            sentences.append(
+                f"the {what} of {named(little)}, which are off by little, but beyond chance"
+            )
+    return sentences
+
+
+def _of_checks(alarms: Sequence[Alarm]) -> list[str]:
+    """Say what else the checks of a replay found."""
+    whose: dict[str, list[str]] = {}
+    for each in alarms:
+        if each.kind in _CHECKS:
+            whose.setdefault(each.kind, []).append(each.estimator)
+    return [_CHECKS[kind](named(list(dict.fromkeys(filter(None, of))))) for kind, of in whose.items()]
+
+
+def _of_failures(found: Findings) -> list[str]:
+    return [
+        f"{label}, which failed in {each.failed} of {count(each.runs, 'run')}"
+        for label, each in found.of.items()
+        if each.failed and each.failed < each.runs
+    ]
+
+
+def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
+    """Say in how many cases another one errs less than the one to take."""
+    best = found.least_in()
+    others = {label: number for label, number in best.items() if label not in (take, *equal)}
+    if not take or len(found.cases) < 2 or not others:
+        return []
+    who = [f"{label} in {number}" for label, number in sorted(others.items(), key=lambda each: -each[1])]
+    return [
+        f"that {take} is best everywhere, as in {sum(others.values())} of {len(found.cases)} cases "
+        f"another one has the least {found.error_name} ({named(who)})"
+    ]
+
+
+def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Sequence[str]) -> list[str]:
+    """Say what so few runs leave open."""
+    runs = count(found.runs, "run")
+    if compared and found.runs < FEWEST_RUNS:
+        do = "does" if found.runs == 1 else "do"
+        return [f"who is better, as {runs} {do} not tell differences from chance"]
+    unclear = [label for label in equal if relation(found, take, label) == "unclear"]
+    if unclear:
+        return [f"who of {named([take, *unclear])} is better, which {runs} do not tell"]
+    if len(compared) > 1 and found.by_run(take or compared[0], found.main).empty:
+        return [
+            f"whether differences are chance, as the result has no table of the {found.error_name} of "
+            "single runs"
+        ]
+    return []
+
+
+def _of_what_is_not_known(found: Findings) -> list[str]:
+    """Say who was not judged, or not compared."""
+    unknown = []
+    unjudged = [
+        label
+        for label, each in found.of.items()
+        if each.decisive is None and not found.has_any(label, "nees", "nis")
+    ]
+    if unjudged and found.main:
+        whose = named(unjudged, len(found.labels))
+        unknown.append(f"the covariances of {whose}, which nothing here judges")
+    lacking = [label for label in found.labels if label not in found.compared]
+    if lacking and found.compared:
+        where = " in every case" if len(found.cases) > 1 else ""
+        have = "has" if len(lacking) == 1 else "have"
+        unknown.append(f"a comparison with {named(lacking)}, which {have} no {found.error_name}{where}")
+    return unknown
+
+
+# The gauge of a card
+
+
+def numbers_of(by: Consistency) -> str:
+    """Return the mean of squares with its interval, and what is right."""
+    name = "NIS per component" if by.name == "NIS" else by.name
+    if not by.found.is_known:
+        return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
+    found, low, high = alike(by.found, Scale())
+    return f"{name} {found}, 95 % {low} to {high}; {number(by.aim)} is right"
+
+
+def gauge(by: Consistency) -> Gauge:
+    """Return where a mean of squares lies on its scale."""
+
+    def place(value: float) -> float:
+        low, high = map(math.log, GAUGE_ENDS)
+        share = (math.log(max(value, 1e-12) / by.aim) - low) / (high - low)
+        return round(100.0 * min(max(share, 0.0), 1.0), 2)
+
+    low, high = by.honest
+    found = by.found
+    spread = (found.low, found.high) if found.is_known else (found.value, found.value)
+    words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
+    is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
+    ends = (place(spread[0]), place(spread[1]))
+    box = min(low, (1.0 - MATERIAL) * by.aim), max(high, (1.0 + MATERIAL) * by.aim)
+    return Gauge(
+        (place(box[0]), place(box[1])), place(by.aim), place(found.value), ends, is_beyond, words
+    )
