@@ -110,7 +110,7 @@ def _draw_robot(
     draw_clouds(canvas, scene, robot, root)
     sights = draw_sights(canvas, scene, robot, tracks, landmarks)
     sights |= _draw_view(canvas, scene, robot, tracks)
-    _, areas, _ = draw_sets(canvas, scene, robot, root)
+    _, areas = draw_sets(canvas, scene, robot, root)
     plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
     board = with_legend(canvas, root, scene.colours(robot) | sights, plane)
     board = above_events(board, draw_events(canvas, scene, robot))
