@@ -39,6 +39,7 @@ from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
 FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
 # The map shows what this share of the sets does not reach beyond.
 SHOWN_SHARE = 0.9
+SIZE = schemas.ESTIMATE_SIZE
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
@@ -59,9 +60,12 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
         places = stream["state"][:, [stream.components.index(name) for name in ("x_m", "y_m")]]
         draw_dots(canvas, f"{root}/truth", stream.publish_time_ns, places, Stroke(TRUTH, 2.0))
         shown.append(places)
-    reach, plots, note = draw_sets(canvas, scene, robot, root)
+    reach, plots = draw_sets(canvas, scene, robot, root)
+    name, is_single = "Map", all(len(each) == 1 for _, each in scene.outputs_of(robot, SIZE))
+    if plots and is_single:  # a plot would be a dot
+        name, plots = f"Map; {plots[0].name}", []
     places = np.concatenate([*shown, reach])
-    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], places, name=f"Map{note}")
+    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], places, name=name)
     board = with_legend(canvas, root, scene.colours(robot), plane)
     board = above_events(board, draw_events(canvas, scene, robot), 4.0)
     return beside(board, plots, robot)
@@ -69,13 +73,10 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
 
 def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
-) -> tuple[Floats, list[rrb.TimeSeriesView], str]:
-    """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas.
-
-    Of single sets there is no plot, but a note for the title of the map.
-    """
+) -> tuple[Floats, list[rrb.TimeSeriesView]]:
+    """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas."""
     plot, corners, areas = entity_path("plots", case, "area"), [], {}
-    for estimator, sizes in scene.outputs_of(case, schemas.ESTIMATE_SIZE):
+    for estimator, sizes in scene.outputs_of(case, SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")
         if topic not in scene.outputs:
             continue
@@ -88,21 +89,21 @@ def draw_sets(
         draw_curve(canvas, plot, estimator, colour, time_ns, areas[estimator], FRAMES)
         corners += [[ring.min(axis=0), ring.max(axis=0)] for ring in polygons]
     if not corners:
-        return np.empty((0, 2)), [], ""
+        return np.empty((0, 2)), []
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     low, high = np.moveaxis(np.array(corners), 1, 0)
     reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
     last = ", ".join(f"{each[-1]:.3g} by {estimator}" for estimator, each in areas.items())
-    if all(len(each) == 1 for each in areas.values()):
-        return reach, [], f", area of the set (m²) {last}"
     largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
     extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
-    return reach, [plot_view(plot, "Area of the set", "m²", extent, note=note, legend=False)], ""
+    if all(len(each) == 1 for each in areas.values()):
+        note = f", {last}"
+    return reach, [plot_view(plot, "Area of the set", "m²", extent, note=note, legend=False)]
 
 
 def draw_areas(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
     """Draw a case's sets in its plane, and return the plot of their areas."""
-    _, plots, _ = draw_sets(canvas, scene, case, entity_path(ROOT, case))
+    _, plots = draw_sets(canvas, scene, case, entity_path(ROOT, case))
     return [*plots]
 
 
