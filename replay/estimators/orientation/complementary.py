@@ -20,7 +20,7 @@ from fuselog.replay.engine.api.functions import batch, each_run
 from fuselog.replay.engine.api.inputs import Given, Messages, OneRun
 from fuselog.replay.engine.api.outputs import Estimates, Results
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.estimators.orientation.magnetometers import with_magnetometer
+from fuselog.replay.estimators.orientation.magnetometers import REFUSAL, with_magnetometer
 from fuselog.replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
 from fuselog.replay.estimators.orientation.resting import of_nine_axes
 from fuselog.replay.estimators.orientation.triad import triad, unit
@@ -244,7 +244,7 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     time_ns = samples.publish_time_ns[is_last]
     step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
     if not has_field.any():
-        raise BadInput(f"topic {samples.topic}: has no magnetic field; estimator vqf needs one")
+        raise BadInput(f"topic {samples.topic}: {REFUSAL}")
     slower = len(has_field) / int(has_field.sum())
     vqf = VQF(
         step_s,
