@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
-from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
@@ -213,6 +212,8 @@ def say_next_of_view(path: Path, *, recover: bool) -> None:
     if path.is_dir():
         say_next("report", str(path))
     elif path.suffix != ".rrd":
+        from fuselog.pipeline.runs.inputs import shipped
+
         log = open_log(path, recover=recover)
         labels, run = _labels(log), log.run
         if not labels:
