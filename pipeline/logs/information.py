@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
-from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
@@ -20,7 +19,7 @@ from fuselog.recorders.plausibility.finding import Finding
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.compiling.cache import cache_folder, kept_files
-from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
 from fuselog.replay.engine.replaying.truth import truths_among
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.foreign.naming import KINDS as PROGRAMS
@@ -153,8 +152,9 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     return Fitting(used, list(bound), [] if bound else lacks[:1])
 
 
-def estimators_that_fit(topics: Mapping[str, Topic]) -> dict[str, list[str]]:
+def estimators_that_fit(log: Log) -> dict[str, list[str]]:
     """Return which estimators without a model, such as trackers, fit a log, and the topics of each."""
+    source = LogSource(log)
     found: dict[str, list[str]] = {}
     for name in available("estimators"):
         if name not in {*METHODS, *PROGRAMS}:
@@ -162,7 +162,9 @@ def estimators_that_fit(topics: Mapping[str, Topic]) -> dict[str, list[str]]:
                 estimator = load("estimators", name, Estimator)
                 parameters = build(estimator.parameters, {}, f"estimator {name}")
                 with foreign_code(f"estimator {name}"):
-                    if bound := bound_to(estimator, name, topics, parameters):
+                    if bound := bound_to(estimator, name, log.topics, parameters):
+                        for each in bound:
+                            require_values([source], each)
                         found[name] = _topics_used(bound)
     return found
 
@@ -180,7 +182,7 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
     used = {topic for each in fit.values() for topic in each.topics}
     # others are loaded, which takes a while, only where a model leaves something to them
     if is_all or not used.issuperset(set(log.topics) - truths_among(log.topics)):
-        for name, topics in estimators_that_fit(log.topics).items():
+        for name, topics in estimators_that_fit(log).items():
             by_topics.setdefault(tuple(topics), []).append(name)
     if fit or by_topics:
         say("Estimators that can be replayed over it:")
@@ -210,6 +212,8 @@ def say_next_of_view(path: Path, *, recover: bool) -> None:
     if path.is_dir():
         say_next("report", str(path))
     elif path.suffix != ".rrd":
+        from fuselog.pipeline.runs.inputs import shipped
+
         log = open_log(path, recover=recover)
         labels, run = _labels(log), log.run
         if not labels:
@@ -298,7 +302,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "topics": topics,
         "findings": [each._asdict() for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
-        "estimators": estimators_that_fit(log.topics),
+        "estimators": estimators_that_fit(log),
         "lost": log.loss_statement,
     }
 

@@ -238,6 +238,23 @@ def test_info_names_the_tracker_of_detections(
     assert found == {"gm-phd": used, "tracker": used}
 
 
+def test_info_names_no_estimator_that_a_replay_refuses(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a unit without a magnetometer, by its values; with one, all that take nine axes."""
+    monkeypatch.chdir(tmp_path)
+    recorded = fl.record("navigation", duration_s=11.0)
+    samples = recorded["/body/inertial"]
+    field = np.tile([20.0, 0.0, -40.0], (len(samples), 1))
+    whole = replace(samples, columns={**samples.columns, "magnetic_field_ut": field})
+    found = []
+    for stream in (samples, whole):
+        fl.write("log.mcap", [stream])
+        found.append(fuselog("info", "log.mcap", "--json").json["estimators"])
+    assert found[0] == {}
+    assert {"bingham-inertial", "gyro", "madgwick", "mahony", "triad", "vqf"} <= found[1].keys()
+
+
 def test_info_names_the_estimators_of_what_a_fitting_model_leaves(
     tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

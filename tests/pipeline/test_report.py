@@ -313,10 +313,14 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     assert left is not None
     assert float(left[2]) == pytest.approx(float(left[1]) / 3.0, rel=0.06)
     assert f"The likeliest cause: {cause.short}." in run_sentences(read_result(folder), folder)[1]
-    write_report([folder], tmp_path / "page.html")
-    assert f"<code>--set {cause.setting}</code>" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    again = fuselog("run", "landmarks", *broken, "--out", folder)  # which is ours still
-    assert again.code == 0
+    again = tmp_path / "page.html"
+    write_report([folder], again)
+    page = again.read_text(encoding="utf-8")
+    assert f"<code>--set {cause.setting}</code>" in page
+    assert "Not diagnosed" not in page
+    assert fuselog("run", "landmarks", *broken, "--out", folder).code == 0  # which is ours still
+    write_report([folder], again)
+    assert "<b>Not diagnosed:</b> <code>--diagnose</code>" in again.read_text(encoding="utf-8")
 
 
 def test_the_lens_is_at_the_second_that_is_most_like_the_run() -> None:

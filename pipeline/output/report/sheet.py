@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fuselog.pipeline.output.report.choosing import choice_of
 from fuselog.pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
+from fuselog.pipeline.output.report.story import choice_of
 from fuselog.pipeline.output.results import Measured, MetricTable
 from fuselog.pipeline.output.words import (
     ACCURACY,

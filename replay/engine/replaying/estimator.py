@@ -7,9 +7,10 @@ the runs replayed one by one, bit for bit.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -57,6 +58,9 @@ class Initialization:
     ) = None
 
 
+NEEDED_MESSAGES = 4096  # that are read at once, until one has a value that is needed
+
+
 @dataclass(frozen=True)
 class Reading:
     """Describes what an estimator reads of its topics and parameters, as its model's functions do.
@@ -99,6 +103,18 @@ Carried = Any  # type: ignore[explicit-any]
 Setting = Any  # type: ignore[explicit-any]
 
 
+class Needed(NamedTuple):
+    """States that a field needs a value in some message of a topic, which its layout does not tell.
+
+    Attributes:
+        field: its name.
+        refusal: the sentence if no message has a value of it.
+    """
+
+    field: str
+    refusal: str
+
+
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True, eq=False)
 class Recursive:
@@ -127,6 +143,7 @@ class Recursive:
             parameters.
         offers: by topic that it does not take, the setting with which it would.
         reading: what it reads; None where that is not known.
+        needed: by topic, a field without which it does not fit a log.
         truth: the topic by which its estimates are judged, which it must not read.
         is_bound: whether it is a bound of estimates, which may read the truth.
     """
@@ -146,6 +163,7 @@ class Recursive:
     is_random: bool = False
     offers: Mapping[str, str] = field(default_factory=dict)
     reading: Callable[[], Reading] | None = None
+    needed: Mapping[str, Needed] = field(default_factory=dict)
     truth: str = ""
     is_bound: bool = False
 
@@ -165,6 +183,7 @@ class Batch:
         priors: topics of priors, with their components.
         given: streams that the replay hands it beside those of the log.
         parameters: as it was bound with.
+        needed: by topic, a field without which it does not fit a log.
         truth: the topic by which its estimates are judged, which it must not read.
     """
 
@@ -175,6 +194,7 @@ class Batch:
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
     parameters: Parameters | None = None
+    needed: Mapping[str, Needed] = field(default_factory=dict)
     truth: str = ""
 
 
@@ -317,6 +337,16 @@ def bound_to(
     return bound
 
 
+def require_values(sources: Iterable[Source], bound: Bound) -> None:
+    """Raise BadInput if no message of the runs has a value of a field that an estimator needs."""
+    for topic, needed in bound.needed.items():
+        runs = (source.whole().blocks([topic], "publish_time", NEEDED_MESSAGES) for source in sources)
+        streams = (block[topic] for block in chain.from_iterable(runs) if topic in block)
+        values = (stream.columns.get(needed.field) for stream in streams)
+        if not any(of is not None and np.isfinite(of).all(axis=-1).any() for of in values):
+            raise BadInput(f"topic {topic}: {needed.refusal}")
+
+
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
@@ -352,6 +382,8 @@ def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Settin
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.requirements}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
+    for each in bound:
+        require_values(ensemble, each)
     read = dict.fromkeys(topic for each in bound for topic in (*each.static, *each.streams))
     ensemble.require_alike(read)
     return [

@@ -25,7 +25,7 @@ from fuselog.replay.families.directional.orientation.estimators import (
     ORIENTATION,
     of_inertial_samples,
 )
-from fuselog.replay.families.directional.orientation.magnetometers import with_magnetometer
+from fuselog.replay.families.directional.orientation.magnetometers import REFUSAL, with_magnetometer
 from fuselog.replay.families.directional.orientation.resting import of_nine_axes
 
 HALF = np.sqrt(0.5)
@@ -247,7 +247,7 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     time_ns = samples.publish_time_ns[is_last]
     step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
     if not has_field.any():
-        raise BadInput(f"topic {samples.topic}: has no magnetic field; estimator vqf needs one")
+        raise BadInput(f"topic {samples.topic}: {REFUSAL}")
     slower = len(has_field) / int(has_field.sum())
     vqf = VQF(
         step_s,

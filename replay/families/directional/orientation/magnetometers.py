@@ -13,7 +13,14 @@ import numpy as np
 
 from fuselog.recorders.log import Clock, Topic, schemas
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Initialized, Recursive
+from fuselog.replay.engine.replaying.estimator import (
+    Batch,
+    Bound,
+    Estimator,
+    Initialized,
+    Needed,
+    Recursive,
+)
 from fuselog.replay.engine.streams.blocks import (
     Block,
     Events,
@@ -25,6 +32,10 @@ from fuselog.replay.engine.streams.blocks import (
 )
 
 FIELD = "magnetic_field_ut"
+REFUSAL = (
+    "has no magnetic field, by which the heading is found, and no topic magnetic_field has it; import "
+    "it, as fields.magnetic_field_ut = [...] in the mapping"
+)
 
 
 class _Waiting(NamedTuple):
@@ -95,9 +106,9 @@ def with_means(samples: Ragged) -> Ragged:
 
 def _joining(bound: Bound, magnetometer: str) -> Bound:
     """Return an estimator of a unit's samples as one of these and a magnetometer's fields."""
-    if not magnetometer:
-        return bound
     unit = bound.streams[0]
+    if not magnetometer:
+        return replace(bound, needed={unit: Needed(FIELD, REFUSAL)})
     streams = (unit, magnetometer)
     if isinstance(bound, Batch):
         solve = bound.solve

@@ -82,7 +82,7 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
 
 
 def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator, which refuses a unit without a magnetometer, and finds how long it rests.
+    """Return the estimator, which finds how long its unit rests.
 
     That is found if it has a parameter `rest_s` that is not set. Its `start` is given the samples of the
     rest as `REST`.
@@ -93,8 +93,8 @@ def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
         found = list[Bound]()
         for each in estimator.bind(name, topics, values):
             assert isinstance(each, Recursive)
-            find = partial(_find, each.name, seeks_rest)
-            found.append(replace(each, initialization=Initialization(each.streams, find)))
+            rest = Initialization(each.streams, partial(_find, each.name)) if seeks_rest else None
+            found.append(replace(each, initialization=rest))
         return found
 
     return with_magnetometer(replace(estimator, bind=bind))
@@ -102,24 +102,15 @@ def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
 
 def _find(
     name: str,
-    seeks_rest: bool,
     first: Mapping[str, Ragged],
     static: Mapping[str, Ragged],
     clock: Clock,
 ) -> Initialized:
     """Find the rest of every run.
 
-    Raises BadInput if no run has a magnetic field, or a unit moves within `LEAST_S` of its start.
+    Raises BadInput if a unit moves within `LEAST_S` of its start.
     """
     [(topic, samples)] = first.items()
-    field = samples.stream.columns.get("magnetic_field_ut")
-    if len(samples.stream) and (field is None or not np.isfinite(field).all(axis=1).any()):
-        raise BadInput(
-            f"topic {topic}: has no magnetic field, by which the heading is found, and no topic "
-            "magnetic_field has it; import it, as fields.magnetic_field_ut = [...] in the mapping"
-        )
-    if not seeks_rest:
-        return Initialized({}, [])
     counts, rests_s, facts = [], [], list[Fact]()
     for run in range(samples.runs):
         own = samples.of_run(run)

@@ -293,7 +293,7 @@ def test_a_magnetometer_in_blocks_is_as_in_the_whole(kind: str) -> None:
             assert_array_equal(np.concatenate([one[topic]["mean"] for one in each]), rows["mean"])
 
 
-@pytest.mark.parametrize("settings", METHODS)
+@pytest.mark.parametrize("settings", [*METHODS, {"kind": "triad"}, {"kind": "vqf"}])
 def test_a_unit_without_a_magnetometer_is_refused(settings: dict[str, str]) -> None:
     source, _ = nine_axes(np.zeros(1000))
     samples = source.streams["/body/inertial"]
