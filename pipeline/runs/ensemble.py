@@ -52,7 +52,7 @@ def no_progress(items: Iterable[Any], title: object, total: int | None) -> Itera
 
 
 @dataclass(frozen=True)
-class Part:
+class RunGroup:
     """Holds some runs of an ensemble, replayed together.
 
     Attributes:
@@ -80,10 +80,10 @@ def cut_in_parts(
     sources: Sequence[Source],
     estimates: Sequence[tuple[Path, Path]],
     origins: Sequence[Origin] = (),
-) -> Iterator[Part]:
+) -> Iterator[RunGroup]:
     """Yield the parts of runs that are all at hand; `estimates` and `origins` are of all of them."""
     for now in parts_of(len(sources)):
-        yield Part(
+        yield RunGroup(
             sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
         )
 
@@ -150,7 +150,7 @@ class Pass:
 
 
 def replay_parts(
-    parts: Iterable[Part],
+    parts: Iterable[RunGroup],
     estimators: Settings,
     *,
     gap_limit_s: float,

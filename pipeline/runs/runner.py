@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fuselog.pipeline.altering.sources import alter_all
-from fuselog.pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
+from fuselog.pipeline.runs.ensemble import Pass, RunGroup, Settings, estimates_metadata, replay_parts
 from fuselog.pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting
 from fuselog.pipeline.runs.initial_states import order_of
@@ -165,7 +165,7 @@ class Runner:
             sources, estimates = recorded, [(path, log) for log, path in places]
             input_sha256 = hash_streams(recorded)
         sources = alter_all(sources, experiment.alterations or {})
-        part = Part(sources, now.start, len(sources) == experiment.runs, estimates)
+        part = RunGroup(sources, now.start, len(sources) == experiment.runs, estimates)
         with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
             done = replay_parts(
                 [part],

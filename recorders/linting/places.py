@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.plausibility.body import bodies
 from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.motion import Motion, Slope
+from fuselog.recorders.plausibility.motion import BodyMotion, Slope
 
 GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
 STEADY_M = 5.0
@@ -216,7 +216,7 @@ def _wheels(streams: Mapping[str, Stream], stream: Stream) -> Slope | None:
     """Compute how far fixes move for each metre of the wheels of the same body."""
     for body in bodies({**streams, stream.topic: stream}):
         if body.speeds and body.fixes and body.fixes[0].topic == stream.topic:
-            return Motion(body).speed(body.speeds[0])
+            return BodyMotion(body).speed(body.speeds[0])
     return None
 
 

@@ -53,7 +53,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Fixes(Series):
+class PlaceSeries(Series):
     """Holds places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
 
     `is_flat` says that they are metres and not latitudes, so that they may have a scale.
@@ -78,7 +78,7 @@ class Body:
         references: those of the truth.
     """
 
-    fixes: list[Fixes] = field(default_factory=list)
+    fixes: list[PlaceSeries] = field(default_factory=list)
     velocities: list[Series] = field(default_factory=list)
     speeds: list[Series] = field(default_factory=list)
     turns: list[Series] = field(default_factory=list)
@@ -168,7 +168,9 @@ _PLACED = {each.full_name for each in (schemas.POSITION_FIX, schemas.POSE, schem
 _TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
 
 
-def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True) -> Fixes:
+def _fixes(
+    places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True
+) -> PlaceSeries:
     """Return places with the mean of the two variances that they state, NaN where they state none."""
     column = stream.columns.get("covariance_m2")
     variances = np.full(len(places.times_s), np.nan)
@@ -177,7 +179,7 @@ def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: 
         size = round(width**0.5)
         second = size + 1 if size * size == width and width > 1 else 1
         variances = 0.5 * (column[rows, 0] + column[rows, min(second, width - 1)])
-    return Fixes(
+    return PlaceSeries(
         places.topic,
         places.field,
         places.times_s,
@@ -187,7 +189,7 @@ def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: 
     )
 
 
-def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> Fixes:
+def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> PlaceSeries:
     """Return places about their middle."""
     values = local_metres(stream["latitude_deg"][rows], stream["longitude_deg"][rows])
     known = np.isfinite(values).all(axis=1)

@@ -10,7 +10,7 @@ from fuselog.recorders.log.streams import concatenate
 from fuselog.recorders.plausibility import speeds, stamps, turns
 from fuselog.recorders.plausibility.body import bodies
 from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.motion import Motion
+from fuselog.recorders.plausibility.motion import BodyMotion
 
 MOST = 1 << 19  # messages that are looked at: the first of a log, however long it is
 BLOCK = 1 << 16
@@ -19,7 +19,7 @@ OF_STAMPS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ..
     stamps.losses,
     stamps.repeats,
 )
-OF_MOTION: tuple[Callable[[Motion], Iterator[Finding]], ...] = (
+OF_MOTION: tuple[Callable[[BodyMotion], Iterator[Finding]], ...] = (
     turns.gravity,
     turns.quaternions,
     speeds.leaps,
@@ -46,7 +46,7 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
     }
     found = [each for stream in sensed.values() for check in OF_STAMPS for each in check(stream, sensed)]
     for body in bodies(sensed):
-        motion = Motion(body)
+        motion = BodyMotion(body)
         of_motion = [each for check in OF_MOTION for each in check(motion)]
         known = {(each.cause, each.topic) for each in found}
         found += [each for each in of_motion if (each.cause, each.topic) not in known]

@@ -128,7 +128,7 @@ class Lag(NamedTuple):
     timing: Timing
 
 
-class Motion:
+class BodyMotion:
     """Holds a body, and what comparing its topics in pairs tells."""
 
     def __init__(self, body: Body) -> None:

@@ -5,9 +5,9 @@ from itertools import chain
 
 import numpy as np
 
-from fuselog.recorders.plausibility.body import Fixes, Floats, Series
+from fuselog.recorders.plausibility.body import Floats, PlaceSeries, Series
 from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import Motion
+from fuselog.recorders.plausibility.motion import BodyMotion
 from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
@@ -24,7 +24,7 @@ TAIL_SIGMAS = 3.2905  # beyond which, to each side, a Gaussian is in .0005 of al
 LEAST_RATIO = 1.5  # of variances, a difference that matters
 
 
-def leaps(motion: Motion) -> Iterator[Finding]:
+def leaps(motion: BodyMotion) -> Iterator[Finding]:
     """Find places that jump while a speed says that the body moves as usual."""
     sources = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
@@ -56,7 +56,7 @@ def leaps(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def delays(motion: Motion) -> Iterator[Finding]:
+def delays(motion: BodyMotion) -> Iterator[Finding]:
     """Find topics that are later than others of the same body, by how speeds and turns lag."""
     for topic, late_s in motion.delays_s.items():
         if not late_s:
@@ -82,7 +82,7 @@ def delays(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def clocks(motion: Motion) -> Iterator[Finding]:
+def clocks(motion: BodyMotion) -> Iterator[Finding]:
     """Find clocks that gain on others, by how speeds drift apart."""
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
@@ -98,7 +98,7 @@ def clocks(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def factors(motion: Motion) -> Iterator[Finding]:
+def factors(motion: BodyMotion) -> Iterator[Finding]:
     """Find speeds in other units, by how far places move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
         ratio = motion.speed(source)
@@ -134,7 +134,7 @@ def factors(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def rest(motion: Motion) -> Iterator[Finding]:
+def rest(motion: BodyMotion) -> Iterator[Finding]:
     """Find variances of fixes that their scatter at rest belies, where their errors are white."""
     moving = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
@@ -161,7 +161,7 @@ def rest(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def scatter(fixes: Fixes, source: Series) -> tuple[float, int, float] | None:
+def scatter(fixes: PlaceSeries, source: Series) -> tuple[float, int, float] | None:
     """Return how fixes scatter while a speed says that the body rests.
 
     Returns the variance as a multiple of what is stated, its degrees of freedom, and the correlation of

@@ -10,7 +10,7 @@ from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.recorders.models.planar import wrap_angle
 from fuselog.recorders.plausibility.body import Floats, Series
 from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import Motion, Slope
+from fuselog.recorders.plausibility.motion import BodyMotion, Slope
 from fuselog.recorders.plausibility.windows import FEWEST, pairs
 
 NEAR_DEGREES = 0.1
@@ -28,7 +28,7 @@ LARGEST_SHARE = 0.9
 G_MPS2 = 9.80665
 
 
-def signs(motion: Motion) -> Iterator[Finding]:
+def signs(motion: BodyMotion) -> Iterator[Finding]:
     """Turn rates, courses or headings that go the other way round than the others do."""
     orientations = motion.body.orientations
     orientation = orientations[0] if orientations else None
@@ -51,7 +51,7 @@ def signs(motion: Motion) -> Iterator[Finding]:
         yield _compass(orientation, "the course turns")
 
 
-def _by_forces(motion: Motion, source: Series) -> int:
+def _by_forces(motion: BodyMotion, source: Series) -> int:
     """Say what forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
     for force in motion.body.forces:
         if force.topic == source.topic:
@@ -61,7 +61,7 @@ def _by_forces(motion: Motion, source: Series) -> int:
     return 0
 
 
-def _mirrored(motion: Motion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
+def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
     """Find which of a rate and a frame is mirrored; a witness that goes with the rate clears it."""
     assert motion.courses is not None
     course = motion.courses
@@ -110,7 +110,7 @@ def _compass(orientation: Series, others: str) -> Finding:
     )
 
 
-def degrees(motion: Motion) -> Iterator[Finding]:
+def degrees(motion: BodyMotion) -> Iterator[Finding]:
     """Turn rates in deg/s, or taken for such, by the course or because no body turns so fast."""
     for source in motion.body.turns:
         ratio = motion.turn(source)
@@ -146,7 +146,7 @@ def _is_degrees(ratio: Slope) -> bool:
     )
 
 
-def headings(motion: Motion) -> Iterator[Finding]:
+def headings(motion: BodyMotion) -> Iterator[Finding]:
     """Find headings that are off the course by one angle, of bodies that go where they head."""
     for orientation in motion.body.orientations:
         ratio = motion.heading_course(orientation)
@@ -170,7 +170,7 @@ def headings(motion: Motion) -> Iterator[Finding]:
             )
 
 
-def mounting(motion: Motion) -> Iterator[Finding]:
+def mounting(motion: BodyMotion) -> Iterator[Finding]:
     """Find units whose forward is not the body's, by the forces in curves and at changes of speed."""
     for force in motion.body.forces:
         found = motion.forces(motion.aligned(force))
@@ -191,7 +191,7 @@ def mounting(motion: Motion) -> Iterator[Finding]:
             )
 
 
-def gravity(motion: Motion) -> Iterator[Finding]:
+def gravity(motion: BodyMotion) -> Iterator[Finding]:
     """Find forces in g, or with z down, by the quietest second."""
     for force in motion.body.forces:
         mean = quietest(force)
@@ -235,7 +235,7 @@ def gravity(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def hangs(motion: Motion, topic: str) -> bool:
+def hangs(motion: BodyMotion, topic: str) -> bool:
     """Tell whether a unit is upside down: by its force, and by its turn rate beside the course."""
     turns = next((each for each in motion.body.turns if each.topic == topic), None)
     if turns is None or not any(_is_z_down(each) for each in motion.body.forces if each.topic == topic):
@@ -269,7 +269,7 @@ ORDERS = {
 }
 
 
-def quaternions(motion: Motion) -> Iterator[Finding]:
+def quaternions(motion: BodyMotion) -> Iterator[Finding]:
     """Find quaternions that are not unit, or in another order, by turn rates."""
     for orientation in (*motion.body.orientations, *motion.body.references):
         norm = np.linalg.norm(orientation.values, axis=1)

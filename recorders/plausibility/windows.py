@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.body import Body, Fixes, Floats, Series
+from fuselog.recorders.plausibility.body import Body, Floats, PlaceSeries, Series
 
 SPANS_S = (2.0, 5.0, 10.0)
 FEWEST = 12  # windows, below which nothing is said
@@ -124,7 +124,7 @@ def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 
 
-def _moves(fixes: Fixes) -> bool:
+def _moves(fixes: PlaceSeries) -> bool:
     """Tell whether places leave their stated error, in which a receiver at rest wanders too."""
     stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
     sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0

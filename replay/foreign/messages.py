@@ -16,9 +16,9 @@ from fuselog.replay.engine.streams.results import failures_by_run, state_stream
 from fuselog.replay.foreign.description import Description, TopicRead
 from fuselog.replay.foreign.native.following import Followed, Static
 from fuselog.replay.inference.run.recursion import (
-    Estimates,
+    EstimateRows,
     FilterEvents,
-    Innovations,
+    InnovationRows,
     recorded_innovations,
 )
 from fuselog.replay.inference.run.timing import at_stamps_of
@@ -156,9 +156,9 @@ def joined(of_runs: Sequence[Followed]) -> Followed:
     innovations = zip(*(run.innovations for run in of_runs), strict=True)
     return Followed(
         np.concatenate([run.issued_ns for run in of_runs]),
-        Estimates(*map(np.concatenate, estimates)),
+        EstimateRows(*map(np.concatenate, estimates)),
         _offsets([len(run.estimates.time_ns) for run in of_runs]),
-        Innovations(*map(np.concatenate, innovations)),
+        InnovationRows(*map(np.concatenate, innovations)),
         _offsets([len(run.innovations.time_ns) for run in of_runs]),
     )
 

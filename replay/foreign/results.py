@@ -13,7 +13,7 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Integers
 from fuselog.replay.inference.linear_algebra.gaussian import LOG_TWO_PI
-from fuselog.replay.inference.run.recursion import Estimates, Innovations
+from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class Sizes(NamedTuple):
@@ -36,8 +36,8 @@ class Results(NamedTuple):
 
     progress: Integers
     issued_ns: Integers
-    estimates: Estimates
-    innovations: Innovations
+    estimates: EstimateRows
+    innovations: InnovationRows
 
 
 def results(
@@ -64,9 +64,9 @@ def results(
         for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
     )
     difference, spread, numbers = others
-    estimates = Estimates(due_end.view(np.int64), time_ns.view(np.int64), mean, covariance)
+    estimates = EstimateRows(due_end.view(np.int64), time_ns.view(np.int64), mean, covariance)
     target_id = target.view(np.uint32)[: len(target)]
-    innovations = Innovations(
+    innovations = InnovationRows(
         recorded_end.view(np.int64), noted_ns.view(np.int64), target_id, difference, spread, numbers
     )
     return Results(progress.view(np.int64), issued_ns.view(np.int64), estimates, innovations)
@@ -97,7 +97,7 @@ def in_file(path: Path) -> Callable[[int], np.ndarray]:
     return memory
 
 
-def fill_squares(innovations: Innovations) -> int:
+def fill_squares(innovations: InnovationRows) -> int:
     """Fill NIS and log-likelihood of one run's innovations, in place, up to the first without one.
 
     Returns the row whose covariance is not positive definite, where the innovations end then; else -1.

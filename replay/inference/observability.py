@@ -58,7 +58,7 @@ from fuselog.replay.inference.model.settings import reading_settings
 from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.filtering import FilterState
 from fuselog.replay.inference.run.recursion import (
-    Estimates,
+    EstimateRows,
     RunInputs,
     RunResults,
     filled,
@@ -105,7 +105,7 @@ def gramian_steps(stage: Stage) -> Steps:
     motion = _carried_by_motion(stage)
     sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
 
-    def estimate(run: int, belief: Gramian, found: Estimates, row: int, _: Workspace) -> None:
+    def estimate(run: int, belief: Gramian, found: EstimateRows, row: int, _: Workspace) -> None:
         """Note the Gramian, and as the mean how many messages are in it; begin anew."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
@@ -251,7 +251,9 @@ class Observability(IteratedSmoother):
         windows: Integers = np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
         return windows
 
-    def _gramians(self, state: FilterState, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
+    def _gramians(
+        self, state: FilterState, way: Way, window_of: Integers
+    ) -> tuple[EstimateRows, Integers]:
         """Return the Gramians at the last stamps of windows, and how many messages are in each."""
         stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
         t, (loop, steps) = stage.model.tangent, _summing(stage)
@@ -263,7 +265,7 @@ class Observability(IteratedSmoother):
         one = np.arange(runs + 1)
         _, innovations = no_results(due, one, stage.model, len(innovation_components(stage.sensors)))
         count = due[-1]
-        found = Estimates(
+        found = EstimateRows(
             due[:-1].copy(), np.empty(count, np.int64), np.empty((count, 1)), np.empty((count, t, t))
         )
         unit = np.repeat(np.eye(t)[None], runs, axis=0)

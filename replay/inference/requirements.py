@@ -66,34 +66,34 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
     return ""
 
 
-def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
+def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Requirement"]:
     """Return what a model needs, under the prefix of a log that has most of it."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
     return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
 
 
-def _fit(parts: Sequence["Part"]) -> int:
+def _fit(parts: Sequence["Requirement"]) -> int:
     return sum(1 if part.is_here else -1 for part in parts)
 
 
-class Part(NamedTuple):
+class Requirement(NamedTuple):
     """Describes something that a model needs, and whether a log has it."""
 
     words: str
     is_here: bool
 
 
-def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
+def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
     """Return all that a model needs under one prefix."""
 
-    def part(name: str, schema: Schema, system: str = "") -> Part:
+    def part(name: str, schema: Schema, system: str = "") -> Requirement:
         place, known = here.place(name), here.topics.get(here.place(name))
         words = f"{place} ({schema.full_name}"
         words += f" of system {system})" if system else ")"
         if known is not None and known.schema_name not in serving(schema):
-            return Part(f"{words}, which is {known.schema_name} here", is_here=False)
+            return Requirement(f"{words}, which is {known.schema_name} here", is_here=False)
         is_of = known is not None and known.metadata.get("system", system) == system
-        return Part(words, is_here=is_of)
+        return Requirement(words, is_here=is_of)
 
     parts = []
     sensing = [sensor for sensor in model.all_sensors if here.has(sensor.topic)]
@@ -102,7 +102,7 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
         words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
         if is_here:
             is_here = names_state(here.topics[here.place(model.prior)], model)
-        parts.append(Part(f"{words} of {', '.join(model.state)}", is_here))
+        parts.append(Requirement(f"{words} of {', '.join(model.state)}", is_here))
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
     seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
@@ -113,7 +113,7 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
         own = len(model.sensors)
         words = ("one of " if own > 1 else "") + ", ".join(each.words for each in sensors[:own])
         words = ", or ".join([words, *(each.words for each in sensors[own:])])
-        parts.append(Part(words, any(each.is_here for each in sensors)))
+        parts.append(Requirement(words, any(each.is_here for each in sensors)))
     return parts
 
 

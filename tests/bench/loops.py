@@ -12,7 +12,7 @@ from fuselog.replay.engine.replaying.estimator import Bound
 from fuselog.replay.engine.replaying.replaying import replay
 from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.inference.run import filtering
-from fuselog.replay.inference.run.recursion import Estimates, Innovations, RunResults, filled
+from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows, RunResults, filled
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Call(NamedTuple):
     loop: Callable[..., None]
     runs: int
     before: tuple[Any, ...]
-    results: tuple[Estimates, Innovations]
+    results: tuple[EstimateRows, InnovationRows]
     scratch: Callable[[], Any]
 
     def __call__(self) -> Floats:
@@ -38,7 +38,7 @@ class Call(NamedTuple):
         return filled(estimates, np.append(self.results[0].end, len(estimates.mean)))[0].mean
 
 
-def handed_over(estimates: Estimates, innovations: Innovations) -> tuple[Any, ...]:
+def handed_over(estimates: EstimateRows, innovations: InnovationRows) -> tuple[Any, ...]:
     """What a loop fills, as it takes it."""
     return (RunResults(estimates, innovations),)
 

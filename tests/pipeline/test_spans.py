@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.ensemble import RunGroup, replay_parts
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, open_log, read_streams, write_log
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, record_run
@@ -256,7 +256,7 @@ def test_the_library_refuses_an_old_prior_too(run_log: Path) -> None:
     log = open_log(run_log)
     assert log.run is not None
     late = LogSource(log, start_ns=log.run.epoch_ns + 30 * SECOND)
-    part = Part([late], estimates=[(Path("late.mcap"), run_log)])
+    part = RunGroup([late], estimates=[(Path("late.mcap"), run_log)])
     with pytest.raises(BadInput, match="30 s before the span"):
         replay_parts([part], {"ekf": {}}, gap_limit_s=0.2)
     assert not list(Path().iterdir())

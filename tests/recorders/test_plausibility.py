@@ -24,7 +24,7 @@ from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.models.orientation import compose
 from fuselog.recorders.plausibility.body import Series, bodies
 from fuselog.recorders.plausibility.checks import findings
-from fuselog.recorders.plausibility.motion import Forces, Lag, Motion
+from fuselog.recorders.plausibility.motion import BodyMotion, Forces, Lag
 from fuselog.recorders.plausibility.speeds import scatter
 from fuselog.recorders.plausibility.timing import Timing
 from fuselog.recorders.plausibility.turns import _by_forces
@@ -67,9 +67,9 @@ SHEET = {
 }
 
 
-def motion_of(streams: Mapping[str, Stream]) -> Motion:
+def motion_of(streams: Mapping[str, Stream]) -> BodyMotion:
     [body] = bodies(streams)
-    return Motion(body)
+    return BodyMotion(body)
 
 
 def test_a_winding_road_at_a_steady_speed_says_nothing() -> None:
@@ -219,7 +219,7 @@ def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
     series = Series("/turns", "turn_radps", np.array([10.0, 11.0, 13.0]), np.array([1.0, 2.0, 4.0]))
 
     def times_s(way: str, speeds: Timing | None, turns: Timing | None) -> list[float]:
-        motion = Motion(body)
+        motion = BodyMotion(body)
         for name, found in (("speed_lags", speeds), ("turn_lags", turns)):
             lags = [Lag(series.topic, "/car/fix", found)] if found else []
             setattr(motion, name, [Lag("/other", "/car/fix", SAME), *lags])

@@ -44,7 +44,7 @@ class Vectors(NamedTuple):
         return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
 
 
-class Fixes(NamedTuple):
+class MeasuredVectors(NamedTuple):
     """Holds measured vectors (n, d), their covariances (n, d, d), and what is missing (n,) of these.
 
     A covariance that the log lacks (NaN, or a variance of zero) is that of the given sigma, and missing
@@ -75,7 +75,7 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
 
 def read_fixes(
     stream: Stream, field: str, covariance: str, wanted: Components, sigma: float | None
-) -> Fixes:
+) -> MeasuredVectors:
     """Read wanted components of a vector field and its covariance, row-major or diagonal in another.
 
     `sigma` of every component stands where the covariance is unknown. A position in the plane serves
@@ -92,7 +92,7 @@ def read_fixes(
     stream = _in_space(stream, field, covariance, wanted)
     value = read_vectors(stream, field, wanted)
     if not len(stream):
-        return Fixes(value, np.empty((0, len(wanted), len(wanted))), np.empty(0, bool))
+        return MeasuredVectors(value, np.empty((0, len(wanted), len(wanted))), np.empty(0, bool))
     rows = match_tangent(_stated(stream, field), wanted, f"topic {stream.topic}: {field}")
     found = matrices(stream, field, covariance)[:, rows][:, :, rows]
     if len(rows) == len(wanted):
@@ -103,7 +103,7 @@ def read_fixes(
     if sigma is not None:
         found[missing] = sigma**2 * np.eye(len(rows))
         missing = np.zeros(len(stream), bool)
-    return Fixes(value, found, missing)
+    return MeasuredVectors(value, found, missing)
 
 
 def unknown(covariance: Floats) -> NDArray[np.bool_]:

@@ -21,7 +21,13 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     no_innovation,
     whiten,
 )
-from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations, fault_of, filled
+from fuselog.replay.inference.run.recursion import (
+    EstimateRows,
+    FilterEvents,
+    InnovationRows,
+    fault_of,
+    filled,
+)
 
 # What fails whatever the filter is; a status s of the filter's own counts on from there.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8
@@ -145,7 +151,7 @@ def take(
     addresses: Addresses,
     events: FilterEvents,
     carried: Filters,
-    innovations: Innovations,
+    innovations: InnovationRows,
     work: tuple[Innovation, Innovation],
 ) -> int:
     """Have the filter take a message, and note its innovation; returns WELL or what failed."""
@@ -221,9 +227,9 @@ class Followed(NamedTuple):
     """Holds what filters said: estimates, when they were issued, innovations, and the runs' offsets."""
 
     issued_ns: Integers
-    estimates: Estimates
+    estimates: EstimateRows
     estimate_offsets: Integers
-    innovations: Innovations
+    innovations: InnovationRows
     innovation_offsets: Integers
 
 

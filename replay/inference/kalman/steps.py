@@ -32,7 +32,7 @@ NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 # What a method believes of all runs, what one core works in, the estimates that it fills in, and its
-# samples, such as `Gaussian`, `Workspace`, `recursion.Estimates` and `SampleMemory`. All are the
+# samples, such as `Gaussian`, `Workspace`, `recursion.EstimateRows` and `SampleMemory`. All are the
 # method's own; a loop over events only hands them on.
 Belief = Any  # type: ignore[explicit-any]
 CoreMemory = Any  # type: ignore[explicit-any]

@@ -25,7 +25,7 @@ from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.modes.mixing import MixtureMemory
 from fuselog.replay.inference.run.filtering import Filter
-from fuselog.replay.inference.run.recursion import Estimates, Innovations
+from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class ModeBelief(NamedTuple):
@@ -43,7 +43,7 @@ class ModeBelief(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Holds estimates as the filter fills them in, see `recursion.Estimates`, and probabilities."""
+    """Holds estimates as the filter fills them in, see `recursion.EstimateRows`, and probabilities."""
 
     end: Integers
     time_ns: Integers
@@ -205,7 +205,7 @@ class MixtureFilter(Filter, ABC):
 
     def no_results(
         self, due: Integers, recorded: Integers, components: int
-    ) -> tuple[Mixtures, Innovations]:
+    ) -> tuple[Mixtures, InnovationRows]:
         """Return estimates and innovations to be filled in."""
         (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
         probability = np.empty((len(mean), len(self.names)))
@@ -214,7 +214,7 @@ class MixtureFilter(Filter, ABC):
     def output_streams(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
         """Return the streams of the state and of the modes' probabilities."""
         modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
-        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
+        return [self.states(EstimateRows(*mixtures[:4]), offsets), modes]
 
     def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
         """Return the stream of the modes' probabilities (n, M)."""

@@ -40,7 +40,7 @@ from fuselog.replay.inference.particles.particles import (
 from fuselog.replay.inference.particles.progressive import kernel_of, renewing
 from fuselog.replay.inference.particles.update import weighing
 from fuselog.replay.inference.run.filtering import Filter, FilterState
-from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from fuselog.replay.inference.run.recursion import EstimateRows, FilterEvents, InnovationRows
 from fuselog.replay.inference.run.timing import join_events, select_events
 
 MOST_PARTICLES = 1_000_000
@@ -222,7 +222,7 @@ class ParticleFilter(Filter):
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Clouds, Innovations]:
+    ) -> tuple[Clouds, InnovationRows]:
         """Make estimates, with particles where they are wanted, and innovations to be filled in."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
@@ -241,7 +241,7 @@ class ParticleFilter(Filter):
             particles=np.full(rows, self.parameters.particles),
             effective=clouds.effective,
         )
-        made = [self.states(Estimates(*clouds[:4]), offsets), Ragged(effective, offsets)]
+        made = [self.states(EstimateRows(*clouds[:4]), offsets), Ragged(effective, offsets)]
         if self.parameters.cloud:
             metadata = {**named(model.state), "truth": self.truth}
             size = make_stream(

@@ -55,7 +55,7 @@ class Cloud(NamedTuple):
 
 
 class Clouds(NamedTuple):
-    """Holds estimates as the recursion fills them in (`recursion.Estimates`), with particles or none.
+    """Holds estimates as the recursion fills them in (`recursion.EstimateRows`), with particles or none.
 
     `effective` (n,) is the effective number of particles.
     """

@@ -13,7 +13,7 @@ from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.engine.streams.blocks import Block, Ragged, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane
-from fuselog.replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
+from fuselog.replay.engine.streams.measurements import MeasuredVectors, read_fixes, read_vectors, unknown
 from fuselog.replay.inference.kalman.update import message_layout
 from fuselog.replay.inference.model.binding import Found
 from fuselog.replay.inference.model.model import Control, Map, Sensor
@@ -280,7 +280,7 @@ def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
     return _fields(ragged.stream, tuple(sensor.measured))
 
 
-def with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
+def with_covariance(sensor: Sensor, ragged: Ragged) -> MeasuredVectors:
     """Read measurements, their covariances and which of them lack one."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
@@ -288,7 +288,7 @@ def with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
     m = len(sensor.measured)
     value = _computed(sensor.read, ragged, m)
     spread = np.array(sensor.covariance(ragged.stream), float).reshape(len(value), m, m)
-    return Fixes(value, spread, unknown(spread))
+    return MeasuredVectors(value, spread, unknown(spread))
 
 
 def _fields(stream: Stream, names: Sequence[str]) -> Floats:

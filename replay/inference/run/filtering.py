@@ -45,9 +45,9 @@ from fuselog.replay.inference.run.events import (
 )
 from fuselog.replay.inference.run.out_of_sequence import issued
 from fuselog.replay.inference.run.recursion import (
-    Estimates,
+    EstimateRows,
     FilterEvents,
-    Innovations,
+    InnovationRows,
     RecursionState,
     RunInputs,
     RunResults,
@@ -351,7 +351,7 @@ class Filter:
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[EstimatesToFill, Innovations]:
+    ) -> tuple[EstimatesToFill, InnovationRows]:
         """Make estimates and innovations to be filled in, see `recursion.no_results`."""
         return no_results(due, recorded, self.stage.model, innovation_size)
 
@@ -376,7 +376,7 @@ class Filter:
         """Make the streams of estimates; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 
-    def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
+    def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
         """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
         model, (_, time_ns, mean, covariance) = self.stage.model, estimates
         columns = {
@@ -398,7 +398,7 @@ class Filter:
         """Return the components of all innovations."""
         return innovation_components(self.stage.sensors)
 
-    def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
+    def innovations(self, innovations: InnovationRows, offsets: Integers) -> Ragged:
         """Make the stream of innovations, which needs a sensor; see `states`."""
         topic = f"/estimates/{self.name}"
         return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)

@@ -39,7 +39,7 @@ from fuselog.replay.inference.run.loops import Follow, over_events
 from fuselog.replay.inference.run.recursion import (
     CONTROL,
     FilterEvents,
-    Innovations,
+    InnovationRows,
     ProcessEvent,
     RecursionState,
     RunInputs,
@@ -127,7 +127,7 @@ def reprocessing(
             kept.target_id,
             events.arrival,
         )
-        records = Innovations(
+        records = InnovationRows(
             at, kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
         )
         kept.difference[row], kept.covariance[row] = np.nan, np.nan
@@ -138,7 +138,7 @@ def reprocessing(
         restore(carried, run, kept.after, row)
         return failure
 
-    def write_innovation(run: int, row: int, kept: KeptMessages, innovations: Innovations) -> None:
+    def write_innovation(run: int, row: int, kept: KeptMessages, innovations: InnovationRows) -> None:
         """Fill in the innovation of a kept message."""
         if kept.has_innovation[row]:
             result = innovations.end[run]
@@ -283,7 +283,7 @@ class OutOfSequenceFilter:
             return []
         kept = history.kept
         columns: Columns = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
-        innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
+        innovations = InnovationRows(offsets[1:], *(column[rows] for column in columns))
         return [self.inner.innovations(innovations, offsets)]
 
 

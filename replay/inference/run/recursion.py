@@ -86,7 +86,7 @@ class RecursionState(NamedTuple):
     failure: Integers
 
 
-class Estimates(NamedTuple):
+class EstimateRows(NamedTuple):
     """Holds estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
@@ -95,8 +95,8 @@ class Estimates(NamedTuple):
     covariance: Floats
 
 
-class Innovations(NamedTuple):
-    """Holds innovations as the recursion fills them in, see `Estimates` and `steps.InnovationRecord`."""
+class InnovationRows(NamedTuple):
+    """Holds innovations as the recursion fills them in; see `steps.InnovationRecord`."""
 
     end: Integers
     time_ns: Integers
@@ -124,11 +124,11 @@ class RunResults(NamedTuple):
     """Holds what a recursion fills in: the method's own estimates, and innovations."""
 
     estimates: EstimatesToFill
-    innovations: Innovations
+    innovations: InnovationRows
 
 
 def recorded_innovations(
-    topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
+    topic: str, components: Mapping[str, str], truth: str, innovations: InnovationRows, offsets: Integers
 ) -> Ragged:
     """Make the stream of innovations that a recursion filled in.
 
@@ -159,7 +159,7 @@ ResultsType = TypeVar("ResultsType", bound=tuple[AnyArgument, ...])
 
 def no_results(
     due: Integers, recorded: Integers, model: Model, innovation_size: int
-) -> tuple[Estimates, Innovations]:
+) -> tuple[EstimateRows, InnovationRows]:
     """Make results to be filled in: run r has the rows from due[r] and recorded[r] up to the next run's.
 
     All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
@@ -176,9 +176,9 @@ def no_results(
     time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
         memory[place].reshape(shape) for place, shape in places
     )
-    estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
+    estimates = EstimateRows(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
     reference = target_id.view(np.uint32)[: len(target_id)]
-    innovations = Innovations(
+    innovations = InnovationRows(
         recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
     )
     return estimates, innovations

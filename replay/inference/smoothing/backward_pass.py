@@ -39,7 +39,7 @@ from fuselog.replay.inference.linear_algebra.manifold import tangent_size
 from fuselog.replay.inference.model.corrections import Kinds, comparing, correcting, sloping
 from fuselog.replay.inference.model.model import Correction
 from fuselog.replay.inference.model.stage import Stage
-from fuselog.replay.inference.run.recursion import Estimates
+from fuselog.replay.inference.run.recursion import EstimateRows
 
 FOREVER_NS = np.iinfo(np.int64).max
 
@@ -199,7 +199,7 @@ class Smoothed(NamedTuple):
     stop: Integers
     start: Integers
     lag_ns: int
-    estimates: Estimates
+    estimates: EstimateRows
 
 
 class BackMemory(NamedTuple):

@@ -29,7 +29,12 @@ from fuselog.replay.inference.kalman.methods import FILTERS, Method, MethodParam
 from fuselog.replay.inference.kalman.steps import CoreMemory, EstimatesToFill, Samples
 from fuselog.replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
 from fuselog.replay.inference.run.filtering import Filter, FilterState
-from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
+from fuselog.replay.inference.run.recursion import (
+    EstimateRows,
+    FilterEvents,
+    InnovationRows,
+    RecursionState,
+)
 from fuselog.replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
 
 
@@ -175,7 +180,7 @@ class BoundFilter(Filter):
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[EstimatesToFill, Innovations]:
+    ) -> tuple[EstimatesToFill, InnovationRows]:
         """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
@@ -190,7 +195,7 @@ class BoundFilter(Filter):
         if self.parameters.of == "smoother":
             kept = kept._replace(nodes=(*kept.nodes, (nodes, offsets)))
         else:
-            made.append(self.states(Estimates(*nodes[:4]), offsets))
+            made.append(self.states(EstimateRows(*nodes[:4]), offsets))
         return after._replace(kept=kept), made
 
     def finish(self, state: FilterState) -> list[Ragged]:
@@ -211,9 +216,9 @@ class BoundFilter(Filter):
         times, mean, covariance, transition, noise = map(np.concatenate, zip(*parts, strict=True))
         offsets = np.sum([rows for _, rows in pieces], axis=0)
         smooth_over_runs()(runs, offsets, transition, noise, covariance, scratch=partial(back_memory, t))
-        return self.states(Estimates(offsets[1:], times, mean, covariance), offsets)
+        return self.states(EstimateRows(offsets[1:], times, mean, covariance), offsets)
 
-    def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
+    def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
         """Return the stream of true states, each with what is known of it there."""
         found = super().states(estimates, offsets)
         metadata = {**found.stream.metadata, "bound": self.parameters.of}

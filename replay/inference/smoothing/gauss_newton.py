@@ -27,7 +27,7 @@ from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import ReadSettings, reading_settings
 from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.recursion import (
-    Innovations,
+    InnovationRows,
     RecursionState,
     RunInputs,
     RunResults,
@@ -73,7 +73,7 @@ class SearchState(NamedTuple):
 
     carried: RecursionState
     piece: Piece
-    innovations: Innovations
+    innovations: InnovationRows
     later: Later
     smoothed: Smoothed
     kept: Floats

@@ -24,7 +24,7 @@ from fuselog.replay.inference.run.events import data_columns
 from fuselog.replay.inference.run.filtering import FilterState
 from fuselog.replay.inference.run.recursion import (
     NOTHING,
-    Estimates,
+    EstimateRows,
     FilterEvents,
     RunInputs,
     no_results,
@@ -85,7 +85,7 @@ class Way(NamedTuple):
     node: Integers
     nodes: Nodes
     offsets: Integers
-    states: Estimates
+    states: EstimateRows
     wanted: Booleans
     made: list[Ragged]
 
@@ -116,7 +116,7 @@ class IteratedSmoother(Smoother):
             kept.mean[:] = np.repeat(state.carried.belief.mean, np.diff(offsets), axis=0)
         ended = self._search(state, way, scale)
         rows = way.wanted
-        found = Estimates(kept.end, kept.time_ns[rows], kept.mean[rows], kept.covariance[rows])
+        found = EstimateRows(kept.end, kept.time_ns[rows], kept.mean[rows], kept.covariance[rows])
         states = self.states(found, ragged_rows(rows, offsets))
         return [states, *way.made, *self._solution_streams(ended, way)]
 

@@ -33,7 +33,7 @@ from fuselog.replay.inference.linear_algebra.manifold import is_flat
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.filtering import Filter, FilterState
-from fuselog.replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from fuselog.replay.inference.run.recursion import EstimateRows, FilterEvents, InnovationRows
 from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
@@ -144,7 +144,7 @@ class Smoother(Filter):
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
-    ) -> tuple[Nodes, Innovations]:
+    ) -> tuple[Nodes, InnovationRows]:
         """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
@@ -180,7 +180,7 @@ class Smoother(Filter):
         piece, window = copied(state.kept)
         return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
-    def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[Estimates, Integers]:
+    def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[EstimateRows, Integers]:
         """Return the estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
 
         Changes the nodes, and the window, which then begins at row stop[run].
@@ -203,7 +203,7 @@ class Smoother(Filter):
 
     def gone_back(
         self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
-    ) -> tuple[Estimates, Integers]:
+    ) -> tuple[EstimateRows, Integers]:
         """Return the estimates at the nodes of all pieces, or of one those before row stop[run].
 
         Run r owns offsets[r]:offsets[r + 1].
@@ -226,10 +226,10 @@ class Smoother(Filter):
         return smoothed, offsets
 
 
-def _no_estimates(offsets: Integers, n: int, t: int) -> Estimates:
+def _no_estimates(offsets: Integers, n: int, t: int) -> EstimateRows:
     count = offsets[-1]
     times, means = np.empty(count, np.int64), np.empty((count, n))
-    return Estimates(offsets[:-1], times, means, np.empty((count, t, t)))
+    return EstimateRows(offsets[:-1], times, means, np.empty((count, t, t)))
 
 
 def _joined(pieces: Sequence[Piece]) -> Piece:

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from fuselog.pipeline.runs import ensemble
-from fuselog.pipeline.runs.ensemble import Part
+from fuselog.pipeline.runs.ensemble import RunGroup
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from fuselog.recorders.parameters import Parameters
@@ -309,7 +309,7 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
     paths = [tmp_path / f"{number}.mcap" for number in range(len(modes))]
     places = [(path, path) for path in paths]
     parts = [
-        Part(sources[now], now.start, False, places[now]) for now in ensemble.parts_of(len(sources))
+        RunGroup(sources[now], now.start, False, places[now]) for now in ensemble.parts_of(len(sources))
     ]
     judge = ensemble.replay_parts(parts, {"m": {}}, gap_limit_s=0.2).judge
     topics = list(open_log(paths[0]).topics)

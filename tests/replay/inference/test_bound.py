@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fuselog.pipeline.output.summary import error_charts
-from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.ensemble import RunGroup, replay_parts
 from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import make_stream, schemas
@@ -291,7 +291,7 @@ def test_tables_and_metrics_show_the_bound_beside_estimators() -> None:
     """RMSE under the names that those of estimators have, over the ensemble and by step; no NEES."""
     sources = record_ensemble("batch-reactor", {}, 3, 4)
     settings = {label: {"model": "batch-reactor"} for label in ("ekf", "bound")}
-    parts = [Part(sources[:3], 0, is_all=False), Part(sources[3:], 3, is_all=False)]
+    parts = [RunGroup(sources[:3], 0, is_all=False), RunGroup(sources[3:], 3, is_all=False)]
     judge = replay_parts(parts, settings, gap_limit_s=0.2).judge
     metrics, [table] = judge.metrics, [each for topic, each in judge.steps.items() if "/bound/" in topic]
     assert {key.replace("bound", "ekf") for key in metrics if "bound" in key and "rmse" in key} == {

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.ensemble import RunGroup, replay_parts
 from fuselog.recorders.log import make_stream, open_log, schemas, write_log
 from fuselog.recorders.recording import record_run
 from fuselog.replay.engine.streams.blocks import gather
@@ -155,7 +155,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
             seen.append(drawn() if len(seen) in (2, 3) else 0)
 
     with listen(tmp_path, "--save", str(live)) as receiver:
-        part = Part([LogSource(open_log(log))])
+        part = RunGroup([LogSource(open_log(log))])
         replay_parts(
             [part],
             {"ekf": {}},

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, make_stream, schemas
-from fuselog.recorders.plausibility.body import Body, Fixes, Series
-from fuselog.recorders.plausibility.motion import Forces, Lag, Motion, Slope
+from fuselog.recorders.plausibility.body import Body, PlaceSeries, Series
+from fuselog.recorders.plausibility.motion import BodyMotion, Forces, Lag, Slope
 from fuselog.recorders.plausibility.timing import Timing
 
 BEGIN_NS = 1_700_000_000 * 10**9
@@ -236,7 +236,7 @@ def resting(ratio: float, count: int = 40) -> Any:
     place[rows:] += np.arange(moving)[:, None]
     told = motion()
     stamps_s = np.arange(float(rows + moving))
-    told.body.fixes = [Fixes("/fix", "position_m", stamps_s, place, False, np.ones(rows + moving))]
+    told.body.fixes = [PlaceSeries("/fix", "position_m", stamps_s, place, False, np.ones(rows + moving))]
     told.body.speeds = [Series("/wheels", "forward_mps", 0.1 * np.arange(len(speed)), speed)]
     return told
 
@@ -281,13 +281,13 @@ def fast(rate: float, share: float = 1.0) -> Any:
     return motion(rate=np.where(np.arange(ROWS) < share * ROWS, rate, 0.0), turn=None)
 
 
-def by_velocities(factor: float) -> Motion:
+def by_velocities(factor: float) -> BodyMotion:
     """A body without places, whose velocities are summed, and wheels in another unit."""
     times_s = 0.2 * np.arange(60)
     speed = 10.0 + 5.0 * np.sin(times_s)
     velocity = np.stack([0.8 * speed, 0.6 * speed], axis=1)
     source = Series("/velocity", "velocity_mps", times_s, velocity)
-    return Motion(
+    return BodyMotion(
         Body(velocities=[source], speeds=[Series("/wheels", "forward_mps", times_s, factor * speed)])
     )
 

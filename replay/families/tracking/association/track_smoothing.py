@@ -12,7 +12,7 @@ import numpy as np
 from fuselog.replay.engine.arrays import Floats, Integers, Settings
 from fuselog.replay.inference.model.functions import ModelFunction
 from fuselog.replay.inference.model.stage import Stage
-from fuselog.replay.inference.run.recursion import Estimates
+from fuselog.replay.inference.run.recursion import EstimateRows
 from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
@@ -50,7 +50,7 @@ def smooth_tracks(
     offsets = np.append(first, len(track))
     nodes = _nodes(stage, parameters, offsets, time_ns[order], mean[order], covariance[order])
     runs, n = len(numbers), stage.model.size
-    smoothed = Estimates(
+    smoothed = EstimateRows(
         offsets[1:].copy(),
         np.empty_like(nodes.time_ns),
         np.empty(mean.shape),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fuselog.pipeline.runs.ensemble import Part, replay_parts
+from fuselog.pipeline.runs.ensemble import RunGroup, replay_parts
 from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
@@ -44,7 +44,7 @@ def test_an_estimator_without_estimates_is_told():
         magnetic_field_ut=np.tile([0.0, 0.0, 40.0], (count, 1)),
     )
     source = memory_source(Recording([samples]), RunMetadata("broad"))
-    judge = replay_parts([Part([source])], {"bingham-inertial": {}}, gap_limit_s=1).judge
+    judge = replay_parts([RunGroup([source])], {"bingham-inertial": {}}, gap_limit_s=1).judge
     at_s = f"{SIMULATION_EPOCH_NS * 1e-9:.3f} s"
     assert judge.failures == [
         f"{source.name}: bingham-inertial trial failed at {at_s}: it gave no estimate"
