@@ -125,14 +125,16 @@ class _Reader(NamedTuple):
     def _name(self, node: ast.expr) -> str:
         """Name what an expression is: its metric, the claim's own name for it, or its text."""
         match node:
-            case ast.Name(id="value"):
+            case ast.Name(id="value") if "value" in self.stated:
                 return self._name(parse(self.stated["value"]))
             case ast.Subscript(value=ast.Name(id=quantity), slice=ast.Constant(value=str() as of)):
                 return quantity if is_many(of) else f"{quantity}[{of}]"
             case ast.Subscript(value=of) | ast.Call(func=ast.Name(id="max" | "min"), args=[of]):
                 return self._name(of)
         text = re.sub(r"\['([^']*)'\]", r"[\1]", ast.unparse(node))
-        return re.sub(r"\bvalue\b", self._name(ast.Name("value")), text) if "value" in text else text
+        if "value" not in self.stated:
+            return text
+        return re.sub(r"\bvalue\b(?!\()", lambda _: self._name(ast.Name("value")), text)
 
 
 def _compared(op: type[ast.cmpop], number: Number, limit: Number) -> _Entry:
