@@ -15,10 +15,20 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
 from fuselog.pipeline.tuning.confidence import confidence
-from fuselog.pipeline.tuning.search import Coordinates, Free, coordinates_of, curvature, least
+from fuselog.pipeline.tuning.search import (
+    CURVATURE_STEP,
+    LEAST_GAIN,
+    UNIT,
+    Coordinates,
+    Free,
+    coordinates_of,
+    curvature,
+    least,
+)
 from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
+TINY, OFF = 1e-6, 2e-3  # of a number: how far a jump is seen from, and how far a search begins from it
 TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything
 
 
@@ -59,6 +69,7 @@ class Fit(NamedTuple):
         log_likelihood: of the log without the faults.
         losses: by fault, what the log-likelihood loses without it, all others refitted, as the curvature
             has it; infinite if the fault has no number.
+        at_limit: whether the search for the number of a fault ended at its limit: it is no estimate.
         ends: by fault, the ends of the 95 % profile-likelihood intervals of its numbers. If the search
             did not converge they are NaN.
     """
@@ -66,6 +77,7 @@ class Fit(NamedTuple):
     faults: Sequence[Supposed]
     log_likelihood: float
     losses: Sequence[float]
+    at_limit: Sequence[bool]
     ends: Sequence[tuple[Number, Number]] = ()
 
 
@@ -82,19 +94,20 @@ def fit(
     """
     together = _Together(likelihood, base, faults)
     unknown = [(value, value) for value in together.values(np.full(len(together.start), np.nan))]
+    start = together.beside_jumps()
     try:
-        coordinates = coordinates_of(together.cost, together.free, together.start)
-        begin = coordinates.of(together.start)
+        coordinates = coordinates_of(together.cost, together.free, start)
+        begin = coordinates.of(start)
         point, has_converged = least(
             together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
         )
     except BadInput:  # nothing depends on one of the numbers
         [found] = likelihood([undone(base, faults)])
-        return Fit(faults, found, [np.inf] * len(faults), unknown)
-    bent = curvature(together.cost, coordinates, point, range(len(point)))
+        return Fit(faults, found, [np.inf] * len(faults), [False] * len(faults), unknown)
+    bent = curvature(together.cost, coordinates, point, range(len(point)), 1.0 / UNIT)
     is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
-    losses, ends = [np.inf] * len(faults), unknown
-    if has_converged and is_top and not coordinates.at_bounds(point).any():
+    losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
+    if has_converged and is_top and not at_bounds.any():
         covariance = confidence(range(len(point)), bent).covariance
         losses = [_loss(point[own], covariance[np.ix_(own, own)]) for own in together.places]
         if has_ends:
@@ -105,7 +118,33 @@ def fit(
     [cost] = together.cost(numbers[None])
     values = together.values(numbers)
     fitted = [each._replace(value=value) for each, value in zip(faults, values, strict=True)]
-    return Fit(fitted, -float(cost), losses, ends)
+    at_limit = [bool(at_bounds[own].any()) for own in together.places]
+    return Fit(fitted, -float(cost), losses, at_limit, ends)
+
+
+def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
+    """Compute what the last of several faults gains if all are fitted again, by the curvature.
+
+    That is its gain beside the others as they are, and that of one step of a search from there;
+    infinite if the log-likelihood does not bend downwards.
+    """
+    together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
+    steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
+    coordinates = Coordinates(together.free, steps / CURVATURE_STEP)
+    point, apart = coordinates.of(together.start), CURVATURE_STEP * np.eye(len(steps))
+    bent = curvature(together.cost, coordinates, point, range(len(point)))
+    if not np.isfinite(bent).all() or (len(bent) and np.linalg.eigvalsh(bent)[0] <= 0.0):
+        return np.inf
+    costs = together.cost(coordinates.values(np.concatenate([point + apart, point - apart])))
+    slopes = np.subtract(*np.split(costs, 2)) / (2.0 * CURVATURE_STEP)
+    return faults[-1][0].gain + 0.5 * float(slopes @ np.linalg.solve(bent, slopes))
+
+
+def _errors(at: Peak, of: Hypothesis) -> Floats:
+    """Return about the standard errors of the numbers (m,) of a fault that gains most."""
+    if not of.tried or of.size > 1:
+        return np.array(of.tried[0] if of.tried else (), float)
+    return np.array([abs(at.value) / (2.0 * max(at.gain, 1.0)) ** 0.5])
 
 
 class _Together:
@@ -116,9 +155,10 @@ class _Together:
         self.start = np.array([number for each in faults for number in each.numbers])
         places = iter(range(len(self.start)))
         self.places = [[next(places) for _ in each.numbers] for each in faults]
+        limits = [each.of.limit if each.of.has_end else np.inf for each in faults]
         self.free = [
-            Free(each.of.name, number, -each.of.limit, each.of.limit, is_positive=False)
-            for each in faults
+            Free(each.of.name, number, -limit, limit, is_positive=False)
+            for each, limit in zip(faults, limits, strict=True)
             for number in each.numbers
         ]
 
@@ -136,6 +176,20 @@ class _Together:
             for point in points
         ]
         return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
+
+    def beside_jumps(self) -> Floats:
+        """Return the start (k,), a little off where the log-likelihood jumps.
+
+        A delay moves the first message or the last out of the log; slopes across a jump say nothing.
+        """
+        start = self.start.copy()
+        apart = np.diag(TINY * start)
+        here, *costs = self.cost(np.concatenate([start[None], start + apart, start - apart]))
+        above, below = np.split(np.array(costs), 2)
+        jumps = np.maximum(np.abs(above - here), np.abs(below - here)) > LEAST_GAIN
+        way = np.where(above < below, 1.0, -1.0) * np.sign(start)
+        start[jumps] += (OFF * way * np.maximum(np.abs(start), 1.0))[jumps]
+        return start
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
