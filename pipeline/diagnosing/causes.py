@@ -69,6 +69,11 @@ class Cause(NamedTuple):
     of_halves: tuple[float, float] = (np.inf, np.inf)
 
     @property
+    def has_ends(self) -> bool:
+        """Tell whether the log bounds the number on both sides, as far as a fit says."""
+        return not np.isinf(self.ends).any()
+
+    @property
     def statement(self) -> str:
         """Return what is wrong, and by how much; without an interval if the fit did not converge."""
         words = self.hypothesis.words(self.value, *self.ends)
@@ -435,7 +440,18 @@ class _Search:
         return Found(self._nearest(self.base, _faults(found.names)), self.base)
 
     def causes(self, found: Sequence[Found]) -> list[Cause]:
-        """Return the causes with gains and intervals: of several by fits of all of them."""
+        """Return the causes with gains and intervals; what has no end of its interval is not named."""
+        causes = self._estimated(found)
+        ended = [each for each, cause in zip(found, causes, strict=True) if cause.has_ends]
+        if len(ended) < len(found):
+            return self.causes(self._together(ended) if len(ended) > 1 else [*map(self._alone, ended)])
+        return [
+            each._replace(others=tuple(other for other in each.others if other.has_ends))
+            for each in causes
+        ]
+
+    def _estimated(self, found: Sequence[Found]) -> list[Cause]:
+        """Compute gains and intervals of causes: of several by fits of all of them."""
         if len(found) < 2:
             alone = [_causes(gains_over(self.likelihood, each.over), each.names) for each in found]
             return [first._replace(others=tuple(others)) for first, *others in alone]
