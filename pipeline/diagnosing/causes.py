@@ -34,7 +34,7 @@ GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign 
 SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
 CONTENDS = 0.8  # of what the likeliest gains: with more faults undone it may be likelier
 HIDDEN = 0.3  # of the least gain: what gains as much may gain enough if other causes are fitted again
-LEADING = 10  # of the likeliest faults: each is tried beside all others
+LEADING = 10  # of the likeliest faults: each is tried beside all that gain less
 
 Named = tuple[Peak, Hypothesis]
 Names = list[Named]  # of one cause: what a log does not tell from it
@@ -243,13 +243,13 @@ class _Search:
             noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
             if self._is_gross(look, noises):
                 look, alike, noises = self._beside_gross(look, alike, noises)
-            other = self._without_noise(look, noises) or self._of_same_kind(look, alike, tried)
+            other = self._without_noise(look, noises)
             if not other and alike:
                 other, first = self._with(look, alike), alike[0][1]
                 if all(of is not first for each in other for _, of in each.names):
                     tried = [each for each in tried if each is not first]
             if not other and np.isinf(target):
-                other = self._hidden(look)
+                other = self._with_less_noise(look.found, tried) or self._hidden(look)
             if not other:
                 break
             found = other
@@ -297,22 +297,29 @@ class _Search:
         beside = Look(look.found, now, list(zip(self.peaks(now, others), others, strict=True)))
         return beside, _likeliest(self.likelihood, now, beside.ranked, self.count)[0] or alike, []
 
-    def _of_same_kind(self, look: Look, alike: Names, tried: Sequence[Hypothesis]) -> list[Found]:
-        """Exchange causes for others of their kind if a noise would follow them; none if all stay.
+    def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
+        """Leave out a noise if the others, exchanged for faults of their kinds, explain as much.
 
-        Fixes in feet may be speeds that are not.
+        Positions that are too large, which look as precise as they are large, may be speeds too small.
         """
-        if len(look.found) < 2 or not alike or alike[0][1].kind not in NOISES:
-            return []
-        wider = self._together([self._widened(each, tried) for each in look.found])
-        stay = {id(each.supposed.of) for each in look.found} == {id(each.supposed.of) for each in wider}
-        return [] if stay else wider
+        for noise in found:
+            rest = [self._widened(each, tried) for each in found if each is not noise]
+            if noise.supposed.of.kind in NOISES and rest:
+                instead = self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
+                if self._score(instead) > self._score(found):
+                    return instead
+        return []
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
         """Let all faults of a cause's kind contend with it."""
         kind = found.supposed.of.kind
         return found._replace(contenders=[of for of in tried if of.kind == kind and _is_physical(of)])
+
+    def _score(self, found: Sequence[Found]) -> float:
+        """Compute the log-likelihood of the log without causes, less what their numbers cost."""
+        [explained] = self.likelihood([self.without(found)])
+        return explained - NUMBER_COST * sum(len(each.supposed.numbers) for each in found)
 
     def _with(self, look: Look, alike: Names) -> list[Found]:
         """Add the likeliest cause, and fit it together with the others."""
@@ -335,11 +342,13 @@ class _Search:
             return []
         noise = max(at.score(of) for at, of in noises)
         [before] = self.likelihood([self.without(look.found)])
-        own, faults = [at for at, _ in look.physical], [of for _, of in look.physical]
-        instead, _ = self.more(faults, own, look.found, target=before + noise)
-        [after] = self.likelihood([self.without(instead)])
-        cost = NUMBER_COST * sum(len(each.supposed.numbers) for each in instead[len(look.found) :])
-        return instead if after - before - cost >= noise else []
+        peaks, faults = [at for at, _ in look.physical], [of for _, of in look.physical]
+        instead, _ = self.more(faults, peaks, look.found, target=before + noise)
+        if self._score(instead) < self._score(look.found) + noise:
+            return []
+        # with causes of what is measured undone, a noise may explain more than one of them does
+        own = [of for _, of in noises]
+        return self._together([each._replace(contenders=[*each.contenders, *own]) for each in instead])
 
     def _hidden(self, look: Look) -> list[Found]:
         """Add a cause that gains enough only if those that are found are fitted again beside it."""
@@ -383,9 +392,9 @@ class _Search:
         return found
 
     def _needed(self, found: list[Found], fitted: Fit) -> list[Found]:
-        """Leave out a cause that the others make superfluous, or whose number ended at its limit."""
-        if True in fitted.at_limit:
-            place = fitted.at_limit.index(True)
+        """Leave out a cause that the others make superfluous, or whose number is no estimate."""
+        if False in fitted.are_estimates:
+            place = fitted.are_estimates.index(False)
             return [*found[:place], *found[place + 1 :]]
         place = int(np.argmin(fitted.losses))
         rest = [*found[:place], *found[place + 1 :]]
@@ -420,7 +429,7 @@ class _Search:
             faults = [other.supposed for other in others]
             faults.insert(place, Supposed(of, most.value))
             fitted = fit(self.likelihood, self.base, faults)
-            if not fitted.at_limit[place]:
+            if fitted.are_estimates[place]:
                 value, gain = fitted.faults[place].value, fitted.log_likelihood - without
                 near.append((most._replace(value=value, gain=gain), of))
         alike = _alike(sorted(near, key=lambda pair: -pair[0].score(pair[1])))
@@ -437,7 +446,9 @@ class _Search:
 
     def _alone(self, found: Found) -> Found:
         """Return a cause with what it gains if it is the only one."""
-        return Found(self._nearest(self.base, _faults(found.names)), self.base)
+        known = [(Peak(0.0, 0.0), of) for of in found.contenders]
+        faults = _faults([*found.names, *known])
+        return Found(self._nearest(self.base, faults), self.base, faults)
 
     def causes(self, found: Sequence[Found]) -> list[Cause]:
         """Return the causes with gains and intervals; what has no end of its interval is not named."""
@@ -538,8 +549,8 @@ def _takes_all(at: Peak, of: Hypothesis) -> bool:
 def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | None:
     """Find one of two gross faults which gain more together than any noise does; None without.
 
-    Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
-    none may gain by itself what it is worth.
+    Of two gross faults none may gain by itself what it is worth. So the likeliest are tried with all
+    others, and special numbers, such as the factors of units, with one another.
     """
     supposed, most = list[Supposed](), 0.0
     for at, of in ranked:
@@ -549,11 +560,15 @@ def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | 
             values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
             supposed += [Supposed(of, value) for value in values]
     alone = np.array(gains_over(likelihood, now)(supposed))
+    order = np.argsort(-alone, kind="stable").tolist()
     best, found = most, None
-    for place in np.argsort(-alone, kind="stable")[:LEADING]:
+    for rank, place in enumerate(order):
         leading = supposed[place]
-        others = [each for each in supposed if each.of is not leading.of]
-        gains = gains_over(likelihood, leading.without(now))(others)
+        others = [supposed[each] for each in order[rank + 1 :]]
+        if rank >= LEADING:
+            others = [each for each in others if each.is_special] if leading.is_special else []
+        others = [each for each in others if each.of is not leading.of]
+        gains = gains_over(likelihood, leading.without(now))(others) if others else []
         together = alone[place] + max(gains, default=-np.inf)
         if together > best:
             best, found = float(together), leading

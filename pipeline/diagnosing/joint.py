@@ -29,6 +29,7 @@ from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 TINY, OFF = 1e-6, 2e-3  # of a number: how far a jump is seen from, and how far a search begins from it
+NEAR = 1e-3  # of a number or its limit: how far off nothing may depend on it, or it may be at its limit
 TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything
 
 
@@ -41,6 +42,11 @@ class Supposed(NamedTuple):
     def without(self, trial: Trial) -> Trial:
         """Return the trial without the fault."""
         return self.of.without(trial, self.value)
+
+    @property
+    def is_special(self) -> bool:
+        """Tell whether the number is one that is tried as it is."""
+        return self.value in self.of.specials
 
     @property
     def numbers(self) -> list[float]:
@@ -69,7 +75,8 @@ class Fit(NamedTuple):
         log_likelihood: of the log without the faults.
         losses: by fault, what the log-likelihood loses without it, all others refitted, as the curvature
             has it; infinite if the fault has no number.
-        at_limit: whether the search for the number of a fault ended at its limit: it is no estimate.
+        are_estimates: whether the numbers of a fault are estimates: not if the search ended at their
+            limit, or if nothing depends on them.
         ends: by fault, the ends of the 95 % profile-likelihood intervals of its numbers. If the search
             did not converge they are NaN.
     """
@@ -77,7 +84,7 @@ class Fit(NamedTuple):
     faults: Sequence[Supposed]
     log_likelihood: float
     losses: Sequence[float]
-    at_limit: Sequence[bool]
+    are_estimates: Sequence[bool]
     ends: Sequence[tuple[Number, Number]] = ()
 
 
@@ -103,7 +110,9 @@ def fit(
         )
     except BadInput:  # nothing depends on one of the numbers
         [found] = likelihood([undone(base, faults)])
-        return Fit(faults, found, [np.inf] * len(faults), [False] * len(faults), unknown)
+        is_free = ~(together.is_flat(start) | together.at_limits(start))
+        are_estimates = [is_free[own].all() for own in together.places]
+        return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
     bent = curvature(together.cost, coordinates, point, range(len(point)), 1.0 / UNIT)
     is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
     losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
@@ -118,8 +127,8 @@ def fit(
     [cost] = together.cost(numbers[None])
     values = together.values(numbers)
     fitted = [each._replace(value=value) for each, value in zip(faults, values, strict=True)]
-    at_limit = [bool(at_bounds[own].any()) for own in together.places]
-    return Fit(fitted, -float(cost), losses, at_limit, ends)
+    are_estimates = [not at_bounds[own].any() for own in together.places]
+    return Fit(fitted, -float(cost), losses, are_estimates, ends)
 
 
 def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
@@ -177,6 +186,17 @@ class _Together:
         ]
         return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
 
+    def is_flat(self, point: Floats) -> NDArray[np.bool_]:
+        """Tell of which numbers (k,) nothing depends near a point (k,)."""
+        apart = np.diag(np.maximum(np.abs(point), 1.0) * NEAR)
+        here, *costs = self.cost(np.concatenate([point[None], point + apart, point - apart]))
+        return np.all(np.reshape(costs, (2, -1)) == here, axis=0)
+
+    def at_limits(self, point: Floats) -> NDArray[np.bool_]:
+        """Tell which numbers (k,) of a point (k,) are at the limit of what is searched."""
+        limits = np.array([each.high for each in self.free])
+        return np.abs(point) >= (1.0 - NEAR) * limits
+
     def beside_jumps(self) -> Floats:
         """Return the start (k,), a little off where the log-likelihood jumps.
 
@@ -223,11 +243,12 @@ def _at_specials(
     ends: tuple[Floats, Floats],
 ) -> Floats:
     """Take special values, such as the factor of a unit, if they are within the intervals."""
+    specials = dict[int, float]()
     for own, each in zip(together.places, together.faults, strict=True):
         for place in own[: each.of.size == 1]:
             low, high = (every[place] for every in ends)
-            special = next((at for at in each.of.specials if low < at < high), None)
-            if special is not None:
-                apart = special / coordinates.units[place] - point[place]
-                point = point + apart * covariance[:, place] / covariance[place, place]
-    return point
+            within = [at / coordinates.units[place] for at in each.of.specials if low < at < high]
+            specials.update((place, at) for at in within[:1])
+    places = list(specials)
+    apart = np.array([*specials.values()]) - point[places]
+    return point + covariance[:, places] @ np.linalg.solve(covariance[np.ix_(places, places)], apart)
