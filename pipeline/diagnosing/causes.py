@@ -29,6 +29,7 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
+CLEARLY = 0.5  # more gained: what a log hardly tells apart is named by the likelier, and never in turns
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
 SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
@@ -265,19 +266,21 @@ class _Search:
         """Find what hypotheses gain beside those that are found; None if no cause can follow."""
         named = {id(of) for each in found for _, of in each.names}
         candidates = [each for each in tried if id(each) not in named]
-        free = self.most - len(found)
-        if not candidates or free < 1:
+        if not candidates or len(found) >= self.most:
             return None
         now = self.without(found)
         lacking = target - self.likelihood([now])[0]
-        peaks = peaks or self.peaks(now, candidates, lacking / free)
+        peaks = peaks or self.peaks(now, candidates, lacking / self.most)
         look = Look(found, now, list(zip(peaks, candidates, strict=True)))
         return look if self._reaches(look, lacking) else None
 
     def _reaches(self, look: Look, gain: float) -> bool:
-        """Tell whether as many causes as may be named would gain so much, each by itself."""
+        """Tell whether as many causes as may be named in all would gain so much, each by itself.
+
+        Those that are found are among them: they gain more if they are fitted again beside others.
+        """
         best = max((at.score(of) for at, of in look.physical), default=0.0)
-        return best * (self.most - len(look.found)) >= gain
+        return best * self.most >= gain
 
     def _is_gross(self, look: Look, noises: Sequence[Named]) -> bool:
         """Tell whether two gross faults may look like a noise or outliers, so that pairs are tried."""
@@ -433,7 +436,8 @@ class _Search:
                 value, gain = fitted.faults[place].value, fitted.log_likelihood - without
                 near.append((most._replace(value=value, gain=gain), of))
         alike = _alike(sorted(near, key=lambda pair: -pair[0].score(pair[1])))
-        if all(of is not main for _, of in alike):
+        (best, first), least = alike[0], near[0][0].score(main) + CLEARLY
+        if all(of is not main for _, of in alike) or best.score(first) > least:
             return Found(alike, self.base, [main, *own])
         rivals = [pair for pair in known if pair[1] is main]
         different = [pair for pair in alike if pair[1] is not main]

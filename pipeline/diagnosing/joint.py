@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
-from fuselog.pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
+from fuselog.pipeline.diagnosing.search import ROOT_95, WIDE, Peak, end, side_by_side
 from fuselog.pipeline.tuning.confidence import confidence
 from fuselog.pipeline.tuning.search import (
     CURVATURE_STEP,
@@ -134,8 +134,8 @@ def fit(
 def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
     """Compute what the last of several faults gains if all are fitted again, by the curvature.
 
-    That is its gain beside the others as they are, and that of one step of a search from there;
-    infinite if the log-likelihood does not bend downwards.
+    That is its gain beside the others as they are, and WIDE times that of one step of a search from
+    there: more is not hoped for. It is infinite if the log-likelihood does not bend downwards.
     """
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
@@ -146,7 +146,7 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
         return np.inf
     costs = together.cost(coordinates.values(np.concatenate([point + apart, point - apart])))
     slopes = np.subtract(*np.split(costs, 2)) / (2.0 * CURVATURE_STEP)
-    return faults[-1][0].gain + 0.5 * float(slopes @ np.linalg.solve(bent, slopes))
+    return faults[-1][0].gain + 0.5 * WIDE * float(slopes @ np.linalg.solve(bent, slopes))
 
 
 def _errors(at: Peak, of: Hypothesis) -> Floats:
