@@ -167,7 +167,7 @@ class Look(NamedTuple):
         ranked: every fault that may follow, with its greatest gain.
     """
 
-    found: list[Found]
+    found: Sequence[Found]
     now: Trial
     ranked: Names
 
@@ -289,9 +289,7 @@ class _Search:
         outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
         return self._reaches(look, outliers)
 
-    def _beside_gross(
-        self, look: Look, alike: Names, noises: Sequence[Named]
-    ) -> tuple[Look, Names, Sequence[Named]]:
+    def _beside_gross(self, look: Look, alike: Names, noises: Names) -> tuple[Look, Names, Names]:
         """Undo one of two gross faults, if they gain more than a noise; the other is likeliest then."""
         gross = _companion(self.likelihood, look.now, look.ranked)
         if gross is None:
@@ -315,9 +313,10 @@ class _Search:
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
-        """Let all faults of a cause's kind contend with it."""
+        """Let all faults of a cause's kind contend with it as well."""
         kind = found.supposed.of.kind
-        return found._replace(contenders=[of for of in tried if of.kind == kind and _is_physical(of)])
+        alike = [of for of in tried if of.kind == kind and _is_physical(of)]
+        return found._replace(contenders=[*found.contenders, *alike])
 
     def _score(self, found: Sequence[Found]) -> float:
         """Compute the log-likelihood of the log without causes, less what their numbers cost."""
@@ -349,9 +348,10 @@ class _Search:
         instead, _ = self.more(faults, peaks, look.found, target=before + noise)
         if self._score(instead) < self._score(look.found) + noise:
             return []
-        # with causes of what is measured undone, a noise may explain more than one of them does
+        # with the others undone, a noise or a fault of the same kind may explain more than a cause does
         own = [of for _, of in noises]
-        return self._together([each._replace(contenders=[*each.contenders, *own]) for each in instead])
+        wide = [self._widened(each, faults) for each in instead]
+        return self._together([each._replace(contenders=[*each.contenders, *own]) for each in wide])
 
     def _hidden(self, look: Look) -> list[Found]:
         """Add a cause that gains enough only if those that are found are fitted again beside it."""

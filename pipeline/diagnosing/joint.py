@@ -111,7 +111,7 @@ def fit(
     except BadInput:  # nothing depends on one of the numbers
         [found] = likelihood([undone(base, faults)])
         is_free = ~(together.is_flat(start) | together.at_limits(start))
-        are_estimates = [is_free[own].all() for own in together.places]
+        are_estimates = [bool(is_free[own].all()) for own in together.places]
         return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
     bent = curvature(together.cost, coordinates, point, range(len(point)), 1.0 / UNIT)
     is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
@@ -127,7 +127,7 @@ def fit(
     [cost] = together.cost(numbers[None])
     values = together.values(numbers)
     fitted = [each._replace(value=value) for each, value in zip(faults, values, strict=True)]
-    are_estimates = [not at_bounds[own].any() for own in together.places]
+    are_estimates = [not bool(at_bounds[own].any()) for own in together.places]
     return Fit(fitted, -float(cost), losses, are_estimates, ends)
 
 
