@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -159,56 +158,6 @@ def test_a_number_at_its_limit_or_without_effect_is_no_estimate() -> None:
     ):
         found = fit(likelihood, base, [Supposed(first, 0.9), Supposed(second, 1e-4)])
         assert found.are_estimates == are_estimates, (first.limit, second.name)
-
-
-def test_faults_at_once_are_counted() -> None:
-    """By pairs and triples, and by what was planted."""
-    rows = pd.DataFrame(
-        {
-            "faults": " + ".join("abc"[:planted]),
-            "planted": planted,
-            "are_named": seed == 1,
-            "values": 2,
-            "within": 1 + (seed == 1),
-            "is_noise_first": seed == 0,
-        }
-        for planted in (2, 3)
-        for seed in range(4)
-    )
-    counted = together.metrics_of(rows)
-    assert counted["ekf.logs.pairs"] == counted["ekf.logs.triples"] == 4.0
-    assert counted["ekf.named_share.pairs"] == 0.25
-    assert counted["ekf.within_share.triples"] == 0.625
-    assert counted["ekf.noise_first.pairs"] == 1.0
-    assert (counted["ekf.named.a-b"], counted["ekf.within.a-b-c"]) == (1.0, 5.0)
-
-
-def test_pairs_and_triples_are_of_faults_that_a_log_tells_apart() -> None:
-    """Each fault is in some of them; none is of two faults of a number, or of two that are a third."""
-    pairs, triples = together.pairs(), together.triples()
-    told = {name for faults in pairs for name in faults}
-    assert told == FAULTS.keys() - {"nothing", "half of the odometry lost"}
-    excluded = {
-        frozenset(each) for each in combinations(sorted(told), 2)
-    } - {frozenset(each) for each in pairs}
-    assert frozenset({"speed x 3.6", "speed / 3.6"}) in excluded
-    assert frozenset({"turn rate's sign", "E, N exchanged"}) in excluded
-    assert len(excluded) == 18
-    assert len({*triples}) == len(triples) == 40
-    assert all(frozenset(two) not in excluded for each in triples for two in combinations(each, 2))
-
-
-@pytest.mark.paper
-def test_faults_at_once_are_named_with_values_in_their_intervals() -> None:
-    """A speed in feet with a turn rate of the wrong sign is no error of fixes with another variance."""
-    for faults in (
-        ("turn rate's sign", "speed x .3048"),
-        ("fixes .3 s late", "lever (2, .6) m", "gyro bias .02"),
-    ):
-        found = together.tried(faults, 2100)
-        assert found["are_named"], found["causes"]
-        assert found["within"] == found["values"] > 0, found["causes"]
-        assert not found["is_noise_first"]
 
 
 def test_faults_at_once_are_counted() -> None:
