@@ -220,7 +220,7 @@ static void take(REAL *to, const double *from, int count)
 static void give(double *to, const REAL *from, int count)
 {{
     for (int i = 0; i < count; i++)
-        to[i] = from[i];
+        to[i] = (double)from[i];
 }}
 
 int32_t fuselog_filter_version(void) {{ return FUSELOG_FILTER_VERSION; }}

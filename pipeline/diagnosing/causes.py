@@ -20,7 +20,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     noise_gain_over,
 )
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
-from fuselog.pipeline.diagnosing.joint import Supposed, fit, undone
+from fuselog.pipeline.diagnosing.joint import Fit, Supposed, fit, promised, undone
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
 from fuselog.replay.engine import chi2
@@ -29,12 +29,13 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
+CLEARLY = 0.5  # more gained: what a log hardly tells apart is named by the likelier, and never in turns
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
 SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
 CONTENDS = 0.8  # of what the likeliest gains: with more faults undone it may be likelier
 HIDDEN = 0.3  # of the least gain: what gains as much may gain enough if other causes are fitted again
-LEADING = 10  # of the likeliest faults: each is tried beside all others
+LEADING = 10  # of the likeliest faults: each is tried beside all that gain less
 
 Named = tuple[Peak, Hypothesis]
 Names = list[Named]  # of one cause: what a log does not tell from it
@@ -67,6 +68,11 @@ class Cause(NamedTuple):
     gain: float
     others: tuple["Cause", ...] = ()
     of_halves: tuple[float, float] = (np.inf, np.inf)
+
+    @property
+    def has_ends(self) -> bool:
+        """Tell whether the log bounds the number on both sides, as far as a fit says."""
+        return not np.isinf(self.ends).any()
 
     @property
     def statement(self) -> str:
@@ -152,6 +158,25 @@ class Found(NamedTuple):
         return Supposed(of, at.value)
 
 
+class Look(NamedTuple):
+    """Holds what the faults that are tried gain beside the causes that are found.
+
+    Attributes:
+        found: the causes.
+        now: the log without them.
+        ranked: every fault that may follow, with its greatest gain.
+    """
+
+    found: Sequence[Found]
+    now: Trial
+    ranked: Names
+
+    @property
+    def physical(self) -> Names:
+        """Return the faults of what is measured."""
+        return [pair for pair in self.ranked if _is_physical(pair[1])]
+
+
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
@@ -187,9 +212,9 @@ class _Search:
     most: int
     count: int
 
-    def peaks(self, now: Trial, candidates: Sequence[Hypothesis]) -> list[Peak]:
-        """Find the greatest gain of each over a trial."""
-        return _peaks(gains_over(self.likelihood, now), candidates, self.count)
+    def peaks(self, now: Trial, candidates: Sequence[Hypothesis], least: float = 0.0) -> list[Peak]:
+        """Find the greatest gain of each over a trial, less well if all gain less than `least`."""
+        return _peaks(gains_over(self.likelihood, now), candidates, self.count, least)
 
     def without(self, found: Sequence[Found]) -> Trial:
         """Return the log without causes."""
@@ -209,105 +234,147 @@ class _Search:
         if as many causes as may be named would not come to that log-likelihood. Without one it also
         looks for causes that gain enough only together with a new fit of the others.
         """
-        found, doubtful = list(found), list[Named]()
+        found, doubtful, tried = list(found), list[Named](), list(tried)
         for _ in range(2 * self.most):  # a cause may go again
-            named = {id(of) for each in found for _, of in each.names}
-            candidates = [each for each in tried if id(each) not in named]
-            if not candidates or len(found) >= self.most:
+            look = self._look(tried, peaks, found, target)
+            if look is None:
                 break
-            now = self.without(found)
-            peaks = peaks or self.peaks(now, candidates)
-            ranked = list(zip(peaks, candidates, strict=True))
-            if not self._reaches(ranked, found, target - self.likelihood([now])[0]):
-                break
-            alike, doubtful = _likeliest(self.likelihood, now, peaks, candidates, self.count)
-            noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
-            if self._is_gross(ranked, found, noises):
-                gross = _companion(self.likelihood, now, peaks, candidates)
-                if gross is not None:
-                    now, noises = gross.without(now), []
-                    candidates = [each for each in candidates if each is not gross.of]
-                    peaks = self.peaks(now, candidates)
-                    alike = _likeliest(self.likelihood, now, peaks, candidates, self.count)[0] or alike
-                    ranked = list(zip(peaks, candidates, strict=True))
             peaks = []
-            if noises and (instead := self._without_noise(ranked, found, noises)):
-                found = instead
-                continue
-            if alike and alike[0][1].kind in NOISES and len(found) > 1:
-                wider = self._together([self._widened(each, tried) for each in found])
-                if {id(each.supposed.of) for each in wider} != {id(each.supposed.of) for each in found}:
-                    found = wider
-                    continue
-            if not alike:
-                beside = self._hidden(ranked, found) if np.isinf(target) else []
-                if not beside:
-                    break
-                found = self._together(beside)
-                continue
-            contenders = [
-                of
-                for at, of in ranked
-                if _is_physical(of) and at.gain > CONTENDS * alike[0][0].gain and of is not alike[0][1]
-            ]
-            alike[:1] = _with_rival(gains_over(self.likelihood, now), alike[0], least_gain(self.count))
-            found = self._together([*found, Found(alike, now, contenders)])
+            alike, doubtful = _likeliest(self.likelihood, look.now, look.ranked, self.count)
+            noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
+            if self._is_gross(look, noises):
+                look, alike, noises = self._beside_gross(look, alike, noises)
+            other = self._without_noise(look, noises)
+            if not other and alike:
+                other, first = self._with(look, alike), alike[0][1]
+                if all(of is not first for each in other for _, of in each.names):
+                    tried = [each for each in tried if each is not first]
+            if not other and np.isinf(target):
+                other = self._with_less_noise(look.found, tried) or self._hidden(look)
+            if not other:
+                break
+            found = other
         return found, doubtful
 
-    def _reaches(self, ranked: Sequence[Named], found: Sequence[Found], gain: float) -> bool:
-        """Tell whether as many causes as may be named would gain so much, each by itself."""
-        best = max((at.score(of) for at, of in ranked if _is_physical(of)), default=0.0)
-        return best * (self.most - len(found)) >= gain
+    def _look(
+        self,
+        tried: Sequence[Hypothesis],
+        peaks: Sequence[Peak],
+        found: Sequence[Found],
+        target: float,
+    ) -> Look | None:
+        """Find what hypotheses gain beside those that are found; None if no cause can follow."""
+        named = {id(of) for each in found for _, of in each.names}
+        candidates = [each for each in tried if id(each) not in named]
+        if not candidates or len(found) >= self.most:
+            return None
+        now = self.without(found)
+        lacking = target - self.likelihood([now])[0]
+        peaks = peaks or self.peaks(now, candidates, lacking / self.most)
+        look = Look(found, now, list(zip(peaks, candidates, strict=True)))
+        return look if self._reaches(look, lacking) else None
 
-    def _is_gross(
-        self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
-    ) -> bool:
+    def _reaches(self, look: Look, gain: float) -> bool:
+        """Tell whether as many causes as may be named in all would gain so much, each by itself.
+
+        Those that are found are among them: they gain more if they are fitted again beside others.
+        """
+        best = max((at.score(of) for at, of in look.physical), default=0.0)
+        return best * self.most >= gain
+
+    def _is_gross(self, look: Look, noises: Sequence[Named]) -> bool:
         """Tell whether two gross faults may look like a noise or outliers, so that pairs are tried."""
         if any(of.kind in NOISES and at.value > GROSS for at, of in noises):
             return True
         outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
-        return self._reaches(ranked, found, outliers)
+        return self._reaches(look, outliers)
+
+    def _beside_gross(self, look: Look, alike: Names, noises: Names) -> tuple[Look, Names, Names]:
+        """Undo one of two gross faults, if they gain more than a noise; the other is likeliest then."""
+        gross = _companion(self.likelihood, look.now, look.ranked)
+        if gross is None:
+            return look, alike, noises
+        now, others = gross.without(look.now), [of for _, of in look.ranked if of is not gross.of]
+        beside = Look(look.found, now, list(zip(self.peaks(now, others), others, strict=True)))
+        return beside, _likeliest(self.likelihood, now, beside.ranked, self.count)[0] or alike, []
+
+    def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
+        """Leave out a noise if the others, exchanged for faults of their kinds, explain as much.
+
+        Positions that are too large, which look as precise as they are large, may be speeds too small.
+        """
+        for noise in found:
+            rest = [self._widened(each, tried) for each in found if each is not noise]
+            if noise.supposed.of.kind in NOISES and rest:
+                instead = self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
+                if self._score(instead) > self._score(found):
+                    return instead
+        return []
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
-        """Let all faults of a cause's kind contend with it: fixes in feet may be speeds that are not."""
+        """Let all faults of a cause's kind contend with it as well."""
         kind = found.supposed.of.kind
-        return found._replace(contenders=[of for of in tried if of.kind == kind and _is_physical(of)])
+        alike = [of for of in tried if of.kind == kind and _is_physical(of)]
+        return found._replace(contenders=[*found.contenders, *alike])
 
-    def _without_noise(
-        self, ranked: Sequence[Named], found: Sequence[Found], noises: Sequence[Named]
-    ) -> list[Found]:
+    def _score(self, found: Sequence[Found]) -> float:
+        """Compute the log-likelihood of the log without causes, less what their numbers cost."""
+        [explained] = self.likelihood([self.without(found)])
+        return explained - NUMBER_COST * sum(len(each.supposed.numbers) for each in found)
+
+    def _with(self, look: Look, alike: Names) -> list[Found]:
+        """Add the likeliest cause, and fit it together with the others."""
+        (at, of), *_ = alike
+        contenders = [
+            other
+            for gained, other in look.physical
+            if gained.gain > CONTENDS * at.gain and other is not of
+        ]
+        rivals = _with_rival(gains_over(self.likelihood, look.now), alike[0], least_gain(self.count))
+        return self._together([*look.found, Found([*rivals, *alike[1:]], look.now, contenders)])
+
+    def _without_noise(self, look: Look, noises: Sequence[Named]) -> list[Found]:
         """Find causes that explain as much as a noise or outliers do; none if there are none.
 
         What is left out of a model looks like noise that is stated too small, and large parts of it like
         outliers.
         """
+        if not noises:
+            return []
         noise = max(at.score(of) for at, of in noises)
-        physical = [(at, of) for at, of in ranked if _is_physical(of)]
-        [before] = self.likelihood([self.without(found)])
-        own, faults = [at for at, _ in physical], [of for _, of in physical]
-        instead, _ = self.more(faults, own, found, target=before + noise)
-        [after] = self.likelihood([self.without(instead)])
-        cost = NUMBER_COST * sum(len(each.supposed.numbers) for each in instead[len(found) :])
-        return instead if after - before - cost >= noise else []
+        [before] = self.likelihood([self.without(look.found)])
+        peaks, faults = [at for at, _ in look.physical], [of for _, of in look.physical]
+        instead, _ = self.more(faults, peaks, look.found, target=before + noise)
+        if self._score(instead) < self._score(look.found) + noise:
+            return []
+        # with the others undone, a noise or a fault of the same kind may explain more than a cause does
+        own = [of for _, of in noises]
+        wide = [self._widened(each, faults) for each in instead]
+        return self._together([each._replace(contenders=[*each.contenders, *own]) for each in wide])
 
-    def _hidden(self, ranked: Sequence[Named], found: Sequence[Found]) -> list[Found]:
+    def _hidden(self, look: Look) -> list[Found]:
         """Add a cause that gains enough only if those that are found are fitted again beside it."""
-        [before] = self.likelihood([self.without(found)])
+        if not look.found:
+            return []
+        known = [each.names[0] for each in look.found]
         some = [
-            (at, of)
-            for at, of in sorted(ranked, key=lambda pair: -pair[0].gain)
-            if _is_physical(of) and of.tried and at.gain > HIDDEN * least_gain(self.count, of.size)
+            (promised(self.likelihood, self.base, [*known, (at, of)]), at, of)
+            for at, of in look.physical
+            if of.tried and at.gain > HIDDEN * least_gain(self.count, of.size)
         ]
-        for at, of in some[: len(found)]:
-            faults = [*(each.supposed for each in found), Supposed(of, at.value)]
+        for most, at, of in sorted(some, key=lambda each: -each[0])[:1]:
+            if most < least_gain(self.count, of.size):
+                continue
+            faults = [*(each.supposed for each in look.found), Supposed(of, at.value)]
             fitted = fit(self.likelihood, self.base, faults)
             *others, own = fitted.faults
-            most = Peak(own.value, fitted.log_likelihood - before)
+            [before] = self.likelihood([self.without(look.found)])
+            gains = Peak(own.value, fitted.log_likelihood - before)
             now = undone(self.base, others)
-            alike, _ = _likeliest(self.likelihood, now, [most], [of], self.count)
+            alike, _ = _likeliest(self.likelihood, now, [(gains, of)], self.count)
             if alike:
-                return [*found, Found(alike, now)]
+                return self._together([*look.found, Found(alike, now)])
         return []
 
     def _together(self, found: Sequence[Found]) -> list[Found]:
@@ -319,28 +386,62 @@ class _Search:
             each._replace(names=[(each.names[0][0]._replace(value=own.value), own.of), *each.names[1:]])
             for each, own in zip(found, fitted.faults, strict=True)
         ]
-        least = int(np.argmin(fitted.losses))
-        enough = least_gain(self.count, fitted.faults[least].of.size)
-        if fitted.losses[least] < 2.0 * enough:  # by a parabola
-            rest = [*found[:least], *found[least + 1 :]]
-            of_rest = fit(self.likelihood, self.base, [each.supposed for each in rest])
-            if fitted.log_likelihood - of_rest.log_likelihood < enough:
-                return self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
+        if (rest := self._needed(found, fitted)) != found:
+            return self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
         for place, each in enumerate(found):
-            others = [*found[:place], *found[place + 1 :]]
-            taken = {id(of) for other in others for _, of in other.names}
-            free = [(Peak(0.0, 0.0), of) for of in each.contenders if id(of) not in taken]
-            own = _faults([*each.names, *free])
-            if len(own) < 2:
-                continue
-            nearest, main = self._nearest(self.without(others), own), each.names[0][1]
-            if all(of is not main for _, of in nearest):
-                found[place] = Found(nearest, self.base, own)
+            found[place] = self._likelier(found, place, fitted.log_likelihood)
+            if found[place].supposed.of is not each.supposed.of:
                 return self._together(found)
-            rivals = [pair for pair in each.names[1:] if pair[1] is main]
-            names = [each.names[0], *rivals, *(pair for pair in nearest if pair[1] is not main)]
-            found[place] = each._replace(names=names)
         return found
+
+    def _needed(self, found: list[Found], fitted: Fit) -> list[Found]:
+        """Leave out a cause that the others make superfluous, or whose number is no estimate."""
+        if False in fitted.are_estimates:
+            place = fitted.are_estimates.index(False)
+            return [*found[:place], *found[place + 1 :]]
+        place = int(np.argmin(fitted.losses))
+        rest = [*found[:place], *found[place + 1 :]]
+        enough = least_gain(self.count, fitted.faults[place].of.size)
+        if fitted.losses[place] >= 2.0 * enough:  # by a parabola
+            return found
+        of_rest = fit(self.likelihood, self.base, [each.supposed for each in rest])
+        return rest if fitted.log_likelihood - of_rest.log_likelihood < enough else found
+
+    def _likelier(self, found: Sequence[Found], place: int, log_likelihood: float) -> Found:
+        """Exchange a cause for a contender if that explains more when all are fitted again.
+
+        `log_likelihood` is that of the log without those that are found.
+        """
+        each, before, after = found[place], found[:place], found[place + 1 :]
+        others = [*before, *after]
+        taken = {id(of) for other in others for _, of in other.names}
+        (at, main), *known = each.names
+        free = [(Peak(0.0, 0.0), of) for of in each.contenders if id(of) not in taken]
+        own = [of for of in _faults([*known, *free]) if of is not main]
+        if not own:
+            return each
+        now = self.without(others)
+        [without] = self.likelihood([now])
+        near = [(at._replace(gain=log_likelihood - without), main)]
+        least = near[0][0].score(main) - RIVAL
+        for most, of in zip(self.peaks(now, own), own, strict=True):
+            beside = [*(other.names[0] for other in others), (most, of)]
+            reached = promised(self.likelihood, self.base, beside) if most.gain > 0.0 else -np.inf
+            if most._replace(gain=reached).score(of) < least:
+                continue
+            faults = [other.supposed for other in others]
+            faults.insert(place, Supposed(of, most.value))
+            fitted = fit(self.likelihood, self.base, faults)
+            if fitted.are_estimates[place]:
+                value, gain = fitted.faults[place].value, fitted.log_likelihood - without
+                near.append((most._replace(value=value, gain=gain), of))
+        alike = _alike(sorted(near, key=lambda pair: -pair[0].score(pair[1])))
+        (best, first), least = alike[0], near[0][0].score(main) + CLEARLY
+        if all(of is not main for _, of in alike) or best.score(first) > least:
+            return Found(alike, self.base, [main, *own])
+        rivals = [pair for pair in known if pair[1] is main]
+        different = [pair for pair in alike if pair[1] is not main]
+        return each._replace(names=[near[0], *rivals, *different])
 
     def _nearest(self, now: Trial, faults: Sequence[Hypothesis]) -> Names:
         """Return the fault that gains most over a trial, and what the log does not tell from it."""
@@ -349,10 +450,23 @@ class _Search:
 
     def _alone(self, found: Found) -> Found:
         """Return a cause with what it gains if it is the only one."""
-        return Found(self._nearest(self.base, _faults(found.names)), self.base)
+        known = [(Peak(0.0, 0.0), of) for of in found.contenders]
+        faults = _faults([*found.names, *known])
+        return Found(self._nearest(self.base, faults), self.base, faults)
 
     def causes(self, found: Sequence[Found]) -> list[Cause]:
-        """Return the causes with gains and intervals: of several by fits of all of them."""
+        """Return the causes with gains and intervals; what has no end of its interval is not named."""
+        causes = self._estimated(found)
+        ended = [each for each, cause in zip(found, causes, strict=True) if cause.has_ends]
+        if len(ended) < len(found):
+            return self.causes(self._together(ended) if len(ended) > 1 else [*map(self._alone, ended)])
+        return [
+            each._replace(others=tuple(other for other in each.others if other.has_ends))
+            for each in causes
+        ]
+
+    def _estimated(self, found: Sequence[Found]) -> list[Cause]:
+        """Compute gains and intervals of causes: of several by fits of all of them."""
         if len(found) < 2:
             alone = [_causes(gains_over(self.likelihood, each.over), each.names) for each in found]
             return [first._replace(others=tuple(others)) for first, *others in alone]
@@ -395,11 +509,7 @@ def _is_physical(of: Hypothesis) -> bool:
 
 
 def _likeliest(
-    likelihood: Likelihood,
-    now: Trial,
-    peaks: Sequence[Peak],
-    candidates: Sequence[Hypothesis],
-    count: int,
+    likelihood: Likelihood, now: Trial, pairs: Names, count: int
 ) -> tuple[Names, list[Named]]:
     """Find the hypothesis that gains most, not by chance, and those the log does not tell from it.
 
@@ -428,7 +538,7 @@ def _likeliest(
         return False
 
     ranked = sorted(
-        ((at, each) for at, each in zip(peaks, candidates, strict=True) if _is_named(at, each, count)),
+        ((at, of) for at, of in pairs if _is_named(at, of, count)),
         key=lambda pair: -pair[0].score(pair[1]),
     )
     place = next((place for place, pair in enumerate(ranked) if is_sure(pair)), None)
@@ -443,27 +553,29 @@ def _takes_all(at: Peak, of: Hypothesis) -> bool:
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
-def _companion(
-    likelihood: Likelihood, now: Trial, peaks: Sequence[Peak], candidates: Sequence[Hypothesis]
-) -> Supposed | None:
+def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | None:
     """Find one of two gross faults which gain more together than any noise does; None without.
 
-    Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
-    none may gain by itself what it is worth.
+    Of two gross faults none may gain by itself what it is worth. So the likeliest are tried with all
+    others, and special numbers, such as the factors of units, with one another.
     """
     supposed, most = list[Supposed](), 0.0
-    for at, of in zip(peaks, candidates, strict=True):
+    for at, of in ranked:
         if not _is_physical(of):
             most = max(most, at.gain)
         else:
             values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
             supposed += [Supposed(of, value) for value in values]
     alone = np.array(gains_over(likelihood, now)(supposed))
+    order = np.argsort(-alone, kind="stable").tolist()
     best, found = most, None
-    for place in np.argsort(-alone, kind="stable")[:LEADING]:
+    for rank, place in enumerate(order):
         leading = supposed[place]
-        others = [each for each in supposed if each.of is not leading.of]
-        gains = gains_over(likelihood, leading.without(now))(others)
+        others = [supposed[each] for each in order[rank + 1 :]]
+        if rank >= LEADING:
+            others = [each for each in others if each.is_special] if leading.is_special else []
+        others = [each for each in others if each.of is not leading.of]
+        gains = gains_over(likelihood, leading.without(now))(others) if others else []
         together = alone[place] + max(gains, default=-np.inf)
         if together > best:
             best, found = float(together), leading
@@ -494,7 +606,7 @@ def _takes_back(pair: Named) -> bool:
     return of.already > 0.0 > at.value and not _is_early(pair)
 
 
-def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> list[Peak]:
+def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int, least: float) -> list[Peak]:
     """Find the greatest gain of each; all are searched side by side."""
     greatest = 0.0
 
@@ -504,7 +616,10 @@ def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> l
         greatest = max([greatest, *found])
         return found
 
-    searches = [peak(each, least_gain(count, each.size), lambda: greatest) for each in candidates]
+    floors = [max(least_gain(count, each.size), least) for each in candidates]
+    searches = [
+        peak(each, floor, lambda: greatest) for each, floor in zip(candidates, floors, strict=True)
+    ]
     return side_by_side(searches, noting)
 
 

@@ -13,12 +13,23 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
-from fuselog.pipeline.diagnosing.search import ROOT_95, Peak, end, side_by_side
+from fuselog.pipeline.diagnosing.search import ROOT_95, WIDE, Peak, end, side_by_side
 from fuselog.pipeline.tuning.confidence import confidence
-from fuselog.pipeline.tuning.search import Coordinates, Free, coordinates_of, curvature, least
+from fuselog.pipeline.tuning.search import (
+    CURVATURE_STEP,
+    LEAST_GAIN,
+    UNIT,
+    Coordinates,
+    Free,
+    coordinates_of,
+    curvature,
+    least,
+)
 from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
+TINY, OFF = 1e-6, 2e-3  # of a number: how far a jump is seen from, and how far a search begins from it
+NEAR = 1e-3  # of a number or its limit: how far off nothing may depend on it, or it may be at its limit
 TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything
 
 
@@ -31,6 +42,11 @@ class Supposed(NamedTuple):
     def without(self, trial: Trial) -> Trial:
         """Return the trial without the fault."""
         return self.of.without(trial, self.value)
+
+    @property
+    def is_special(self) -> bool:
+        """Tell whether the number is one that is tried as it is."""
+        return self.value in self.of.specials
 
     @property
     def numbers(self) -> list[float]:
@@ -59,6 +75,8 @@ class Fit(NamedTuple):
         log_likelihood: of the log without the faults.
         losses: by fault, what the log-likelihood loses without it, all others refitted, as the curvature
             has it; infinite if the fault has no number.
+        are_estimates: whether the numbers of a fault are estimates: not if the search ended at their
+            limit, or if nothing depends on them.
         ends: by fault, the ends of the 95 % profile-likelihood intervals of its numbers. If the search
             did not converge they are NaN.
     """
@@ -66,6 +84,7 @@ class Fit(NamedTuple):
     faults: Sequence[Supposed]
     log_likelihood: float
     losses: Sequence[float]
+    are_estimates: Sequence[bool]
     ends: Sequence[tuple[Number, Number]] = ()
 
 
@@ -82,19 +101,22 @@ def fit(
     """
     together = _Together(likelihood, base, faults)
     unknown = [(value, value) for value in together.values(np.full(len(together.start), np.nan))]
+    start = together.beside_jumps()
     try:
-        coordinates = coordinates_of(together.cost, together.free, together.start)
-        begin = coordinates.of(together.start)
+        coordinates = coordinates_of(together.cost, together.free, start)
+        begin = coordinates.of(start)
         point, has_converged = least(
             together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
         )
     except BadInput:  # nothing depends on one of the numbers
         [found] = likelihood([undone(base, faults)])
-        return Fit(faults, found, [np.inf] * len(faults), unknown)
-    bent = curvature(together.cost, coordinates, point, range(len(point)))
+        is_free = ~(together.is_flat(start) | together.at_limits(start))
+        are_estimates = [bool(is_free[own].all()) for own in together.places]
+        return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
+    bent = curvature(together.cost, coordinates, point, range(len(point)), 1.0 / UNIT)
     is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
-    losses, ends = [np.inf] * len(faults), unknown
-    if has_converged and is_top and not coordinates.at_bounds(point).any():
+    losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
+    if has_converged and is_top and not at_bounds.any():
         covariance = confidence(range(len(point)), bent).covariance
         losses = [_loss(point[own], covariance[np.ix_(own, own)]) for own in together.places]
         if has_ends:
@@ -105,7 +127,33 @@ def fit(
     [cost] = together.cost(numbers[None])
     values = together.values(numbers)
     fitted = [each._replace(value=value) for each, value in zip(faults, values, strict=True)]
-    return Fit(fitted, -float(cost), losses, ends)
+    are_estimates = [not bool(at_bounds[own].any()) for own in together.places]
+    return Fit(fitted, -float(cost), losses, are_estimates, ends)
+
+
+def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
+    """Compute what the last of several faults gains if all are fitted again, by the curvature.
+
+    That is its gain beside the others as they are, and WIDE times that of one step of a search from
+    there: more is not hoped for. It is infinite if the log-likelihood does not bend downwards.
+    """
+    together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
+    steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
+    coordinates = Coordinates(together.free, steps / CURVATURE_STEP)
+    point, apart = coordinates.of(together.start), CURVATURE_STEP * np.eye(len(steps))
+    bent = curvature(together.cost, coordinates, point, range(len(point)))
+    if not np.isfinite(bent).all() or (len(bent) and np.linalg.eigvalsh(bent)[0] <= 0.0):
+        return np.inf
+    costs = together.cost(coordinates.values(np.concatenate([point + apart, point - apart])))
+    slopes = np.subtract(*np.split(costs, 2)) / (2.0 * CURVATURE_STEP)
+    return faults[-1][0].gain + 0.5 * WIDE * float(slopes @ np.linalg.solve(bent, slopes))
+
+
+def _errors(at: Peak, of: Hypothesis) -> Floats:
+    """Return about the standard errors of the numbers (m,) of a fault that gains most."""
+    if not of.tried or of.size > 1:
+        return np.array(of.tried[0] if of.tried else (), float)
+    return np.array([abs(at.value) / (2.0 * max(at.gain, 1.0)) ** 0.5])
 
 
 class _Together:
@@ -116,9 +164,10 @@ class _Together:
         self.start = np.array([number for each in faults for number in each.numbers])
         places = iter(range(len(self.start)))
         self.places = [[next(places) for _ in each.numbers] for each in faults]
+        limits = [each.of.limit if each.of.has_end else np.inf for each in faults]
         self.free = [
-            Free(each.of.name, number, -each.of.limit, each.of.limit, is_positive=False)
-            for each in faults
+            Free(each.of.name, number, -limit, limit, is_positive=False)
+            for each, limit in zip(faults, limits, strict=True)
             for number in each.numbers
         ]
 
@@ -136,6 +185,31 @@ class _Together:
             for point in points
         ]
         return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
+
+    def is_flat(self, point: Floats) -> NDArray[np.bool_]:
+        """Tell of which numbers (k,) nothing depends near a point (k,)."""
+        apart = np.diag(np.maximum(np.abs(point), 1.0) * NEAR)
+        here, *costs = self.cost(np.concatenate([point[None], point + apart, point - apart]))
+        return np.all(np.reshape(costs, (2, -1)) == here, axis=0)
+
+    def at_limits(self, point: Floats) -> NDArray[np.bool_]:
+        """Tell which numbers (k,) of a point (k,) are at the limit of what is searched."""
+        limits = np.array([each.high for each in self.free])
+        return np.abs(point) >= (1.0 - NEAR) * limits
+
+    def beside_jumps(self) -> Floats:
+        """Return the start (k,), a little off where the log-likelihood jumps.
+
+        A delay moves the first message or the last out of the log; slopes across a jump say nothing.
+        """
+        start = self.start.copy()
+        apart = np.diag(TINY * start)
+        here, *costs = self.cost(np.concatenate([start[None], start + apart, start - apart]))
+        above, below = np.split(np.array(costs), 2)
+        jumps = np.maximum(np.abs(above - here), np.abs(below - here)) > LEAST_GAIN
+        way = np.where(above < below, 1.0, -1.0) * np.sign(start)
+        start[jumps] += (OFF * way * np.maximum(np.abs(start), 1.0))[jumps]
+        return start
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
@@ -169,11 +243,12 @@ def _at_specials(
     ends: tuple[Floats, Floats],
 ) -> Floats:
     """Take special values, such as the factor of a unit, if they are within the intervals."""
+    specials = dict[int, float]()
     for own, each in zip(together.places, together.faults, strict=True):
         for place in own[: each.of.size == 1]:
             low, high = (every[place] for every in ends)
-            special = next((at for at in each.of.specials if low < at < high), None)
-            if special is not None:
-                apart = special / coordinates.units[place] - point[place]
-                point = point + apart * covariance[:, place] / covariance[place, place]
-    return point
+            within = [at / coordinates.units[place] for at in each.of.specials if low < at < high]
+            specials.update((place, at) for at in within[:1])
+    places = list(specials)
+    apart = np.array([*specials.values()]) - point[places]
+    return point + covariance[:, places] @ np.linalg.solve(covariance[np.ix_(places, places)], apart)

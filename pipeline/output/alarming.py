@@ -5,7 +5,7 @@ limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error tha
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,44 @@ RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
 LARGEST = 1e300  # as JSON has no infinity
 # Squared errors so many times too large are no matter of covariances: 10,000 standard deviations.
 DIVERGED = 1e8
+OF_DIVERGENCE = "it diverged, or its covariances are of another unit"
 UNUSED = 0.05  # of a topic's messages
+
+
+class _Range(NamedTuple):
+    """Holds NIS or NEES and the limits within which a consistent filter has it."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_within(self) -> bool:
+        """Tell whether a consistent filter has it."""
+        return not (self.value < self.low or self.value > self.high)
+
+    @property
+    def has_diverged(self) -> bool:
+        """Tell whether it is no matter of covariances."""
+        return self.value > DIVERGED * self.high
+
+    @property
+    def excess(self) -> float:
+        """Return how many times it is beyond a limit."""
+        beyond = self.value / self.high if self.value > self.high else self.low / max(self.value, 1e-9)
+        return min(beyond, LARGEST)
+
+    @property
+    def limits(self) -> str:
+        """Return the limits in words."""
+        return f"where a consistent filter is within {self.low:.3g} and {self.high:.3g}"
+
+    @property
+    def reason(self) -> str:
+        """Return what it says of the estimator."""
+        if self.has_diverged:
+            return OF_DIVERGENCE
+        return f"its covariances are too {'small' if self.value > self.high else 'large'}"
 
 
 def alarms_of(
@@ -43,7 +80,16 @@ def alarms_of(
     """
     uninformed = [*_of_components(judge)]
     explained = {(each.estimator, each.case) for each in uninformed}
-    inconsistent = [*_of_innovations(judge, parameters), *_of_errors(judge)]
+    nis, nees = _nis(judge), _nees(judge)
+    diverged = {
+        what: nees[what]
+        for what in nis.keys() & nees.keys()
+        if nis[what].has_diverged or nees[what].has_diverged
+    }
+    inconsistent = [
+        *_of_innovations(judge, parameters, nis, diverged),
+        *_of_errors(judge, nees, diverged),
+    ]
     found = [
         *uninformed,
         *(each for each in inconsistent if (each.estimator, each.case) not in explained),
@@ -66,8 +112,38 @@ def _of_components(judge: Judge) -> Iterator[Alarm]:
         yield Alarm("uninformed", estimator, case, LARGEST, words)
 
 
-def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
-    """Find a gate that keeps out too much, and NIS that is beyond its interval."""
+def _nis(judge: Judge) -> dict[tuple[str, str], _Range]:
+    """Return the NIS per component of estimators and cases where it is beyond its limits."""
+    found = {}
+    for topic, innovations in judge.innovations.items():
+        sums = innovations.total
+        limits = chi_square_interval(max(sums.degrees, 1), 1, CONSISTENT)
+        if sums.degrees:
+            found[split_topic(topic)] = _Range(*(np.array([sums.squared, *limits]) / sums.degrees))
+    return {what: each for what, each in found.items() if not each.is_within}
+
+
+def _nees(judge: Judge, quantity: str = "nees") -> dict[tuple[str, str], _Range]:
+    """Return the NEES of estimators and cases where it is beyond its limits."""
+    intervals, found = judge.intervals(CONSISTENT), {}
+    for topic in judge.judged:
+        estimator, case = split_topic(topic)
+        key = metric_key(estimator, quantity, case)
+        if key in intervals:
+            found[estimator, case] = _Range(judge.metrics[key], *intervals[key])
+    return {what: each for what, each in found.items() if not each.is_within}
+
+
+def _of_innovations(
+    judge: Judge,
+    parameters: Mapping[str, Mapping[str, Any]],
+    nis: Mapping[tuple[str, str], _Range],
+    diverged: Mapping[tuple[str, str], _Range],
+) -> Iterator[Alarm]:
+    """Find a gate that keeps out too much, and NIS that is beyond its interval.
+
+    With the NEES of those that diverged: what one of the two says holds of the other.
+    """
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
         estimator, case = split_topic(topic)
@@ -85,47 +161,43 @@ def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -
             )
         if not sums.accepted and sums.messages:
             facts.append("its log-likelihood is that of no measurement")
-        low, high = chi_square_interval(max(sums.degrees, 1), 1, CONSISTENT)
-        if sums.degrees and (sums.squared < low or sums.squared > high):
-            nis, low, high = (each / sums.degrees for each in (sums.squared, low, high))
-            excess = max(excess, _beyond(nis, low, high))
-            facts.append(f"NIS is {nis:.3g} per component, {_expected(nis, low, high)}")
+        if own := nis.get((estimator, case)):
+            excess = max(excess, own.excess)
+            facts.append(f"NIS is {own.value:.3g} per component, {own.limits}")
+            if nees := diverged.get((estimator, case)):
+                excess = max(excess, nees.excess)
+                facts.append(f"NEES is {nees.value:.3g}, {nees.limits}")
+            facts[-1] += f": {OF_DIVERGENCE if nees else own.reason}"
         if facts:
             words = f"{_name(estimator, case)}: {'; '.join(facts)}; "
             words += f"fuselog diagnose LOG -e {estimator} says why"
             yield Alarm("innovations", estimator, case, excess, words)
 
 
-def _of_errors(judge: Judge) -> Iterator[Alarm]:
-    """Find NEES beyond its interval; of positions whose error stays, that."""
-    metrics, intervals, constants = judge.metrics, judge.intervals(CONSISTENT), judge.constants
+def _of_errors(
+    judge: Judge,
+    nees: Mapping[tuple[str, str], _Range],
+    diverged: Mapping[tuple[str, str], _Range],
+) -> Iterator[Alarm]:
+    """Find NEES beyond its interval, if none diverged; of positions whose error stays, that."""
+    constants, positions = judge.constants, _nees(judge, "position_nees")
     for topic in judge.judged:
         what = estimator, case = split_topic(topic)
-        of_position = metric_key(estimator, "position_nees", case)
-        of_state = metric_key(estimator, "nees", case)
-        for key in (of_position, of_state):
-            if key not in intervals:
-                continue
-            nees, (low, high) = metrics[key], intervals[key]
-            if not (nees < low or nees > high):
-                continue
-            if what in constants and nees > high:
-                yield _of_constant(estimator, case, constants[what])
-            elif key == of_state:
-                words = f"{_name(*what)}: NEES is {nees:.3g}, {_expected(nees, low, high)}"
-                words += _of_one_run(judge, estimator, case)
-                if (lacking := judge.unestimated.get(what)) and nees > high:
-                    more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
-                    words += (
-                        f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "
-                        "can, the setting estimate adds them to the state"
-                    )
-                if any(split_topic(each)[0] == estimator for each in judge.innovations):
-                    words += f"; fuselog diagnose LOG -e {estimator} says why"
-                yield Alarm("errors", estimator, case, _beyond(nees, low, high), words)
-            else:
-                continue
-            break
+        own, either = nees.get(what), (nees.get(what), positions.get(what))
+        if what in constants and any(each and each.value > each.high for each in either):
+            yield _of_constant(estimator, case, constants[what])
+        elif own and what not in diverged:
+            words = f"{_name(*what)}: NEES is {own.value:.3g}, {own.limits}: {own.reason}"
+            words += _of_one_run(judge, estimator, case)
+            if (lacking := judge.unestimated.get(what)) and own.value > own.high:
+                more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+                words += (
+                    f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "
+                    "can, the setting estimate adds them to the state"
+                )
+            if any(split_topic(each)[0] == estimator for each in judge.innovations):
+                words += f"; fuselog diagnose LOG -e {estimator} says why"
+            yield Alarm("errors", estimator, case, own.excess, words)
 
 
 def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
@@ -237,18 +309,6 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
             "--set gate_probability=1"
         )
         yield Alarm("gates", "", "", 1.0, words)
-
-
-def _expected(value: float, low: float, high: float) -> str:
-    if value > DIVERGED * high:
-        why = "it diverged, or its covariances are of another unit"
-    else:
-        why = f"its covariances are too {'small' if value > high else 'large'}"
-    return f"where a consistent filter is within {low:.3g} and {high:.3g}: {why}"
-
-
-def _beyond(value: float, low: float, high: float) -> float:
-    return min(value / high if value > high else low / max(value, 1e-9), LARGEST)
 
 
 def _percent(share: float) -> str:

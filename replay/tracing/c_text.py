@@ -116,9 +116,9 @@ class Precision(NamedTuple):
     def number(self, value: float) -> str:
         """Write a number, so that it is read as the same one."""
         if math.isnan(value):
-            return "NAN"
+            return f"({self.real})NAN"
         if math.isinf(value):
-            return "INFINITY" if value > 0.0 else "-INFINITY"
+            return f"({self.real})INFINITY" if value > 0.0 else f"-({self.real})INFINITY"
         text = repr(float(value))
         return f"{text}{'' if '.' in text or 'e' in text else '.0'}{self.ending}"
 

@@ -130,7 +130,7 @@ MIXTURES = ("hmm", "ergodic", "density-joint", "density-by-modality")
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 # searches, which their own tests hold to what is known
-SEARCHES = ("calibration", "diagnosis", "ellipsoid", "false-causes", "sensor-noise")
+SEARCHES = ("calibration", "diagnosis", "ellipsoid", "false-causes", "faults-together", "sensor-noise")
 RECIPES = {name: Recipe(name) for name in shipped("experiments") if name not in SEARCHES} | {
     "biometrics-bssr1": Recipe(
         "biometrics-bssr1",

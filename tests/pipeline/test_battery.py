@@ -33,6 +33,7 @@ from fuselog.pipeline.diagnosing.causes import find_causes, seek
 from fuselog.pipeline.diagnosing.consistency import judged_by_itself
 from fuselog.pipeline.diagnosing.findings import undone_by, without_filter
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.joint import Supposed, fit
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.recorders.log.planes import Origin
@@ -123,12 +124,40 @@ def test_pairs_and_triples_are_of_faults_that_a_log_tells_apart() -> None:
 
 
 @pytest.mark.paper
-def test_faults_at_once_are_named_with_values_in_their_intervals() -> None:
-    """A speed in feet with a wrong sign is no error of fixes with another variance."""
-    found = together.tried(("turn rate's sign", "speed x .3048"), 2100)
+@pytest.mark.parametrize(
+    "faults",
+    [
+        ("turn rate's sign", "speed x .3048"),  # no fixes too far apart with another variance
+        ("fixes .3 s late", "lever (2, .6) m"),  # an early odometry is likelier than either alone
+        ("fixes .3 s late", "lever (2, .6) m", "gyro bias .02"),
+        ("speed x 3.6", "degrees as radians"),  # either alone looks like outliers
+        ("speed x 3.6", "fix variance / 16"),  # no fixes and speeds of another scale
+    ],
+    ids=" + ".join,
+)
+def test_faults_at_once_are_named_with_values_in_their_intervals(faults: tuple[str, ...]) -> None:
+    found = together.tried(faults, 2100)
     assert found["are_named"], found["causes"]
-    assert found["within"] == found["values"] == 1, found["causes"]
+    assert found["within"] == found["values"], found["causes"]
     assert not found["is_noise_first"]
+    assert found["causes"].count(";") == len(faults) - 1
+
+
+def test_a_number_at_its_limit_or_without_effect_is_no_estimate() -> None:
+    log = recorded(faulty(SEED, "fix variance / 16"), has_prior=True)
+    likelihood, base = Likelihood("ekf"), Trial(log, OPEN)
+    tried = hypotheses(bind("ekf", [log], OPEN), base, likelihood.begin(base), likelihood.readings)
+    [noise] = [each for each in tried if (each.kind, each.topic) == ("measurement noise", FIX)]
+    [drift] = [each for each in tried if each.name == f"drifting bias {FIX} position_x_m"]
+    limited = replace(noise, limit=1.0)  # less than log(4)
+    idle = replace(drift, without=lambda trial, _: trial)
+    for first, second, are_estimates in (
+        (noise, drift, [True, True]),
+        (limited, drift, [False, True]),
+        (noise, idle, [True, False]),
+    ):
+        found = fit(likelihood, base, [Supposed(first, 0.9), Supposed(second, 1e-4)])
+        assert found.are_estimates == are_estimates, (first.limit, second.name)
 
 
 def test_faults_at_once_are_counted() -> None:

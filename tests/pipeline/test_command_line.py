@@ -872,12 +872,20 @@ def test_a_replay_whose_only_run_failed_fails_a_build(fuselog: Fuselog, tmp_path
 def test_errors_beyond_any_covariance_are_called_divergence(
     here: Path, fuselog: Fuselog, world: Path
 ) -> None:
-    """A hundred standard deviations are a matter of covariances, a hundred thousand are not."""
-    for sigma_m, why in ((1e-3, "its covariances are too small"), (1e-6, "it diverged")):
+    """A hundred standard deviations are a matter of covariances, a hundred thousand are not.
+
+    Then one sentence has NIS and NEES, so that it gives one reason.
+    """
+    small, far = "its covariances are too small", "it diverged"
+    for sigma_m, told in ((1e-3, [(small, 1), (small, 1)]), (1e-6, [(far, 2)])):
         own = ("--set", f"sigma_range_m={sigma_m}", "--set", "gate_probability=1")
         said = fuselog("replay", world / "log.mcap", "-e", "ekf", *own, "--out", here / "e.mcap")
         assert said.code == 0
-        assert [line for line in said.out.splitlines() if "NIS is" in line and why in line], said.out
+        lines = [line for line in said.out.splitlines() if "NIS is" in line or "NEES is" in line]
+        found = [
+            (why, line.count(" is within ")) for line in lines for why in (small, far) if why in line
+        ]
+        assert found == told, said.out
 
 
 def test_a_log_that_is_replaced_by_one_of_other_settings_is_named(

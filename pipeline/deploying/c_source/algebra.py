@@ -58,11 +58,11 @@ static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate
 static void forget(NAME_innovation *innovation)
 {
     for (int i = 0; i < NAME_INNOVATION; i++) {
-        innovation->difference[i] = NAN;
+        innovation->difference[i] = (REAL)NAN;
         for (int j = 0; j < NAME_INNOVATION; j++)
-            innovation->covariance[i][j] = NAN;
+            innovation->covariance[i][j] = (REAL)NAN;
     }
-    innovation->nis = NAN;
+    innovation->nis = (REAL)NAN;
     innovation->is_accepted = 0;
 }
 

@@ -1,5 +1,6 @@
 """Writes the source of a filter in C99 from the graphs of its steps."""
 
+import math
 import re
 
 from fuselog.pipeline.deploying.c_source.algebra import CHOLESKY
@@ -161,7 +162,8 @@ def _init(made: CFilter) -> str:
         for index, value in enumerate(control)
     )
     if made.is_interpolated:  # what drives it from the prior on is not known before its first message
-        driven = "".join(f"    filter->control[{index}] = NAN;\n" for index in range(len(control)))
+        unknown = made.precision.number(math.nan)
+        driven = "".join(f"    filter->control[{index}] = {unknown};\n" for index in range(len(control)))
         driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""
     return filled(
         made,

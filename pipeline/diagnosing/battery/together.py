@@ -14,13 +14,13 @@ from fuselog.pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case
 from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
 from fuselog.pipeline.diagnosing.causes import Cause, Estimated, seek
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import NOISES
+from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 
 TRIPLES = 40
 AXES = "E, N exchanged"
-MOST = 4  # causes: one more than are planted at most
 # What each fault is of. Two faults of one number hide one another, such as opposite factors.
 FIELDS: dict[str, Sequence[str]] = {
     "stamps of fixes": ("fixes .3 s late", "fixes 18 s late"),
@@ -67,7 +67,7 @@ def _is_told(faults: Sequence[str]) -> bool:
 def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
     """Plant faults, look for causes, and see which are named and whether intervals have the values."""
     log = recorded(faulty(seed, *faults), has_prior=True)
-    causes = seek(log, "ekf", OPEN, MOST).causes
+    causes = seek(log, "ekf", OPEN, MOST_SENTENCES).causes
     planted = [RIGHT[name][0] for name in faults]
     found = [_estimate(causes, right) for right in planted]
     values = [
