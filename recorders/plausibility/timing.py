@@ -144,8 +144,8 @@ def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -
     if len(x) < FEWEST:
         return 0.0
     x, y = x - np.mean(x), y - np.mean(y)
-    left = y - x * (x @ y) / max(x @ x, TINY)
-    persists = float(np.clip(left[1:] @ left[:-1] / max(left @ left, TINY), 0.0, 0.99))
+    left = y - x * (x @ y) / max(float(x @ x), TINY)
+    persists = float(np.clip(left[1:] @ left[:-1] / max(float(left @ left), TINY), 0.0, 0.99))
     return len(x) * (1.0 - persists) / (1.0 + persists)
 
 
