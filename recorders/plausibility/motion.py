@@ -13,7 +13,7 @@ import numpy as np
 from fuselog.recorders.models.orientation import heading
 from fuselog.recorders.models.planar import wrap_angle
 from fuselog.recorders.plausibility.body import Body, Floats, Series
-from fuselog.recorders.plausibility.timing import Timing, timing
+from fuselog.recorders.plausibility.timing import SURE, Timing, timing
 from fuselog.recorders.plausibility.windows import (
     FEWEST,
     Windows,
@@ -27,7 +27,6 @@ from fuselog.recorders.plausibility.windows import (
     turned,
 )
 
-SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
 LEAST_LAG_S = 0.15
 LONG_S = 1.0  # a lag that no body makes whose course is not where it heads
 CHORD = 1.3  # of the variance that `noise_of` finds: what noise adds to the square of a chord
@@ -180,7 +179,7 @@ class BodyMotion:
             late_s.setdefault(each.against, 0.0)
             own_s = late_s[each.against] - _sure_lag_s(each.timing)
             nearest_s = min(late_s.values(), key=lambda other_s: abs(own_s - other_s))
-            if self._goes_where_it_points(each):
+            if self.goes_where_it_points(each):
                 late_s[each.source] = own_s
             elif _sure_lag_s(each.timing) and abs(each.timing.likeness) > PLAIN:
                 late_s[each.source] = nearest_s if abs(own_s - nearest_s) < LONG_S else own_s
@@ -190,7 +189,7 @@ class BodyMotion:
         usual_s = sorted_s[(len(sorted_s) - 1) // 2]
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
-    def _goes_where_it_points(self, lag: Lag) -> bool:
+    def goes_where_it_points(self, lag: Lag) -> bool:
         """Tell whether forces in the body's axes are those of its course: then course is heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
@@ -225,7 +224,7 @@ class BodyMotion:
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
                 lag = each.timing
-                if lag.evidence > SURE and abs(lag.likeness) > ALIKE:
+                if lag.is_alone and lag.evidence > SURE and abs(lag.likeness) > ALIKE:
                     return source.moved(-lag.lag_s, lag.gain)
         return aligned
 
@@ -250,7 +249,8 @@ class BodyMotion:
     def turn(self, source: Series) -> Slope | None:
         """Return how much the course turns for each radian of a turn rate.
 
-        One that is like the course as it is needs no lag: half a period of a winding road is none.
+        One that is like the course as it is needs no lag: half a period of a winding road is none. If
+        several lags fit better than none, of which some turn it round, its sign is not known.
         """
         if self.courses is None:
             return None
@@ -258,8 +258,10 @@ class BodyMotion:
         for moved in (source, self.aligned(source), self.likened(source)):
             ratio = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
             if ratio.sign > 0:
-                break
-        return ratio
+                return ratio
+        lags = [each.timing for each in self.turn_lags if each.source == source.topic]
+        is_known = all(lag.is_alone or lag.evidence < SURE for lag in lags)
+        return ratio if is_known else None
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
         """Return how much a heading turns for each radian of a turn rate."""
@@ -350,5 +352,5 @@ def _hold_s(source: Series) -> float:
 def _sure_lag_s(lag: Timing) -> float:
     """Return the lag where it is one; a clock that gains has none."""
     is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
-    is_sure = lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
+    is_sure = lag.is_alone and lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
     return lag.lag_s if is_lag and is_sure else 0.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from fuselog.recorders.plausibility.body import Floats, PlaceSeries, Series
 from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import BodyMotion
+from fuselog.recorders.plausibility.motion import LONG_S, BodyMotion
 from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
@@ -61,12 +61,14 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
     for topic, late_s in motion.delays_s.items():
         if not late_s:
             continue
-        evidence = next(
-            f"the motion of {each.source} is most like that of {each.against} (correlation "
-            f"{abs(each.timing.likeness):.3f}) so"
+        lag = next(
+            each
             for each in (*motion.speed_lags, *motion.turn_lags)
             if topic in (each.source, each.against)
         )
+        # a lever arm or slip lets the course change before or after the heading
+        slips = lag in motion.turn_lags and not motion.goes_where_it_points(lag)
+        spread_s = max(lag.timing.spread_s, LONG_S if slips else 0.0)
         leap_s = next((s for s in LEAP_S if abs(abs(late_s) - s) < LEAP_TOLERANCE_S), None)
         value = late_s if leap_s is None else float(np.copysign(leap_s, late_s))
         why = "" if leap_s is None else f", and {LEAP_S[leap_s]}"
@@ -75,8 +77,9 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
             topic,
             "",
             value,
-            f"{topic}: its stamps are {abs(value):.3g} s {'late' if value > 0 else 'early'}: {evidence}"
-            f"{why}",
+            f"{topic}: its stamps are {abs(value):.3g} s {'late' if value > 0 else 'early'}, "
+            f"give or take {spread_s:.2g} s: the motion of {lag.source} is most like that of "
+            f"{lag.against} (correlation {abs(lag.timing.likeness):.3f}) so{why}",
             f"{topic}.delay_s",
             digits(value),
         )

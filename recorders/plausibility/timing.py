@@ -1,7 +1,7 @@
 """Finds when a topic's account of a motion is most like another's: by delay, and clock's gain."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,11 @@ LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
 FEW = 100  # windows at least by which a lag or a clock is sought: more of them overlap by half
 NEAR_S = 1.0  # a lag within it is as likely as all that are longer
+SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
+MISFIT = 0.02  # share of a motion that lever arms, slip and bends may leave unexplained at the right lag
+CHANGES = 4  # passes of a motion through its mean; with fewer a lever arm may look like a delay
+TINY = float(np.finfo(float).tiny)
+VARIES = 1e-6  # of its size, which a motion has to vary by to tell a time
 
 
 class Timing(NamedTuple):
@@ -24,6 +29,9 @@ class Timing(NamedTuple):
         likeness: the correlation there, -1 to 1.
         evidence: by how much the log-likelihood exceeds that without lag and gain.
         tolerance_s: up to which a lag counts as none.
+        spread_s: by how much lags that are as likely differ from it, with the tolerance.
+        is_alone: whether no lags but its neighbours explain the motion as well, as those do that are a
+            period of the motion away.
     """
 
     lag_s: float
@@ -31,6 +39,8 @@ class Timing(NamedTuple):
     likeness: float
     evidence: float
     tolerance_s: float
+    spread_s: float
+    is_alone: bool
 
 
 def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
@@ -51,17 +61,44 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     best = int(np.nanargmax(np.abs(near)))
     lag_s, likeness = float(fine_s[best]), float(near[best])
     gain, gained_s, gained = _gained(few, source, account)
-    if _evidence(count, gained, likeness) > max(10.0, 0.05 * count) and abs(gain) > 0.005:
+    telling = _telling(windows, source.moved(0.0, gain), account, gained_s)
+    if _evidence(telling, gained, likeness) > max(10.0, 0.05 * count) and abs(gain) > 0.005:
         lag_s, likeness = gained_s, gained
     else:
-        gain = 0.0
+        gain, telling = 0.0, _telling(windows, source, account, lag_s)
     zero_s = np.arange(-tolerance_s, tolerance_s + 0.5 * FINE_S, max(FINE_S, tolerance_s / 10.0))
     without = _likeness(windows, source, account, zero_s)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
-    evidence = _evidence(count * _share_within(windows, source, lag_s), likeness, usual)
+    evidence = float(_evidence(telling, likeness, usual))
     if abs(lag_s) > NEAR_S:  # some lag of so many is the best by chance
         evidence -= float(np.log(len(lags_s)))
-    return Timing(lag_s, gain, likeness, evidence, tolerance_s)
+    tried_s, tried = np.concatenate([lags_s, fine_s]), np.concatenate([coarse, near])
+    as_likely_s = tried_s[_evidence(telling, likeness, tried) < SURE]
+    spread_s = tolerance_s + float(np.max(np.abs(as_likely_s - lag_s), initial=FINE_S))
+    is_alone = _changes(windows) >= CHANGES and _is_one_peak(coarse, telling)
+    return Timing(lag_s, gain, likeness, evidence, tolerance_s, spread_s, is_alone)
+
+
+def _changes(windows: Windows) -> int:
+    """Count how often a motion passes through its mean."""
+    return int(np.count_nonzero(np.diff(windows.values > np.mean(windows.values))))
+
+
+def _is_one_peak(likeness: Floats, count: float) -> bool:
+    """Tell whether the lags that explain about as much are neighbours, and none of the first or last.
+
+    A peak between two lags is as high as the parabola through three says.
+    """
+    size = np.abs(likeness)
+    below, above = size[1:-1] - size[:-2], size[1:-1] - size[2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rise = (below - above) ** 2 / (8.0 * (below + above))
+    size[1:-1] += np.where((below >= 0.0) & (above >= 0.0) & (below + above > 0.0), rise, 0.0)
+    size = np.minimum(size, 1.0)
+    as_good = np.flatnonzero(_evidence(count, np.nanmax(size), size, MISFIT) < SURE)
+    known = np.flatnonzero(np.isfinite(size))
+    is_within = known[0] < as_good[0] and as_good[-1] < known[-1]
+    return bool(is_within and as_good[-1] - as_good[0] + 1 == len(as_good))
 
 
 def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
@@ -87,16 +124,29 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
         x, y = np.where(is_in, moves, 0.0), np.where(is_in, windows.values, 0.0)
         x = np.where(is_in, x - (x.sum(axis=1) / count)[:, None], 0.0)
         y = np.where(is_in, y - (y.sum(axis=1) / count)[:, None], 0.0)
-        found = np.sum(x * y, axis=1) / np.sqrt(np.sum(x * x, axis=1) * np.sum(y * y, axis=1))
-    return np.where(count >= max(FEWEST, 0.5 * len(windows)), found, np.nan)
+        xx = np.sum(x * x, axis=1)
+        found = np.sum(x * y, axis=1) / np.sqrt(xx * np.sum(y * y, axis=1))
+        varies = xx > VARIES**2 * np.sum(np.where(is_in, moves, 0.0) ** 2, axis=1)
+    return np.where(varies & (count >= max(FEWEST, 0.5 * len(windows))), found, np.nan)
 
 
-def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
-    """Compute the share of windows in the source's span when they are earlier by the lag."""
-    is_within = (windows.begin_s - lag_s >= source.times_s[0]) & (
-        windows.end_s - lag_s <= source.times_s[-1]
-    )
-    return float(is_within.mean())
+def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
+    """Count the windows that tell independently of one another.
+
+    They do not overlap, and are fewer if what the lag leaves unexplained persists from one to the next,
+    as the motion of a lever arm does: by how much follows from a first-order autoregression.
+    """
+    span_s = float(np.median(windows.end_s - windows.begin_s))
+    _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)
+    moves = account(source, windows.begin_s[first] - lag_s, windows.end_s[first] - lag_s)
+    is_in = np.isfinite(moves)
+    x, y = moves[is_in], windows.values[first][is_in]
+    if len(x) < FEWEST:
+        return 0.0
+    x, y = x - np.mean(x), y - np.mean(y)
+    left = y - x * (x @ y) / max(float(x @ x), TINY)
+    persists = float(np.clip(left[1:] @ left[:-1] / max(float(left @ left), TINY), 0.0, 0.99))
+    return len(x) * (1.0 - persists) / (1.0 + persists)
 
 
 def _independent(windows: Windows) -> int:
@@ -105,7 +155,7 @@ def _independent(windows: Windows) -> int:
     return len(np.unique(np.floor(windows.begin_s / span_s)))
 
 
-def _evidence(count: float, likeness: float, usual: float) -> float:
-    """Compute how much likelier one correlation is than another, of so many Gaussian pairs."""
-    rest, before = (max(1.0 - each * each, 1e-9) for each in (likeness, usual))
-    return 0.5 * count * float(np.log(before / rest))
+def _evidence(count: float, likeness: float, usual: Any, misfit: float = 1e-9) -> Any:
+    """Compute how much likelier one correlation is than others, of so many Gaussian pairs."""
+    rest, before = (np.maximum(1.0 - np.square(each), misfit) for each in (likeness, usual))
+    return 0.5 * count * np.log(before / rest)

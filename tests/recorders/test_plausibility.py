@@ -1,5 +1,6 @@
 """What logs say of their faults without a filter: the sheet of sensors, sections 3 and 5."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
@@ -80,6 +81,62 @@ def test_a_winding_road_at_a_steady_speed_says_nothing() -> None:
     for seed in (0, 1, 4, 7, 18, 24):
         odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
         assert not findings({each.topic: each for each in (odometry, fix)})
+
+
+def winding(seed: int, period_s: float, late_s: float, speed_period_s: float) -> dict[str, Stream]:
+    """Wheels, and late fixes of an antenna on a lever arm; infinite periods make a random drive."""
+    rng, step_s, rows = np.random.default_rng(seed), 0.05, 1200
+    time_s = step_s * np.arange(rows)
+    phase, (turns, speeds) = rng.uniform(0.0, 2.0 * np.pi), rng.normal(size=(2, 32))
+    turn = 0.3 * np.sin(2.0 * np.pi * time_s / period_s + phase)
+    speed = 3.0 + 0.8 * np.sin(2.0 * np.pi * time_s / speed_period_s) * np.isfinite(speed_period_s)
+    if np.isinf(period_s):
+        turn = 0.3 * np.interp(time_s, 2.0 * np.arange(32), turns)
+        speed = 4.0 + 0.8 * np.interp(time_s, 2.0 * np.arange(32), speeds)
+    heading = np.cumsum(step_s * turn) - step_s * turn
+    along = step_s * np.cumsum(speed * np.exp(1j * heading)) - step_s * speed * np.exp(1j * heading)
+    seen = (along + (1.0 + 0.5j) * np.exp(1j * heading))[::4]
+    place = np.stack([seen.real, seen.imag], axis=1) + 0.02 * rng.normal(size=(len(seen), 2))
+    stamps_ns = np.rint(1e9 * (100.0 + time_s)).astype(np.int64)
+    wheels = {
+        "forward_mps": speed + 0.02 * (seed % 2) * rng.normal(size=rows),
+        "turn_radps": turn + 0.005 * rng.normal(size=rows),
+    }
+    spread = np.tile(4e-4 * np.eye(2).ravel(), (len(seen), 1))
+    fixes = {"position_m": place, "covariance_m2": spread}
+    return {
+        "/wheels": make_stream("/wheels", schemas.ODOMETRY, stamps_ns, **wheels),
+        "/fix": make_stream("/fix", schemas.POSITION_FIX, stamps_ns[::4] + round(1e9 * late_s), **fixes),
+    }
+
+
+PERIODS_S = [(3.0, np.inf), (3.0, 3.0), (6.0, 7.0), (15.7, np.inf), (15.7, 15.7), (np.inf, np.inf)]
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.25, 2.0])
+@pytest.mark.parametrize(("period_s", "speed_period_s"), PERIODS_S)
+def test_no_delay_is_named_that_is_a_period_off(
+    period_s: float, speed_period_s: float, late_s: float
+) -> None:
+    """Nor one that is off by more than is stated; at random, most drives tell theirs."""
+    named = 0
+    for seed in range(4):
+        found = findings(winding(seed, period_s, late_s, speed_period_s))
+        assert {each.cause for each in found} <= {"delay"}
+        for each in found:
+            [spread_s] = re.findall(r"give or take (\S+) s:", each.words)
+            value_s = each.value if each.topic == "/fix" else -each.value
+            assert value_s == pytest.approx(late_s, abs=float(spread_s))
+            assert float(spread_s) < 0.5
+            named += 1
+    assert named >= 3 * (np.isinf(period_s) and late_s > 0.0)
+
+
+def test_a_speed_that_does_not_change_tells_no_delay() -> None:
+    """Its sums differ by rounding, which may be like anything."""
+    streams = winding(0, 15.7, 0.0, np.inf)
+    assert np.ptp(streams["/wheels"]["forward_mps"]) == 0.0
+    assert motion_of(streams).speed_lags == []
 
 
 @pytest.mark.parametrize(
@@ -227,7 +284,10 @@ def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
         assert moved.values.tolist() == series.values.tolist()
         return moved.times_s.tolist()
 
-    late, gaining = Timing(-0.5, 0.0, 0.99, 9.0, 0.1), Timing(-0.5, 0.1, 0.99, 9.0, 0.1)
+    late, gaining = (
+        Timing(-0.5, 0.0, 0.99, 9.0, 0.1, 0.1, True),
+        Timing(-0.5, 0.1, 0.99, 9.0, 0.1, 0.1, True),
+    )
     unlike, unsure = late._replace(likeness=0.5), late._replace(evidence=1.0)
     still, moved = [10.0, 11.0, 13.0], [9.5, 10.5, 12.5]
     slowed = [9.5, 10.4, 12.2]
@@ -263,7 +323,7 @@ def test_forces_are_witnesses_where_they_go_with_a_frame_or_its_mirror_image(
     assert _by_forces(motion, own) == says
 
 
-SAME = Timing(0.0, 0.0, 0.99, 0.0, 0.1)
+SAME = Timing(0.0, 0.0, 0.99, 0.0, 0.1, 0.1, True)
 
 
 def test_of_equal_stamps_the_first_is_taken() -> None:
