@@ -15,7 +15,7 @@ WARNINGS = (
     *("-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wfloat-equal", "-Wshadow"),
     *("-pedantic", "-Werror"),
 )
-SANITIZERS = ("-fsanitize=address,undefined",)
+SANITIZERS = ("-fsanitize=address,undefined", "-O0")  # -O0: they find as much, in a third of the time
 STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
 
 

@@ -110,9 +110,11 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
         return
 
     def written(folder: Path, name: str, settings: dict[str, Any], outcome: Outcome) -> Result:
-        keeping.hold_outcome(name, settings, outcome, in_full=in_full)
+        hold(name, settings, outcome, in_full=in_full)
         assert opposite(name, settings, outcome.claims) == []
         result = write_outcome(folder, name, settings, outcome)
+        if in_full and is_new(name, settings, outcome):
+            told(result, folder)
         viewed(name, folder)
         return result
 
@@ -120,8 +122,10 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
         command: str, settings: Mapping[str, Any], outcome: Outcome, *, in_full: bool = True
     ) -> None:
         hold(command, settings, outcome, in_full=in_full)
-        if in_full:
-            told(command, settings, outcome)
+        if in_full and is_new(command, settings, outcome):
+            stated = {"study": command, "estimators": {}, **settings}
+            with TemporaryDirectory() as place, without_drawing():
+                told(write_outcome(Path(place), command, stated, outcome), Path(place))
 
     hold = keeping.hold_outcome
     with pytest.MonkeyPatch.context() as patch:
@@ -134,18 +138,19 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
 _TOLD: set[tuple[str, ...]] = set()
 
 
-def told(name: str, settings: Mapping[str, Any], outcome: Outcome) -> None:
-    """Have `run`'s sentences and the report of what a study found, once for each set of its tables."""
-    study = settings.get("study", name)
-    key = study, *outcome.tables, *outcome.figures
-    if key not in _TOLD:
-        _TOLD.add(key)
-        stated = {"study": study, "estimators": {}, **settings}
-        with TemporaryDirectory() as place, without_drawing():
-            folder = Path(place)
-            result = write_outcome(folder, name, stated, outcome)
-            run_sentences(result, folder)
-            write_report([folder], folder / "report.html")
+def is_new(name: str, settings: Mapping[str, Any], outcome: Outcome) -> bool:
+    """Whether nothing was told of a study with these tables and figures."""
+    key = settings.get("study", name), *outcome.tables, *outcome.figures
+    is_known = key in _TOLD
+    _TOLD.add(key)
+    return not is_known
+
+
+def told(result: Result, folder: Path) -> None:
+    """Have `run`'s sentences and the report of what a study found."""
+    run_sentences(result, folder)
+    with TemporaryDirectory() as place:
+        write_report([folder], Path(place, "report.html"))
 
 
 _VIEWED: set[tuple[str, bool]] = set()
