@@ -169,10 +169,27 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 def view(path: Path, **options: Any) -> None:
     """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
     from fuselog.pipeline.command_line.commands import view_path
-    from fuselog.pipeline.logs.information import say_next_of_view
 
     view_path(path, **options)
-    say_next_of_view(path, recover=options["recover"])
+    _say_next_of_view(path, recover=options["recover"])
+
+
+def _say_next_of_view(path: Path, *, recover: bool) -> None:
+    """Print what one would type after looking at a result, a log or an estimates log."""
+    from fuselog.pipeline.output.terminal import say_next
+    from fuselog.pipeline.runs.inputs import shipped
+    from fuselog.recorders.log import open_log
+
+    if path.is_dir():
+        say_next("report", str(path))
+    elif path.suffix != ".rrd":
+        log = open_log(path, recover=recover)
+        if not any(topic.startswith("/estimates/") for topic in log.topics):
+            say_next("info", str(path))
+        elif log.run and log.run.scenario in shipped("experiments"):
+            say_next("run", log.run.scenario, "--runs", "20")
+        else:
+            say_next("evaluate", str(path))
 
 
 @command(

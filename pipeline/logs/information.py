@@ -207,32 +207,13 @@ def _some_topics(topics: Sequence[str]) -> str:
     return ", ".join(topics[:MOST_TOPICS]) + more
 
 
-def say_next_of_view(path: Path, *, recover: bool) -> None:
-    """Print what one would type after looking at a result, a log or an estimates log."""
-    if path.is_dir():
-        say_next("report", str(path))
-    elif path.suffix != ".rrd":
-        from fuselog.pipeline.runs.inputs import shipped
-
-        log = open_log(path, recover=recover)
-        labels, run = _labels(log), log.run
-        if not labels:
-            say_next("info", str(path))
-        elif run and run.scenario in shipped("experiments"):
-            say_next("run", run.scenario, "--runs", "20")
-        else:
-            say_next("evaluate", str(path))
-
-
-def _labels(log: Log) -> list[str]:
-    """List whose estimates a log has."""
-    estimates = [topic.removeprefix(ESTIMATES) for topic in log.topics if topic.startswith(ESTIMATES)]
-    return list(dict.fromkeys(each.partition("/")[0] for each in estimates))
-
-
 def _say_what_to_do(path: Path, log: Log) -> None:
     """Print whose estimates a log has, and what can be done with them."""
-    labels = _labels(log)
+    labels = dict.fromkeys(
+        topic.removeprefix(ESTIMATES).partition("/")[0]
+        for topic in log.topics
+        if topic.startswith(ESTIMATES)
+    )
     place = log.run.notes.get("log") if log.run else None
     of_log = f" of {place}" if place else ""
     say(f"Estimates by {', '.join(labels)}{of_log}: for view, evaluate, compare, diagnose, export")
