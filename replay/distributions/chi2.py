@@ -8,9 +8,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+
+# One number, or an array of them, as what is given.
+Numbers = Any  # type: ignore[explicit-any]
 
 _ROUNDING = 2.0**-53
 _STEPS = 100  # of Newton's method; it takes 3 to 12
@@ -19,7 +23,7 @@ _FARTHEST = 2.0  # such a step, at most
 _TINY = 1e-300
 
 
-def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
+def ppf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
     """Return the value below which a number lies with this probability.
 
     Args:
@@ -32,7 +36,7 @@ def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
     return _quantile(probability, np.subtract(1.0, probability), degrees)
 
 
-def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
+def isf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
     """Return the value that a number exceeds with this probability.
 
     Args:
@@ -45,7 +49,7 @@ def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
     return _quantile(np.subtract(1.0, probability), probability, degrees)
 
 
-def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
+def sf(value: ArrayLike, degrees: ArrayLike) -> Numbers:
     """Return the probability with which a number exceeds this value.
 
     Args:
@@ -58,11 +62,11 @@ def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
     return _by_element(_tails, value, degrees)
 
 
-def _quantile(below: ArrayLike, above: ArrayLike, degrees: ArrayLike) -> Any:
+def _quantile(below: ArrayLike, above: ArrayLike, degrees: ArrayLike) -> Numbers:
     return _by_element(_quantiles, below, above, degrees)
 
 
-def _by_element(loop: Any, *numbers: ArrayLike) -> Any:
+def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
     """Run a kernel over the elements of arrays, the last of which are degrees of freedom."""
     same = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in numbers))
     columns = [np.ascontiguousarray(each).ravel() for each in same]
@@ -109,7 +113,7 @@ def _log_of_rest(log_probability: float) -> float:
     return math.log1p(-min(math.exp(log_probability), 1.0 - _ROUNDING))
 
 
-def _tail(run: int, found: NDArray, value: NDArray, shape: NDArray, log_gamma: NDArray) -> None:
+def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floats) -> None:
     """Find with which probability a value is exceeded."""
     half = 0.5 * value[run]
     if not 0.0 < shape[run] < math.inf or not half >= 0.0:
@@ -121,7 +125,7 @@ def _tail(run: int, found: NDArray, value: NDArray, shape: NDArray, log_gamma: N
 
 
 def _solve(
-    run: int, found: NDArray, below: NDArray, above: NDArray, shape: NDArray, log_gamma: NDArray
+    run: int, found: Floats, below: Floats, above: Floats, shape: Floats, log_gamma: Floats
 ) -> None:
     """Find the value with these probabilities below and above it, by Newton's method for its logarithm.
 
