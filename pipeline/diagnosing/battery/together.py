@@ -101,16 +101,25 @@ def _estimate(causes: Sequence[Cause], right: Right) -> Estimated | None:
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
-    rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
-    for faults in (*pairs(), *triples()):
-        title = " + ".join(faults)
-        rows += [tried(faults, seed) for seed in setting.progress(seeds, title, len(seeds))]
+    rows = []
+    for case, faults in enumerate((*pairs(), *triples())):
+        seeds = _seeds(experiment, case)
+        rows += [tried(faults, seed) for seed in setting.progress(seeds, " + ".join(faults), len(seeds))]
     found = pd.DataFrame(rows)
     outcome = Outcome(metrics={**metrics_of(found)}, tables={"together": found})
     outcome.input_sha256 = hash_streams(
-        [recorded(faulty(experiment.seed, *faults), has_prior=True) for faults in pairs()]
+        [
+            recorded(faulty(_seeds(experiment, case)[0], *faults), has_prior=True)
+            for case, faults in enumerate(pairs())
+        ]
     )
     return outcome
+
+
+def _seeds(experiment: Experiment, case: int) -> range:
+    """Give each case seeds of its own: logs of one seed have the same noise, and so the same misses."""
+    first = experiment.seed + case * experiment.runs
+    return range(first, first + experiment.runs)
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
