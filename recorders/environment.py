@@ -1,6 +1,7 @@
 """Reads the environment variables that fuselog heeds, and refuses what they cannot be."""
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,13 +48,15 @@ def cache_folder() -> Path:
 def check() -> None:
     """Raise BadInput if a variable is set to what it cannot be.
 
-    matplotlib takes MPLBACKEND for the name of a window system, which no command needs: it is dropped.
+    What libraries heed and no command needs is dropped: MPLBACKEND names a window system, RERUN switches
+    off what a command was asked to draw, and RERUN_FLUSH_... say how its rows are packed.
     """
     for name, (is_valid, expected) in _EXPECTED.items():
         stated = os.environ.get(name)
         if stated is not None and not is_valid(stated):
             raise BadInput(f"{name}={stated}: expected {expected}; correct the variable, or unset it")
-    os.environ.pop("MPLBACKEND", None)
+    for name in [each for each in os.environ if re.fullmatch("MPLBACKEND|RERUN(_FLUSH_.*)?", each)]:
+        del os.environ[name]
 
 
 def _is_count(text: str) -> bool:

@@ -33,7 +33,7 @@ CLEARLY = 0.5  # more gained: what a log hardly tells apart is named by the like
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
 SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
-CONTENDS = 0.8  # of what the likeliest gains: with more faults undone it may be likelier
+CONTENDS = 0.5  # of what the likeliest gains: with more faults undone it may be likelier
 HIDDEN = 0.3  # of the least gain: what gains as much may gain enough if other causes are fitted again
 LEADING = 10  # of the likeliest faults: each is tried beside all that gain less
 

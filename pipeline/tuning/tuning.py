@@ -329,26 +329,32 @@ def _blocked(objective: Objective, free: Sequence[Free], values: Floats) -> dict
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
     """Correct the cost for the noise of the controls, if that noise may decide where it is least.
 
-    That is if it changes the cost by MOVED or more, and by half of what the cost rises, a few standard
-    errors of a parameter away. At less than one it may not: where stamps are shifted by half a step, the
-    noise gains most, and about equally much on both sides.
+    It may if it changes the cost by MOVED or more, and by half of what the cost rises, a few standard
+    errors of a parameter away. One alone is too near: where stamps are shifted by half a step, the noise
+    gains most, and about the same on both sides.
     """
     if found.confidence is None:
         return False
     point = found.coordinates.of(found.optimum)
     errors = np.zeros(len(point))
     errors[list(found.confidence.places)] = np.nan_to_num(found.confidence.errors, posinf=0.0)
-    ways = np.outer([*REACHES, *(-REACHES)], errors)[:, :, None] * np.eye(len(point))
-    points = found.coordinates.values(np.array([point, *(point + ways.reshape(-1, len(point)))]))
-    rises = objective(points) - objective(points[:1])
     objective.correct(found.optimum)
-    points[:, list(objective.held)] = found.optimum[list(objective.held)]
-    if objective.is_corrected:
+    errors[list(objective.held)] = 0.0
+    is_moved = False
+    if objective.is_corrected and errors.any():
+        along = np.diag(errors)[errors > 0.0]
+        ways = (reach * along for reach in (*REACHES, *(-REACHES)))
+        points = found.coordinates.values(np.concatenate([point[None], *(point + way for way in ways)]))
         lost = objective.lost_by_noise(points).mean(axis=(1, 2))
-        if np.any(np.abs(lost - lost[0]) > np.maximum(MOVED, 0.5 * rises)):
-            return True
-    objective.leave_noise()
-    return False
+        objective.leave_noise()
+        costs = objective(points)
+        changes = np.abs(lost - lost[0])
+        is_moved = bool(np.any(changes > np.maximum(MOVED, 0.5 * (costs - costs[0]))))
+    if is_moved:
+        objective.correct(found.optimum)
+    else:
+        objective.leave_noise()
+    return is_moved
 
 
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:

@@ -260,7 +260,7 @@ class BodyMotion:
             if ratio.sign > 0:
                 return ratio
         lags = [each.timing for each in self.turn_lags if each.source == source.topic]
-        is_known = all(lag.is_alone or lag.evidence < SURE for lag in lags)
+        is_known = all(lag.is_alone or not lag.is_needed for lag in lags)
         return ratio if is_known else None
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:

@@ -28,6 +28,7 @@ class Timing(NamedTuple):
         gain: so many seconds a second the clock of the source gains.
         likeness: the correlation there, -1 to 1.
         evidence: by how much the log-likelihood exceeds that without lag and gain.
+        is_needed: whether without a lag more than a misfit of the motion is left unexplained.
         tolerance_s: up to which a lag counts as none.
         spread_s: by how much lags that are as likely differ from it, with the tolerance.
         is_alone: whether no lags but its neighbours explain the motion as well, as those do that are a
@@ -38,6 +39,7 @@ class Timing(NamedTuple):
     gain: float
     likeness: float
     evidence: float
+    is_needed: bool
     tolerance_s: float
     spread_s: float
     is_alone: bool
@@ -75,8 +77,9 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     tried_s, tried = np.concatenate([lags_s, fine_s]), np.concatenate([coarse, near])
     as_likely_s = tried_s[_evidence(telling, likeness, tried) < SURE]
     spread_s = tolerance_s + float(np.max(np.abs(as_likely_s - lag_s), initial=FINE_S))
+    is_needed = bool(_evidence(telling, likeness, usual, MISFIT) >= SURE)
     is_alone = _changes(windows) >= CHANGES and _is_one_peak(coarse, telling)
-    return Timing(lag_s, gain, likeness, evidence, tolerance_s, spread_s, is_alone)
+    return Timing(lag_s, gain, likeness, evidence, is_needed, tolerance_s, spread_s, is_alone)
 
 
 def _changes(windows: Windows) -> int:

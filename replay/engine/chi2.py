@@ -5,28 +5,22 @@ kernels: half of a chi-squared number of k degrees of freedom has the gamma dist
 """
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
+
+# One number, or an array of them, as what is given.
+Numbers = Any  # type: ignore[explicit-any]
 
 _ROUNDING = 2.0**-53
 _STEPS = 100  # of Newton's method; it takes 3 to 12
 _CLOSE = 1e-9  # a relative step of Newton's method, whose square is below the rounding
 _FARTHEST = 2.0  # such a step, at most
 _TINY = 1e-300
-
-# One number, or an array of the shape that the arguments have together.
-Numbers = Any  # type: ignore[explicit-any]
-
-
-class _Loop(Protocol):
-    """Finds a number for each row of columns, the last two of which belong to degrees of freedom."""
-
-    def __call__(self, rows: int, found: Floats, /, *columns: Floats) -> object: ...
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
@@ -72,7 +66,7 @@ def _quantile(below: ArrayLike, above: ArrayLike, degrees: ArrayLike) -> Numbers
     return _by_element(_quantiles, below, above, degrees)
 
 
-def _by_element(loop: _Loop, *numbers: ArrayLike) -> Numbers:
+def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
     """Run a kernel over the elements of arrays, the last of which are degrees of freedom."""
     same = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in numbers))
     columns = [np.ascontiguousarray(each).ravel() for each in same]

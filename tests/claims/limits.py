@@ -72,7 +72,8 @@ class Made:
         seen.read = {}
         self.experiment, self.claim = experiment, claim
         self._numbers = {name: exactly(number) for name, number in numbers.items()}
-        self._bare = claim.model_copy(update=dict.fromkeys(_WORDS, ""))
+        # with a reason of its own, so that none is made of the numbers
+        self._bare = claim.model_copy(update=dict.fromkeys(_WORDS, "") | {"why": "-"})
         self.metrics: Mapping[str, MetricValue] = seen
         self.decided(seen)
         self.metrics = {key: metrics[key] for key in seen.read}

@@ -856,6 +856,18 @@ def test_an_environment_variable_that_cannot_be_is_named(
     assert said.err.count("\n") == 1
 
 
+@pytest.mark.parametrize(("name", "value"), [("RERUN", "off"), ("RERUN_FLUSH_NUM_ROWS", "x")])
+def test_variables_of_rerun_leave_a_timeline_as_it_is(
+    name: str, value: str, world: Path, tmp_path: Path, start_fuselog: Callable[..., Any]
+) -> None:
+    """In a process of its own, whose stderr a library writes to as well."""
+    view = ("view", str(world / "log.mcap"), "--save", str(tmp_path / "a.rrd"))
+    process = start_fuselog(*view, env={**os.environ, name: value})
+    _, said = process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert (tmp_path / "a.rrd").stat().st_size > 1000
+
+
 def test_a_replay_whose_only_run_failed_fails_a_build(fuselog: Fuselog, tmp_path: Path) -> None:
     """Of two runs one estimate is left, and of a folder each log is a run."""
     for each in (SANE, float(FAIL)):

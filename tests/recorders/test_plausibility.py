@@ -285,8 +285,8 @@ def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
         return moved.times_s.tolist()
 
     late, gaining = (
-        Timing(-0.5, 0.0, 0.99, 9.0, 0.1, 0.1, True),
-        Timing(-0.5, 0.1, 0.99, 9.0, 0.1, 0.1, True),
+        Timing(-0.5, 0.0, 0.99, 9.0, True, 0.1, 0.1, True),
+        Timing(-0.5, 0.1, 0.99, 9.0, True, 0.1, 0.1, True),
     )
     unlike, unsure = late._replace(likeness=0.5), late._replace(evidence=1.0)
     still, moved = [10.0, 11.0, 13.0], [9.5, 10.5, 12.5]
@@ -323,7 +323,7 @@ def test_forces_are_witnesses_where_they_go_with_a_frame_or_its_mirror_image(
     assert _by_forces(motion, own) == says
 
 
-SAME = Timing(0.0, 0.0, 0.99, 0.0, 0.1, 0.1, True)
+SAME = Timing(0.0, 0.0, 0.99, 0.0, False, 0.1, 0.1, True)
 
 
 def test_of_equal_stamps_the_first_is_taken() -> None:

@@ -1,5 +1,6 @@
 """Guessed mappings of tables as loggers outside of the United States write them."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -172,3 +173,11 @@ def test_without_any_one_column_the_others_are_taken_once_and_in_their_order(
         assert all(len(each) == 1 for each in places), without
         if len(log.streams) == 1:
             assert places == sorted(places), without
+
+
+@pytest.mark.parametrize("cell", ["++1", "0b1", "1.7e9e9", "\uff11\uff17"])
+def test_a_cell_of_a_column_of_times_that_is_no_number_is_named(tmp_path: Path, cell: str) -> None:
+    times = [str(1_700_000_000 + row) for row in range(30)]
+    times[11] = cell
+    with pytest.raises(BadInput, match=f"but '{re.escape(cell)}' in row 12 is no number; correct it"):
+        guessed(tmp_path, "\n".join(["t,x_m,y_m", *(f"{each},1.5,2.5" for each in times)]))

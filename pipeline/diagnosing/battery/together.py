@@ -5,10 +5,11 @@ The logs have a compass and a prior, so that most faults can be told apart.
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 
 from fuselog.pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
 from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
@@ -18,8 +19,9 @@ from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.parameters import Parameters
 
-TRIPLES = 40
+PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"
 # What each fault is of. Two faults of one number hide one another, such as opposite factors.
 FIELDS: dict[str, Sequence[str]] = {
@@ -39,6 +41,22 @@ MIRRORS = {"turn rate's sign", AXES, "compass clockwise from north"}
 ALIKE = {"speed / 3.6", "fix variance / 16"}
 # Lost messages are told by the stamps, and "nothing" is no fault.
 NOT_PAIRED = {"nothing", "half of the odometry lost"}
+
+
+class TogetherOptions(Parameters):
+    """States how many sets of faults are tried.
+
+    Attributes:
+        pairs: how many of the pairs, from the first on.
+        triples: how many of the triples.
+    """
+
+    pairs: Annotated[int, Field(ge=1, le=PAIRS)] = PAIRS
+    triples: Annotated[int, Field(ge=1, le=TRIPLES)] = TRIPLES
+
+    def sets(self) -> list[tuple[str, ...]]:
+        """Return the pairs, and then the triples."""
+        return [*pairs()[: self.pairs], *triples()[: self.triples]]
 
 
 def pairs() -> list[tuple[str, ...]]:
@@ -101,16 +119,25 @@ def _estimate(causes: Sequence[Cause], right: Right) -> Estimated | None:
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
-    rows, seeds = [], range(experiment.seed, experiment.seed + experiment.runs)
-    for faults in (*pairs(), *triples()):
-        title = " + ".join(faults)
-        rows += [tried(faults, seed) for seed in setting.progress(seeds, title, len(seeds))]
+    rows, every = [], setting.options.sets()
+    for case, faults in enumerate(every):
+        seeds = _seeds(experiment, case)
+        rows += [tried(faults, seed) for seed in setting.progress(seeds, " + ".join(faults), len(seeds))]
     found = pd.DataFrame(rows)
     outcome = Outcome(metrics={**metrics_of(found)}, tables={"together": found})
     outcome.input_sha256 = hash_streams(
-        [recorded(faulty(experiment.seed, *faults), has_prior=True) for faults in pairs()]
+        [
+            recorded(faulty(_seeds(experiment, case)[0], *faults), has_prior=True)
+            for case, faults in enumerate(every)
+        ]
     )
     return outcome
+
+
+def _seeds(experiment: Experiment, case: int) -> range:
+    """Give each case seeds of its own: logs of one seed have the same noise, and so the same misses."""
+    first = experiment.seed + case * experiment.runs
+    return range(first, first + experiment.runs)
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
@@ -133,5 +160,6 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 FAULTS_TOGETHER = Study(
     "how often a diagnosis names two or three faults that are planted into a log, with their values",
     study,
+    TogetherOptions,
     runs="logs of each pair and each triple",
 )

@@ -25,6 +25,7 @@ from fuselog.recorders.importers.tables.columns import (
     parted,
 )
 from fuselog.recorders.importers.tables.files import Batch
+from fuselog.recorders.importers.tables.layout import MISSING, NUMBER
 from fuselog.recorders.importers.tables.order import Order, is_reversed, rollover_of
 from fuselog.recorders.importers.tables.times import (
     DIGITS,
@@ -475,12 +476,23 @@ def _check_texts(table: _Table, dated: set[str]) -> None:
         cell = first_cell(table.batch[name])
         is_named = _NAMED.search(parted(name)[0]) and re.search(r"\d.*\d", cell)
         if name not in dated and (is_named or re.search(_LIKE_A_TIME, cell)):
+            texts = texts_of(table.batch[name]).to_pylist()
+            odd = [each for each in texts if each and not _is_number(each)]
+            if odd and _is_number(cell):
+                raise BadInput(
+                    f"{table.path}: column {name} holds times such as '{cell}', but '{odd[0]}' in row "
+                    f"{texts.index(odd[0]) + 1} is no number; correct it, or leave the row out"
+                )
             raise BadInput(
                 f"{table.path}: column {name} holds times such as '{cell}', whose format is not known; "
                 "write "
                 f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
                 "as docs/your-log.md says"
             )
+
+
+def _is_number(cell: str) -> bool:
+    return cell.lower() in MISSING or re.fullmatch(NUMBER, cell, re.ASCII) is not None
 
 
 def first_cell(cells: pa.Array, *, is_part: bool = False) -> str:

@@ -13,10 +13,10 @@ _LINES, _BYTES = 40, 1 << 20
 _DELIMITERS = (";", "\t", "|", ",")
 _QUOTED = re.compile(r'"[^"]*"')
 _SEPARATOR = re.compile(r'\s*"?sep=(.)"?\s*')
-_NUMBER = r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?"
+NUMBER = r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?"
 _TIME = r"\d{1,4}[-./:]\d{1,2}([-./: T].*)?"
-_VALUE = re.compile(rf"{_NUMBER}|{_TIME}|{_NUMBER}[ ,;/]+{_NUMBER}.*|[-+]?0[xX][0-9a-fA-F]+")
-_MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "inf", "-inf"}
+_VALUE = re.compile(rf"{NUMBER}|{_TIME}|{NUMBER}[ ,;/]+{NUMBER}.*|[-+]?0[xX][0-9a-fA-F]+")
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "inf", "-inf"}
 
 
 class Layout(NamedTuple):
@@ -170,7 +170,7 @@ def _is_value(cell: str) -> bool:
 
 def _names_columns(head: list[str], below: Iterable[list[str]]) -> bool:
     """Tell whether a line names columns: it has no values, or words above values and small numbers."""
-    is_word = [not _is_value(cell) and cell.lower() not in _MISSING for cell in head]
+    is_word = [not _is_value(cell) and cell.lower() not in MISSING for cell in head]
     values = [cell for cell in head if _is_value(cell)]
     if not values:
         return any(is_word)
@@ -185,7 +185,7 @@ def _are_units(below: list[list[str]]) -> bool:
     if len(below) < 2 or any(_is_value(cell) or len(cell) > 24 for cell in below[0]):
         return False
     return any(
-        unit.lower() not in _MISSING and _is_value(cell)
+        unit.lower() not in MISSING and _is_value(cell)
         for row in below[1:]
         for unit, cell in zip(below[0], row, strict=False)
     )

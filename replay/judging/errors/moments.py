@@ -54,9 +54,10 @@ class Moments:
             self._add(errors, name, length)
 
     def _add(self, errors: Errors, quantity: str, values: Floats) -> None:
-        if np.isnan(values).all():
+        known = np.isfinite(values)  # a NEES beyond all numbers is counted as none
+        if not known.any():
             return
-        row = int(np.nanargmax(values))
+        row = int(np.argmax(np.where(known, values, -np.inf)))
         value, run, time_ns = float(values[row]), int(errors.run[row]), int(errors.time_ns[row])
         elapsed_s = float(errors.elapsed_s[row])
         self._keep(Moment(errors.estimator, errors.case, quantity, value, run, time_ns, elapsed_s))

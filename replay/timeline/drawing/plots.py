@@ -269,7 +269,7 @@ def _draw_squares(
             if above.any():
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
                 counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
-        note = f"; 95 % are below {high:.3g}" if high < 0.2 * end or not legend else ""
+        note = f"; 95 % within {low:.3g} to {high:.3g}" if high < 0.2 * end or not legend else ""
         note += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
         title = f"{_TITLES[name]} {of or f'{degrees} component' + 's' * (degrees != 1)}"
         extent, locked = (-0.1 * end, end), not counted

@@ -1,5 +1,6 @@
 """A filter is diagnosed and tuned alike as a model, a recursion, a library and a program."""
 
+import json
 import shutil
 import subprocess
 from collections.abc import Mapping
@@ -174,24 +175,27 @@ def test_a_noise_is_named_alike_however_the_filter_is_written(
         "lib": library(compile_filter),
         "exec": {"kind": "exec", "command": "./drifter"},
     }
-    diagnosed = [fl.diagnose(log, {label: given}) for label, given in ways.items()]
-    first = diagnosed[0].causes.iloc[0]
+    causes = [
+        fl.diagnose(log, {label: given}).causes.to_dict("records")
+        for label, given in ways.items()
+        if label != "exec"
+    ]
+    assert main(["diagnose", log, "-e", "exec:./drifter", "--json"]) == 0
+    causes.append(json.loads(capsys.readouterr().out)["sentences"])
+    [first] = causes[0]
     assert (first["kind"], first["topic"]) == ("process noise", "drift_density")
     assert first["low"] < 1.0 / TOO_LARGE < first["high"]
-    for each in diagnosed:
-        assert len(each.causes) == 1
-        own = each.causes.iloc[0]
-        numbers = ["value", "low", "high", "gain"]
-        assert own[numbers].tolist() == pytest.approx(first[numbers].tolist(), rel=1e-6)
+    for [own] in causes:
+        numbers = ("value", "low", "high", "gain")
+        assert [own[each] for each in numbers] == pytest.approx([first[each] for each in numbers], 1e-6)
         assert own["sentence"].partition("; try")[0] == first["sentence"].partition("; try")[0]
+    advice = f"--set drift_density={first['setting'].partition('=')[2]}"
+    tuning = "fuselog tune LOG -e exec:./drifter --free drift_density"
+    assert f"try {advice}, or {tuning}" in causes[-1][0]["sentence"]
     tuned = [fl.tune(log, {label: given}, "drift_density") for label, given in ways.items()]
     values = [each.parameters.loc[0, ["value", "low", "high"]].tolist() for each in tuned]
     for found in values:
         assert found == pytest.approx(values[0], rel=1e-4)
-    assert main(["diagnose", log, "-e", "exec:./drifter"]) == 0
-    advice = f"--set drift_density={first['setting'].partition('=')[2]}"
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"try {advice}, or fuselog tune LOG -e exec:./drifter --free drift_density" in said
 
 
 ROLE = '\\"role\\": \\"process noise\\",'

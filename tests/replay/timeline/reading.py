@@ -447,10 +447,11 @@ def _title_of(view: View) -> str:
     if found:
         assert view.span is not None
         assert float(found[1]) == view.span[1] == -view.span[0]
-    below = re.search(r"(\d+) components? \(-\); 95 % are below ([^;]+)", title)
-    if below:
-        assert float(below[2]) == pytest.approx(chi_square_interval(int(below[1]), 1)[1], rel=1e-2)
-    return re.sub(r", axis to ±[^,]+|; 95 % are below [^;]+", "", title)
+    within = re.search(r"(\d+) components? \(-\); 95 % within (\S+) to ([^;]+)", title)
+    if within:
+        low, high = chi_square_interval(int(within[1]), 1)
+        assert (float(within[2]), float(within[3])) == pytest.approx((low, high), rel=1e-2)
+    return re.sub(r", axis to ±[^,]+|; 95 % within [^;]+", "", title)
 
 
 def _check_bounds(picture: Picture, view: View) -> None:

@@ -31,6 +31,7 @@ def pressed() -> Iterator[str]:
     ):
         page = Page(open_session(source, ["ekf", "ukf"]), document)
         said = {"said": page._sentences, "saved": page._saved, "head": page._head}
+        said["command"] = page._command
         said["lens"] = page.plots["lens"].figure.title
         page._pin()
         sigma, bias = (page._widgets[name][1] for name in ("sigma_range_m", "bias_range_m"))
@@ -43,7 +44,6 @@ def pressed() -> Iterator[str]:
             ("estimate a bias", page._estimate),
             ("no longer", page._estimate),
             ("toml", page._save),
-            ("command", page._command),
             ("reset", page._reset),
             ("bad input", lambda: page._say_error(BadInput("no such log"))),
             ("failure", lambda: page._say_error(ValueError("no such log"))),

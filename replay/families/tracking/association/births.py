@@ -1,7 +1,7 @@
 """Begins tracks at detections that belong to none, and ends those of which nothing is left."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -81,21 +81,8 @@ def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     return end_tracks
 
 
-class BeginTracks(Protocol):
-    """Begins tracks of a run with detections of a scan; returns how many had no room."""
-
-    def __call__(
-        self,
-        run: int,
-        scan: int,
-        count: int,
-        scans: Scans,
-        tracks: Tracks,
-        newborn: Newborn,
-        p: Settings,
-        memory: ScanMemory,
-        /,
-    ) -> int: ...
+# (run, scan, count, scans, tracks, newborn, parameters, memory) -> how many had no room.
+BeginTracks = Callable[[int, int, int, Scans, Tracks, Newborn, Settings, ScanMemory], int]
 
 
 def beginning(tracker: Tracker) -> BeginTracks:

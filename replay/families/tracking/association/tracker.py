@@ -1,7 +1,7 @@
 """Puts a tracker together: the model of its targets, the kinds of its sensors, how tracks move."""
 
 from collections.abc import Callable
-from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar, cast
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar, cast
 
 from fuselog.replay.engine.arrays import AnyArgument, Floats
 from fuselog.replay.engine.vectors.tangent import tangent_components
@@ -62,10 +62,8 @@ def moving(stage: Stage) -> Steps:
     return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
 
 
-class BeliefOf(Protocol):
-    """Gives the tracks of a run as the filters have them, first axis = place."""
-
-    def __call__(self, run: int, tracks: Tracks, /) -> Belief: ...
+# (run, tracks) -> the tracks of a run as the filters have them, first axis = place.
+BeliefOf = Callable[[int, Tracks], Belief]
 
 
 def believing(stage: Stage) -> BeliefOf:
