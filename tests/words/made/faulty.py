@@ -295,5 +295,5 @@ def by_velocities(factor: float) -> BodyMotion:
 def late(seconds: float) -> Any:
     told = motion()
     told.delays_s, told.turn_lags = {"/wheels": seconds}, []
-    told.speed_lags = [Lag("/wheels", "/fix", Timing(seconds, 0.0, 0.987, 9.0, 0.1, 0.05, True))]
+    told.speed_lags = [Lag("/wheels", "/fix", Timing(seconds, 0.0, 0.987, 9.0, True, 0.1, 0.05, True))]
     return told
