@@ -93,15 +93,19 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print all about one entry of a list, or the whole list as JSON."""
+    """Print all about one entry of a list, or the whole list as JSON, where one that fails says why.
+
+    Raises BadInput if the one entry is unknown or does not load.
+    """
     known = LISTS[kind]()
-    if name is not None:
+    if name is None:
+        entries = [entry_or_why(*each) for each in known.items()]
+    else:
         if kind == "estimator" and name.partition(":")[0] in known:
             known[name] = lambda: _estimator(name, *find_estimator(name))
         if name not in known:
             raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
-        known = {name: known[name]}
-    entries = [entry_or_why(*each) for each in known.items()]
+        entries = [known[name]()]
     if as_json:
         print_json([_as_json(entry) for entry in entries])
     else:

@@ -330,7 +330,7 @@ def test_lists_that_are_kept_are_what_modules_and_files_say() -> None:
 
 
 def test_lists_are_not_kept_if_an_entry_does_not_load(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The lists show its error; `python -m tests.lists` does not keep that as its description."""
     before = KEPT.read_bytes()
@@ -339,6 +339,9 @@ def test_lists_are_not_kept_if_an_entry_does_not_load(
         monkeypatch.setattr(f"{module}.available", lambda _: broken)
     why = "metric 'broken' (nowhere:METRIC)"
     assert told_of("metrics")["broken"].startswith(why)
+    assert fuselog("metrics", "--json").json[0]["what"].startswith(why)
+    named = fuselog("metrics", "broken")
+    assert (named.code, why in named.err) == (2, True)
     monkeypatch.setattr("tests.lists.GROUPS", {"metrics": "metrics"})
     with pytest.raises(SystemExit, match="2"):
         keep_lists()
