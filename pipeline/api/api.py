@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fuselog.pipeline.api.catalog import LISTS, Entries, Entry
+from fuselog.pipeline.api.catalog import LISTS, Entries, Entry, entry_or_why
 from fuselog.pipeline.api.lists import listed
 from fuselog.pipeline.output.outputs import LOG, check_files, check_folder
 from fuselog.pipeline.output.results import Result, read_table
@@ -301,7 +301,7 @@ class Catalog(Mapping[str, Entry]):
     def __getitem__(self, name: str) -> Entry:
         if name not in self._entries:
             raise UnknownName(f"no {self._kind} '{name}'; {choices(name, self._entries)}")
-        return self._entries[name]()
+        return entry_or_why(name, self._entries[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)

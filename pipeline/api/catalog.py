@@ -93,15 +93,19 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print all about one entry of a list, or the whole list as JSON."""
+    """Print all about one entry of a list, or the whole list as JSON, where one that fails says why.
+
+    Raises BadInput if the one entry is unknown or does not load.
+    """
     known = LISTS[kind]()
-    if name is not None:
+    if name is None:
+        entries = [entry_or_why(*each) for each in known.items()]
+    else:
         if kind == "estimator" and name.partition(":")[0] in known:
             known[name] = lambda: _estimator(name, *find_estimator(name))
         if name not in known:
             raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
-        known = {name: known[name]}
-    entries = [make() for make in known.values()]
+        entries = [known[name]()]
     if as_json:
         print_json([_as_json(entry) for entry in entries])
     else:
@@ -136,17 +140,16 @@ def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry
     def make(name: str) -> Entry:
         return described(name, load(kind, name, expected))
 
-    return {name: partial(_entry, name, partial(make, name)) for name in available(kind)}
+    return {name: partial(make, name) for name in available(kind)}
 
 
 def _files(kind: str, described: Callable[[str, Path], Entry]) -> Entries:
     """Return an entry for every file that ships."""
-    files = shipped(kind).items()
-    return {name: partial(_entry, name, partial(described, name, path)) for name, path in files}
+    return {name: partial(described, name, path) for name, path in shipped(kind).items()}
 
 
-def _entry(name: str, make: Callable[[], Entry]) -> Entry:
-    """Return an entry, or where it cannot be had, why."""
+def entry_or_why(name: str, make: Callable[[], Entry]) -> Entry:
+    """Return an entry, or if it does not load, one that says why."""
     try:
         return make()
     except BadInput as error:

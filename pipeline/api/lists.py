@@ -45,13 +45,19 @@ def listed(kind: str) -> dict[str, Any]:
     return told(kind)
 
 
-def told(kind: str) -> dict[str, Any]:
-    """Return what is listed as all that is listed says it, which imports all."""
+def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
+    """Return what is listed as all that is listed says it, which imports all.
+
+    An entry that does not load says why; with `all_load` it raises BadInput.
+    """
     from fuselog.pipeline.api import catalog
 
     if kind == "methods":
         return catalog.methods()
-    return {name: make().what for name, make in catalog.LISTS[kind.removesuffix("s")]().items()}
+    return {
+        name: (make() if all_load else catalog.entry_or_why(name, make)).what
+        for name, make in catalog.LISTS[kind.removesuffix("s")]().items()
+    }
 
 
 def places_of(kind: str) -> dict[str, str]:

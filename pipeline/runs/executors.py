@@ -135,11 +135,7 @@ def processes(count: int) -> PoolFactory:
 def _begin_worker() -> None:
     """Give each worker one core; an interrupt is the parent's to deal with, and its end theirs too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    use_cores(1)
-    import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
-
-    threadpool_limits(1)
-    ignore_warnings_of_numbers()
+    _use_one_core()
     keep_off_settings_here()
     parent = parent_process()
     assert parent is not None
@@ -149,6 +145,37 @@ def _begin_worker() -> None:
         os._exit(1)
 
     Thread(target=follow, daemon=True).start()
+
+
+@cache
+def _use_one_core() -> None:
+    """Have kernels and linear algebra of this process use one core; warnings of numbers are left out."""
+    use_cores(1)
+    import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
+
+    threadpool_limits(1)
+    ignore_warnings_of_numbers()
+
+
+class DaskExecutor(Executor):
+    """Hands work to a Dask client; each thread of a worker uses one core.
+
+    Work brings this along, so that workers that are started later, or again, keep to it too.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._executor = client.get_executor(pure=False)
+
+    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hand work to a worker."""
+        future: Future[Any] = self._executor.submit(_on_one_core, work, *args, **kwargs)
+        return future
+
+
+def _on_one_core(work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Do the work in a process that uses one core from now on."""
+    _use_one_core()
+    return work(*args, **kwargs)
 
 
 def dask(scheduler: str) -> PoolFactory:
@@ -186,7 +213,7 @@ def dask(scheduler: str) -> PoolFactory:
             workers = sum(client.nthreads().values())
             sees = None if scheduler.startswith("local:") else partial(_all_see, client)
             stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
-            yield WorkerPool(client.get_executor(pure=False), workers, sees, (KilledWorker,))
+            yield WorkerPool(DaskExecutor(client), workers, sees, (KilledWorker,))
 
     return begin
 

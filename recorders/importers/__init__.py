@@ -1,4 +1,5 @@
-"""Imports real data of any kind: tables, ROS, ULog, and robots among landmarks; begin with `mrclam`.
+"""Imports real data of any kind: tables, ROS, ULog, and robots among landmarks.
 
-Data sets of families are imported in `fuselog.recorders.families`.
+Begin with `tables`, for CSV and its like. Data sets of families are imported in
+`fuselog.recorders.families`.
 """

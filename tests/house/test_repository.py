@@ -34,12 +34,16 @@ def test_the_picture_of_the_house_is_what_is_checked() -> None:
     assert set(rooms) == {path.parent.name for path in ROOT.glob("replay/*/__init__.py")}
 
 
-def test_families_are_the_same_in_all_rooms_and_no_part_of_the_core_may_import_one() -> None:
+def test_families_are_the_same_everywhere_and_no_part_of_the_core_may_import_one() -> None:
     rooms = ("pipeline", "recorders", "replay")
     named = [
         {each.parent.name for each in (ROOT / room / "families").glob("*/__init__.py")} for room in rooms
     ]
-    assert named[0] == named[1] == named[2]
+    named += [
+        {each.stem for each in (ROOT / "docs" / "families").glob("*.md")},
+        {each.name for each in (ROOT / "data" / "experiments").iterdir() if each.is_dir()},
+    ]
+    assert all(each == named[0] for each in named)
     (contract,) = [
         each for each in PYPROJECT["tool"]["importlinter"]["contracts"] if each["type"] == "forbidden"
     ]

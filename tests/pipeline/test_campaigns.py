@@ -254,14 +254,18 @@ class Dying(InlineExecutor):
         return super().submit(work, *args, **kwargs)
 
 
-def test_a_worker_has_one_thread_for_linear_algebra() -> None:
+# What a worker says of its cores: threads of libraries, and cores of kernels.
+CORES_THERE = (
+    "(__import__('scipy.linalg'), "
+    "{each['num_threads'] for each in __import__('threadpoolctl').threadpool_info()}, "
+    "__import__('fuselog.replay.engine.compiling.compile', fromlist=['']).core_count())[1:]"
+)
+
+
+def test_a_worker_uses_one_core() -> None:
     """Also in SciPy, whose library is another than NumPy's and is loaded later."""
-    asked = (
-        "(__import__('scipy.linalg'), "
-        "{each['num_threads'] for each in __import__('threadpoolctl').threadpool_info()})[1]"
-    )
     with processes(1)() as pool:
-        assert pool.executor.submit(eval, asked).result() == {1}
+        assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 
 @pytest.mark.paper
@@ -463,6 +467,17 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, monkeypatch):
     assert main([*command, "--workers", "2"]) == 0
     assert contents(place) == files
     assert not unfinished(place).exists()
+
+
+@pytest.mark.paper
+def test_a_dask_worker_uses_one_core_also_when_it_was_started_again(monkeypatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    with pool_for(None, "local:1", RUNS)() as pool:
+        assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
+        distributed.get_client().restart()
+        assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 
 @pytest.mark.paper

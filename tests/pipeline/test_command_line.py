@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,12 @@ from rerun.blueprint import View
 
 import fuselog as fl
 from fuselog.pipeline.api.lists import KEPT
+from fuselog.pipeline.api.lists import told as told_of
 from fuselog.pipeline.output.results import result_folder
 from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 from fuselog.replay.timeline.drawing.canvas import Scene
 from tests.lists import lists
+from tests.lists import main as keep_lists
 from tests.pipeline.conftest import heeding_interrupts
 from tests.replay.foreign.test_isolation import SANE, run_with
 from tests.replay.foreign.test_programs import FAIL, PROGRAM, python
@@ -324,6 +327,26 @@ def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuse
 def test_lists_that_are_kept_are_what_modules_and_files_say() -> None:
     """`python -m tests.lists` keeps them."""
     assert json.loads(KEPT.read_text(encoding="utf-8")) == lists()
+
+
+def test_lists_are_not_kept_if_an_entry_does_not_load(
+    fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The lists show its error; `python -m tests.lists` does not keep that as its description."""
+    before = KEPT.read_bytes()
+    broken = {"broken": EntryPoint("broken", "nowhere:METRIC", "fuselog.metrics")}
+    for module in ("fuselog.recorders.registry", "fuselog.pipeline.api.catalog"):
+        monkeypatch.setattr(f"{module}.available", lambda _: broken)
+    why = "metric 'broken' (nowhere:METRIC)"
+    assert told_of("metrics")["broken"].startswith(why)
+    assert fuselog("metrics", "--json").json[0]["what"].startswith(why)
+    named = fuselog("metrics", "broken")
+    assert (named.code, why in named.err) == (2, True)
+    monkeypatch.setattr("tests.lists.GROUPS", {"metrics": "metrics"})
+    with pytest.raises(SystemExit, match="2"):
+        keep_lists()
+    assert capsys.readouterr().err.startswith(f"nothing is kept: {why}")
+    assert KEPT.read_bytes() == before
 
 
 def test_the_formulas_of_a_model_are_printed(fuselog: Fuselog) -> None:

@@ -333,6 +333,44 @@ rows = [{ landmark_id = 0, position_m = [0, 0, 1] }, { landmark_id = 1, position
     assert notes["table.csv: rows without a time are left out"] == "1"
 
 
+@pytest.mark.parametrize("name", ["table.csv", "table.csv.gz"])
+def test_lines_may_end_with_carriage_returns_only(
+    imported: Callable[..., Any], tmp_path: Path, name: str
+) -> None:
+    data = ROWS.replace("\n", "\r").encode()
+    (tmp_path / name).write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    old, _ = imported(tmp_path / name, INERTIAL)
+    new, _ = imported(ROWS, INERTIAL)
+    assert_array_equal(old["/inertial"]["turn_rate_radps"], new["/inertial"]["turn_rate_radps"])
+    assert len(old["/inertial"]["turn_rate_radps"]) == 2
+
+
+POSITION = """
+[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/position"
+becomes = "PositionFix"
+fields.position_m = ["x", "y"]
+"""
+
+
+def test_cells_that_are_no_numbers_are_counted(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """Of a text, odd ones too; NaN and empty cells stand for nothing measured, in an array as well."""
+    cells = ["0", "-inf", "infinity", "nan(0x7)", "1e+2147483648", "", "nan", "NaN"]
+    text = "t,x,y\n" + "".join(f"{time},{cell},1\n" for time, cell in enumerate(cells))
+    streams, notes = imported(text, POSITION)
+    assert notes["table.csv: x: cells that are no numbers, missing"] == "4"
+    assert not [key for key in notes if key.startswith("table.csv: y")]
+    missing = [np.nan] * 7
+    assert_array_equal(streams["/position"]["position_m"][:, 0], [0.0, *missing])
+    x = np.array([0.0, np.nan, np.inf])
+    np.savez(tmp_path / "table.npz", t=np.arange(3.0), x=x, y=np.ones(3))
+    streams, notes = imported(tmp_path / "table.npz", POSITION)
+    assert notes["table.npz: x: cells that are no numbers, missing"] == "1"
+    assert_array_equal(streams["/position"]["position_m"][:, 0], [0.0, np.nan, np.nan])
+
+
 def test_axes_and_attitudes(imported: Callable[..., Any]) -> None:
     """A mounting turns vectors, covariances and orientations; a heading east is the identity."""
     mapping = """

@@ -1,1 +1,4 @@
-"""Simulates relative bearings with bounded errors; begin with `simulator`."""
+"""Simulates relative bearings with bounded errors; begin with `simulator`.
+
+How bounds follow from real recordings is in `fuselog.pipeline.families.sets.error_bounds`.
+"""

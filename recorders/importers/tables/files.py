@@ -57,6 +57,8 @@ _SUFFIXES: dict[str, Format] = {
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 _BLOCK_ROWS = 1 << 17
+# How much of a text is looked at to tell how its lines end.
+_HEAD_BYTES = 1 << 16
 # How many lines there are at most before the data of a .vbo file, and what columns of a VBOX are in.
 _HEADER_LINES = 10_000
 VBOX_UNITS = {
@@ -81,6 +83,7 @@ class Table:
         mended: what was mended.
         units: what a row of units says, by column.
         doubts: what is doubtful about its rows.
+        is_text: whether its cells are texts, of which those that say NaN are null.
     """
 
     path: Path
@@ -90,6 +93,7 @@ class Table:
     mended: str = ""
     units: dict[str, str] = field(default_factory=dict)
     doubts: set[str] = field(default_factory=set)
+    is_text: bool = False
 
     def __post_init__(self) -> None:
         _check_width(self.path, len(self.columns))
@@ -156,7 +160,7 @@ def open_table(
     format = format or _SUFFIXES.get(suffix.lower(), "csv")  # noqa: A001
     try:
         if format == "csv":
-            with open_decompressed(path) as file:
+            with open_text(path) as file:
                 tagged = tagged_of(file, path)
             found = _open_tagged(path, tagged) if tagged else _open_text(path, more, options)
         elif format in ("rtklib", "vbo"):
@@ -232,14 +236,30 @@ def open_decompressed(path: Path) -> BinaryIO:
     return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
 
 
+def open_text(path: Path) -> BinaryIO:
+    """Open the bytes of a text, decompressed; if its lines end with CR only, these become newlines."""
+    file = open_decompressed(path)
+    head = file.read(_HEAD_BYTES).strip()
+    file.seek(0)
+    if b"\n" in head or b"\r" not in head:
+        return file
+    return cast(BinaryIO, io.BufferedReader(Chunks(_with_newlines(file))))
+
+
+def _with_newlines(file: BinaryIO) -> Iterator[bytes]:
+    with file:
+        while chunk := file.read(BLOCK_BYTES):
+            yield chunk.replace(b"\r", b"\n")
+
+
 @contextmanager
 def _open_joined(paths: Sequence[Path]) -> Iterator[BinaryIO]:
     """Open one file, or the lines of several as one."""
     if len(paths) == 1:
-        with open_decompressed(paths[0]) as file:
+        with open_text(paths[0]) as file:
             yield file
         return
-    yield cast(BinaryIO, io.BufferedReader(Chunks(joined(open_decompressed, paths))))
+    yield cast(BinaryIO, io.BufferedReader(Chunks(joined(open_text, paths))))
 
 
 def _check_width(path: Path, width: int) -> None:
@@ -280,7 +300,7 @@ def _open_text(path: Path, more: Sequence[Path], options: TextOptions) -> Table:
             yield from _text_batches(blocks, columns, wanted, found, options.decimal, left_out)
 
     units = {name: unit for name, unit in zip(columns, found.units, strict=False) if unit}
-    return Table(path, columns, read, left_out, units=units, doubts=doubts)
+    return Table(path, columns, read, left_out, units=units, doubts=doubts, is_text=True)
 
 
 def _open_tagged(path: Path, found: Tagged) -> Table:
@@ -288,14 +308,14 @@ def _open_tagged(path: Path, found: Tagged) -> Table:
     layout = Layout(columns, len(columns), ",", 0, (), [], 0)
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        with open_decompressed(path) as file:
+        with open_text(path) as file:
             rows = found.rows(blocks_of(file, doubts), left_out)
             first = next((block for block in rows if block), None)
             if first is None:
                 raise BadInput(f"{path}: has no rows of {found.what}; give a log or a table with them")
             yield from _text_batches(chain([first], rows), columns, wanted, layout, ".", left_out)
 
-    return Table(path, columns, read, left_out, units=found.units, doubts=doubts)
+    return Table(path, columns, read, left_out, units=found.units, doubts=doubts, is_text=True)
 
 
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
@@ -354,7 +374,7 @@ def _text_batches(
 def _open_rtklib(path: Path) -> Table:
     """Open a solution of RTKLIB: its header names two columns, date and time, by one word."""
     named: list[str] = []
-    with open_decompressed(path) as file:
+    with open_text(path) as file:
         for line in lines_of(file):
             if not line.startswith(b"%"):
                 break
@@ -374,7 +394,7 @@ def _open_vbo(path: Path) -> Table:
     sections: dict[str, list[str]] = {}
     section: list[str] = []
     count = 0
-    with open_decompressed(path) as file:
+    with open_text(path) as file:
         for line in islice(lines_of(file), _HEADER_LINES):
             count += 1
             text = line.decode("utf-8", "replace").strip()
@@ -428,7 +448,7 @@ def _open_json(path: Path) -> Table:
     doubts = set[str]()
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        with open_decompressed(path) as file:
+        with open_text(path) as file:
             for block in blocks_of(file, doubts):
                 _check_depth(block)
                 for batch in _flat_batches(pyarrow.json.read_json(pa.BufferReader(block))):

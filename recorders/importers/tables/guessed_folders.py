@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
-from fuselog.recorders.importers.tables.files import open_decompressed
+from fuselog.recorders.importers.tables.files import open_text
 
 # How many files of one row are one table at least.
 _FEWEST = 3
@@ -57,7 +57,7 @@ def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
 
 def stamps_in(path: Path) -> list[str]:
     """Return the lines of a file with times that are not blank."""
-    with open_decompressed(path) as file:
+    with open_text(path) as file:
         lines = [line.decode("utf-8", "replace").strip() for line in lines_of(file)]
     return [line for line in lines if line]
 
@@ -65,7 +65,7 @@ def stamps_in(path: Path) -> list[str]:
 def _count(path: Path, most: int) -> int:
     """Count the rows of a text, up to a number."""
     try:
-        with open_decompressed(path) as file:
+        with open_text(path) as file:
             rows = (line for line in lines_of(file) if line.strip() and not line.startswith(COMMENTS))
             return sum(1 for _ in islice(rows, most))
     except (OSError, ValueError):

@@ -35,8 +35,8 @@ from fuselog.recorders.importers.tables.files import (
     Table,
     TextOptions,
     floats,
-    open_decompressed,
     open_table,
+    open_text,
 )
 from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
 from fuselog.recorders.importers.tables.order import Order, is_reversed
@@ -206,21 +206,33 @@ class Rows:
         column = self.table.column(source)
         if column in self._numbers_of:
             return self._numbers_of[column]
+        cells = batch[column]
         sides = batch[self._halves[column]] if column in self._halves else None
         try:
             if sides is not None and self._halves[column] == column:
-                numbers, sides = sided(batch[column])
-                found = floats(numbers)
-            else:
-                found = floats(batch[column])
+                cells, sides = sided(cells)
+            found = floats(cells)
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             raise BadInput(
                 f"{self.path}: column {column} has cells that are not numbers; give a column of numbers"
             ) from None
+        found = self._finite(column, cells, found)
         if self._is_prepared:
             found = self._prepared(column, found, sides)
-            self._numbers_of[column] = found
+        self._numbers_of[column] = found
         return found
+
+    def _finite(self, column: str, cells: pa.Array, found: NDArray) -> NDArray:
+        """Return a column's numbers (n,) with NaN for infinite ones; what is no number is counted."""
+        if np.isfinite(found).all():
+            return found
+        is_odd = np.isinf(found)
+        if self.table.is_text:
+            is_odd |= np.isnan(found) & cells.is_valid().to_numpy(zero_copy_only=False)
+        self._tell(
+            f"{self.path.name}: {column}", "cells that are no numbers, missing", int(is_odd.sum())
+        )
+        return np.where(is_odd, np.nan, found)
 
     def _prepared(self, column: str, found: NDArray, sides: pa.Array | None) -> NDArray:
         """Return a column's numbers (n,) without codes of missing values, in degrees and with a sign."""
@@ -628,7 +640,7 @@ def _times_in(stream: TableStream) -> Iterator[str]:
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines of a text that are not blank."""
-    with open_decompressed(path) as file:
+    with open_text(path) as file:
         for line in lines_of(file):
             if text := line.decode("utf-8", "replace").strip():
                 yield text
