@@ -447,11 +447,11 @@ def _title_of(view: View) -> str:
     if found:
         assert view.span is not None
         assert float(found[1]) == view.span[1] == -view.span[0]
-    within = re.search(r"(\d+) components? \(-\); 95 % within (\S+) to ([^;]+)", title)
+    within = re.search(r"(\d+) components? \(-\).*; 95 % within (\S+) to ([^;]+)", title)
     if within:
         low, high = chi_square_interval(int(within[1]), 1)
         assert (float(within[2]), float(within[3])) == pytest.approx((low, high), rel=1e-2)
-    return re.sub(r", axis to ±[^,]+|; 95 % within [^;]+", "", title)
+    return re.sub(r", axis to ±[^,]+|; (?:95 % within|outside:) [^;]+", "", title)
 
 
 def _check_bounds(picture: Picture, view: View) -> None:
