@@ -149,6 +149,7 @@ def test_lines_of_sight_are_as_measured_and_as_corrected(tmp_path: Path) -> None
         for name in biases:
             column = truth.components.index(name)
             each["mean"][:, column] = truth["state"][:, column]
+    made[1]["covariance"][:] *= 100.0
     run = drawn(tmp_path, source, made)
     wanted, titles = run.quality()
     names = [name for name in truth.components if name.startswith("target")]
