@@ -36,6 +36,7 @@ ROOT = "space"
 SENSOR: Colour = (240, 228, 66)
 # The longest half axis of an ellipsoid is drawn as about this share of the scene.
 ELLIPSOID_SHARE = 0.03
+MARK = rr.Radius.ui_points(4.0)
 # Rays go on behind the targets by this share.
 BEYOND = 1.05
 # From where the scene is seen, in sizes of it from its middle.
@@ -182,6 +183,10 @@ def _draw_estimates(
     entity = f"{ROOT}/{estimator}/targets"
     canvas.send(entity, times_ns, columns.partition([targets.at_once] * len(stream)))
     canvas.fix(entity, rr.Ellipsoids3D.from_fields(colors=[colour]))
+    # a point is seen where the ellipsoid is too small to be
+    points = rr.Points3D.columns(positions=targets.centres)
+    canvas.send(f"{entity}/place", times_ns, points.partition([targets.at_once] * len(stream)))
+    canvas.fix(f"{entity}/place", rr.Points3D.from_fields(colors=[colour], radii=MARK))
     for sensor in sensors:
         names = bias_components(sensor.number)
         if not set(names) & set(components):

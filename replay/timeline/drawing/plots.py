@@ -234,7 +234,7 @@ def draw_nees(
         for errors in scene.errors_of(case)
         if not errors.is_bound
     ]
-    return _draw_squares(canvas, scene, case, "NEES", found, line, legend=legend)
+    return _draw_squares(canvas, scene, case, "NEES", found, legend=legend)
 
 
 def draw_nis(
@@ -253,7 +253,7 @@ def draw_nis(
             of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
             squares = innovations.time_ns[rows], innovations.squared[rows]
             found.append(Squares(own, of, estimator, *squares))
-    return _draw_squares(canvas, scene, case, "NIS", found, dots, legend=legend)
+    return _draw_squares(canvas, scene, case, "NIS", found, scatter=True, legend=legend)
 
 
 def _draw_squares(
@@ -262,11 +262,11 @@ def _draw_squares(
     case: str,
     name: str,
     found: Sequence[Squares],
-    style: Callable[[float], Style],
     *,
+    scatter: bool = False,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
-    """Draw chi-square values of one run, and the band that holds 95 % of consistent ones.
+    """Draw chi-square values of one run, lines or a scatter, and the band of 95 % of consistent ones.
 
     Those above the panel are marks at its upper edge, and its title counts them. It ends above the band;
     where most values of every estimator are above that, the best one's set its range.
@@ -287,8 +287,9 @@ def _draw_squares(
         counted = []
         for _, _, estimator, time_ns, values in alike:
             colour = scene.colour(estimator)
-            rows = thin_scatter(len(values)) if style is dots else np.arange(len(values))
-            look = style(scene.width(estimator))
+            width = scene.width(estimator)
+            look = dots(0.5 * (WIDTH + width)) if scatter else line(width)
+            rows = thin_scatter(len(values)) if scatter else np.arange(len(values))
             draw_curve(canvas, plot, estimator, colour, time_ns[rows], values[rows], look)
             above = values > end
             if above.any():

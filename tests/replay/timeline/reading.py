@@ -252,7 +252,13 @@ OF_NO_ESTIMATOR = {
 # What a view has beside its data, and the names of columns that are data.
 FRAMES = ("grid", "decades", "bounds", "circle", "cells", "names", "numbers", "threshold")
 VALUES = ("scalars", "values", "strips", "positions", "centers", "vectors", "text", "buffer", "instance")
-SIZES = ("LineStrips2D:strips", "Points2D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips")
+SIZES = (
+    "LineStrips2D:strips",
+    "Points2D:positions",
+    "Ellipsoids3D:centers",
+    "LineStrips3D:strips",
+    "Points3D:positions",
+)
 
 
 def compare(moving: Mapping[str, Columns], wanted: Mapping[str, Wanted]) -> None:

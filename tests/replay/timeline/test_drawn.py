@@ -181,6 +181,8 @@ def test_lines_of_sight_are_as_measured_and_as_corrected(tmp_path: Path) -> None
         wanted[f"/space/{name}/targets"] = Wanted(
             "ellipsoids", np.repeat(stream.publish_time_ns, 3), values
         )
+        stamps = np.repeat(stream.publish_time_ns, 3)
+        wanted[f"/space/{name}/targets/place"] = Wanted("places in space", stamps, places)
     compare(run.picture.moving, wanted)
     one, two = (
         np.array(run.picture.moving[f"/space/{name}/targets"]["Ellipsoids3D:half_sizes"], float).ravel()
