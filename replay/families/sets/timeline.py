@@ -39,8 +39,8 @@ from fuselog.replay.timeline.drawing.plane import (
 )
 from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
 
-# What one bearing allows is drawn of so many frames.
-BEARING_FRAMES = 200
+# What one bearing allows is drawn of so many frames, evenly in time; at the others it is not there.
+BEARING_FRAMES = 100
 ALLOWED = (110, 110, 90)
 FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
 # The map shows what this share of the sets does not reach beyond.
@@ -99,14 +99,12 @@ def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list
     seen, marks = (scene.read(topic) for topic in (stated[0]["measured"], "/landmarks"))
     found = list(frames(seen, marks, Known.of(stated[0])))
     time_ns = np.array([frame.time_ns for frame in found], np.int64)
-    shown = thin(time_ns, BEARING_FRAMES)
-    allowed = [
-        [ring for pair in _single(found[row].pairs) for ring in rings(exact_set(pair, found[row].arena))]
-        for row in shown
-    ]
-    counts = np.array([len(each) for each in allowed], np.int64)
-    polygons = [ring for each in allowed for ring in each]
-    draw_polygons(canvas, entity, time_ns[shown], counts, polygons, Stroke(ALLOWED, 2.0))
+    counts, polygons = np.zeros(len(found), np.int64), []
+    for row in thin(time_ns, BEARING_FRAMES):
+        allowed = [rings(exact_set(pair, found[row].arena)) for pair in _single(found[row].pairs)]
+        counts[row] = sum(map(len, allowed))
+        polygons += [ring for each in allowed for ring in each]
+    draw_polygons(canvas, entity, time_ns, counts, polygons, Stroke(ALLOWED, 2.0))
     return [entity] if polygons else []
 
 

@@ -95,11 +95,11 @@ def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
     particles = draw_effective(canvas, scene, case)
     strips: list[Board] = [*nees, *errors.values(), *nis, *particles]
     if len(strips) > MOST_STRIPS:
-        in_tabs = _tabs(_by_quantity(errors), TAB_STRIPS)
-        room = MOST_STRIPS - strips_of(in_tabs)
-        strips = [*nees, in_tabs, *nis, *particles]
+        in_tabs = [_tabs(_by_quantity(errors), TAB_STRIPS)] if errors else []
+        room = MOST_STRIPS - sum(strips_of(each) for each in in_tabs)
+        strips = [*nees, *in_tabs, *nis, *particles]
         if len(nees) + len(nis) + len(particles) > room:
-            strips = [_tabs({"NEES": nees, "NIS": nis, "particles": particles}, room), in_tabs]
+            strips = [_tabs({"NEES": nees, "NIS": nis, "particles": particles}, room), *in_tabs]
     close_up = draw_close_up(canvas, scene, case)
     if close_up is None:
         return strips

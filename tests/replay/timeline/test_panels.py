@@ -181,6 +181,33 @@ def test_an_error_plot_has_room_for_who_is_right(
     assert f"Error of x (m), {axis}" in views(tmp_path / "two.rrd")
 
 
+def test_many_nis_without_errors_leave_no_empty_container(tmp_path: Path) -> None:
+    """Each of the seven sets of measured components has a plot, which is more than are seen at once."""
+    patterns = np.array(
+        [[1.0 if number >> axis & 1 else np.nan for axis in range(3)] for number in range(1, 8)]
+    )
+    names = ["room_degC", "door_degC", "wall_degC"]
+    innovation = make_stream(
+        "/estimates/ekf/innovation",
+        schemas.INNOVATION,
+        STAMPS[:7],
+        metadata=state_metadata(names),
+        target_id=np.zeros(7, np.int64),
+        accepted=np.ones(7, np.int64),
+        innovation=patterns,
+        covariance=np.tile(np.eye(3).ravel(), (7, 1)),
+        normalised_innovation_squared=np.ones(7),
+        log_likelihood=np.zeros(7),
+    )
+    told = state_metadata(names)
+    truth = make_stream("/truth", schemas.TRUTH_STATE, STAMPS, metadata=told, state=np.zeros((50, 3)))
+    source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
+    show(source, {innovation.topic: gather([innovation])}, [], save=tmp_path / "nis.rrd")
+    contents = "ContainerBlueprint:contents"
+    assert sum("NIS" in name for name in views(tmp_path / "nis.rrd")) == 7
+    assert all(part.get(contents, True) for part in layout(tmp_path / "nis.rrd").values())
+
+
 def test_a_long_scatter_of_nis_keeps_its_middle(tmp_path: Path) -> None:
     """Three measurements a stamp: extremes of spans of time would leave out the middle one."""
     count = 3 * 4000
