@@ -44,7 +44,7 @@ PICTURES = 500
 CELLS = 96
 OUTLINE_POINTS = 145
 MEASURED: Colour = (240, 228, 66)
-SAMPLES: Colour = (255, 255, 255)
+SAMPLES: Colour = (140, 230, 120)
 # The radius of an estimate on the torus.
 DOT_PX = 6.0
 AXES: tuple[Colour, Colour, Colour] = ((230, 60, 60), (80, 200, 80), (80, 120, 240))

@@ -36,6 +36,7 @@ ROOT = "space"
 SENSOR: Colour = (240, 228, 66)
 # The longest half axis of an ellipsoid is drawn as about this share of the scene.
 ELLIPSOID_SHARE = 0.03
+MARK = rr.Radius.ui_points(4.0)
 # Rays go on behind the targets by this share.
 BEYOND = 1.05
 # From where the scene is seen, in sizes of it from its middle.
@@ -51,6 +52,18 @@ class Sensor(NamedTuple):
     sights: Stream
 
 
+class Targets(NamedTuple):
+    """Holds where an estimator has the targets: ellipsoids at each stamp, `at_once` of them."""
+
+    estimator: str
+    colour: Colour
+    stream: Stream
+    at_once: int
+    centres: Floats
+    half_axes: Floats
+    turns: Floats
+
+
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     """Return the scene in space beside NEES and the errors of all components."""
     canvas.fix(ROOT, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
@@ -63,14 +76,16 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     _draw_points(canvas, "sensors", places[: len(sensors)], SENSOR)
     _draw_points(canvas, "targets", targets, TRUTH)
     _draw_measured(canvas, sensors, BEYOND * extent)
-    shown = {
-        name: _draw_estimates(canvas, scene.colour(name), name, stream, sensors, extent)
+    estimates = [
+        _targets_of(name, scene.colour(name), stream)
         for name, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE)
-    }
-    larger = ", ".join(f"of {name} {scale:g} times as large" for name, scale in shown.items())
-    space = rrb.Spatial3DView(
-        origin=ROOT, name=f"Scene; 95 % ellipsoids {larger}" if shown else "Scene", eye_controls=eye
-    )
+    ]
+    sizes = [float(np.median(each.half_axes.max(axis=1))) for each in estimates]
+    scale = max(1.0, nice(ELLIPSOID_SHARE * extent / max(sizes))) if sizes else 1.0
+    for each in estimates:
+        _draw_estimates(canvas, each, sensors, scale, BEYOND * extent)
+    drawn = f"Scene; 95 % ellipsoids {scale:g} times as large" if estimates else "Scene"
+    space = rrb.Spatial3DView(origin=ROOT, name=drawn, eye_controls=eye)
     colours = scene.colours("") | {"sensors": SENSOR, "measured": WRONG}
     board = above_events(with_legend(canvas, ROOT, colours, space), draw_events(canvas, scene, ""))
     return beside(board, draw_quality(canvas, scene, "", legend=False), "")
@@ -147,29 +162,31 @@ def draw_rays(
     canvas.fix(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=radii))
 
 
-def _draw_estimates(
-    canvas: Canvas,
-    colour: Colour,
-    estimator: str,
-    stream: Stream,
-    sensors: list[Sensor],
-    extent: float,
-) -> float:
-    """Draw targets' ellipsoids and corrected lines of sight; returns how much the former are larger."""
-    components, times_ns = stream.components, stream.publish_time_ns
-    count = sum(name.startswith("target_") for name in components) // 3
-    covariances = stream["covariance"].reshape(len(stream), len(components), -1)
+def _targets_of(estimator: str, colour: Colour, stream: Stream) -> Targets:
+    """Compute the ellipsoids of all targets at each stamp, one after another."""
+    count = sum(name.startswith("target_") for name in stream.components) // 3
+    covariances = stream["covariance"].reshape(len(stream), len(stream.components), -1)
     blocks = np.stack([covariances[:, i : i + 3, i : i + 3] for i in range(0, 3 * count, 3)], axis=1)
-    half_axes, turns = ellipsoids(blocks.reshape(-1, 3, 3))
-    scale = max(1.0, nice(ELLIPSOID_SHARE * extent / float(np.median(half_axes.max(axis=1)))))
+    centres = stream["mean"][:, : 3 * count].reshape(-1, 3)
+    return Targets(estimator, colour, stream, count, centres, *ellipsoids(blocks.reshape(-1, 3, 3)))
+
+
+def _draw_estimates(
+    canvas: Canvas, targets: Targets, sensors: list[Sensor], scale: float, length_m: float
+) -> None:
+    """Draw targets' ellipsoids, larger by a scale, and corrected lines of sight so long."""
+    estimator, colour, stream = targets.estimator, targets.colour, targets.stream
+    components, times_ns = stream.components, stream.publish_time_ns
     columns = rr.Ellipsoids3D.columns(
-        centers=stream["mean"][:, : 3 * count].reshape(-1, 3),
-        half_sizes=scale * half_axes,
-        quaternions=turns,
+        centers=targets.centres, half_sizes=scale * targets.half_axes, quaternions=targets.turns
     )
     entity = f"{ROOT}/{estimator}/targets"
-    canvas.send(entity, times_ns, columns.partition([count] * len(stream)))
+    canvas.send(entity, times_ns, columns.partition([targets.at_once] * len(stream)))
     canvas.fix(entity, rr.Ellipsoids3D.from_fields(colors=[colour]))
+    # a point is seen where the ellipsoid is too small to be
+    points = rr.Points3D.columns(positions=targets.centres)
+    canvas.send(f"{entity}/place", times_ns, points.partition([targets.at_once] * len(stream)))
+    canvas.fix(f"{entity}/place", rr.Points3D.from_fields(colors=[colour], radii=MARK))
     for sensor in sensors:
         names = bias_components(sensor.number)
         if not set(names) & set(components):
@@ -180,10 +197,9 @@ def _draw_estimates(
                 bias[:, axis] = stream["mean"][:, components.index(name)]
         batch = np.searchsorted(times_ns, sensor.sights.publish_time_ns)
         known = batch < len(times_ns)
-        rays = _rays(sensor, sensor.sights.take(known), bias[batch[known]], BEYOND * extent)
+        rays = _rays(sensor, sensor.sights.take(known), bias[batch[known]], length_m)
         name = f"{ROOT}/{estimator}/corrected/{sensor.number}"
         draw_rays(canvas, name, times_ns, times_ns[batch[known]], rays, colour)
-    return scale
 
 
 def ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:

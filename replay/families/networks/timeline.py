@@ -72,7 +72,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     nees = [view for case in cases for view in _draw_nees(canvas, scene, case)]
     errors = [in_strips(draw_errors(canvas, scene, case), case) for case in cases]
     plots = rrb.Tabs(rrb.Vertical(*nees, name="NEES"), *errors)
-    return rrb.Horizontal(board, plots, column_shares=[3, 2])
+    return rrb.Horizontal(board, plots, column_shares=[1, 1])
 
 
 def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:

@@ -11,6 +11,8 @@ import rerun.blueprint as rrb
 
 from fuselog.recorders.log import schemas
 from fuselog.replay.families.sets.judging.regions import areas_of, rings_of
+from fuselog.replay.families.sets.regions.feasible_sets import Pairs, exact_set, rings
+from fuselog.replay.families.sets.regions.frames import Known, frames
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
@@ -22,6 +24,7 @@ from fuselog.replay.timeline.drawing.canvas import (
     draw_cases,
     entity_path,
     nice,
+    thin,
 )
 from fuselog.replay.timeline.drawing.events import above_events, draw_events
 from fuselog.replay.timeline.drawing.plane import (
@@ -36,6 +39,9 @@ from fuselog.replay.timeline.drawing.plane import (
 )
 from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
 
+# What one bearing allows is drawn of so many frames, evenly in time; at the others it is not there.
+BEARING_FRAMES = 100
+ALLOWED = (110, 110, 90)
 FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
 # The map shows what this share of the sets does not reach beyond.
 SHOWN_SHARE = 0.9
@@ -61,14 +67,53 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
         draw_dots(canvas, f"{root}/truth", stream.publish_time_ns, places, Stroke(TRUTH, 2.0))
         shown.append(places)
     reach, plots = draw_sets(canvas, scene, robot, root)
+    landmarks = f"{ROOT}/landmarks"
+    colours, scene_root = scene.colours(robot), entity_path(ROOT, "bearings", robot)
+    allowed = _draw_allowed(canvas, scene, robot, f"{scene_root}/allowed")
     name, is_single = "Map", all(len(each) == 1 for _, each in scene.outputs_of(robot, SIZE))
     if plots and is_single:  # a plot would be a dot
         name, plots = f"Map; {plots[0].name}", []
     places = np.concatenate([*shown, reach])
-    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], places, name=name)
-    board = with_legend(canvas, root, scene.colours(robot), plane)
+    board: Board = plane_view(canvas, root, [landmarks, *allowed], [], places, name=name)
+    if allowed:
+        colours |= {"allowed by one relative bearing": ALLOWED}
+        sets = [entity_path(root, each) for each in ("truth", *scene.estimators_of(robot))]
+        marks = scene.read("/landmarks")["position_m"][:, :2]
+        around = np.concatenate([places, marks])
+        whole = plane_view(canvas, scene_root, [landmarks, *sets], [], around, name="Landmarks")
+        board = rrb.Horizontal(whole, board)
+    board = with_legend(canvas, root, colours, board)
     board = above_events(board, draw_events(canvas, scene, robot), 4.0)
     return beside(board, plots, robot)
+
+
+def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list[str]:
+    """Draw all places that each single bearing and its bound allow; return the entity, if there are any.
+
+    What was measured, and what is known of it, is as the channel of a set states.
+    """
+    stated = [stream.metadata for _, stream in scene.outputs_of(robot, SIZE)]
+    stated = [each for each in stated if {"measured", *Known._fields} <= {*each}]
+    if not stated or not {stated[0]["measured"], "/landmarks"} <= {*scene.source.topics}:
+        return []
+    seen, marks = (scene.read(topic) for topic in (stated[0]["measured"], "/landmarks"))
+    found = list(frames(seen, marks, Known.of(stated[0])))
+    time_ns = np.array([frame.time_ns for frame in found], np.int64)
+    counts, polygons = np.zeros(len(found), np.int64), []
+    for row in thin(time_ns, BEARING_FRAMES):
+        allowed = [rings(exact_set(pair, found[row].arena)) for pair in _single(found[row].pairs)]
+        counts[row] = sum(map(len, allowed))
+        polygons += [ring for each in allowed for ring in each]
+    draw_polygons(canvas, entity, time_ns, counts, polygons, Stroke(ALLOWED, 2.0))
+    return [entity] if polygons else []
+
+
+def _single(pairs: Pairs) -> list[Pairs]:
+    """Return a frame of one relative bearing for each of a frame."""
+    rows = [slice(row, row + 1) for row in range(len(pairs.angle_rad))]
+    return [
+        Pairs(pairs.first[row], pairs.second[row], pairs.angle_rad[row], pairs.bound_rad) for row in rows
+    ]
 
 
 def draw_sets(

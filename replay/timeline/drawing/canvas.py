@@ -110,7 +110,7 @@ class Scene:
         The viewer draws entities in the order of their names, so the first ones are the widest.
         """
         above = len(self.estimators) - 1 - sorted(self.estimators).index(estimator)
-        return WIDTH * (1.0 + min(above, 2.0 * above / max(len(self.estimators) - 1, 1)))
+        return WIDTH * (1.0 + 2.0 * above / max(len(self.estimators) - 1, 1))
 
     def colours(self, case: str) -> dict[str, Colour]:
         """Return the colours of the truth of `case` and of its estimators, by name."""
@@ -329,6 +329,16 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     return extremes(_spans(time_ns, rows // 2), values)
+
+
+def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
+    """Return the rows of a scatter of points to draw: all, or `rows` of them at random, in order.
+
+    Extremes as of a curve would leave out what is between them, where most points are.
+    """
+    if count <= rows:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, rows, replace=False))
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:

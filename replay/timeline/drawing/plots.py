@@ -33,17 +33,21 @@ from fuselog.replay.timeline.drawing.canvas import (
     strips_of,
     thin,
     thin_curve,
+    thin_scatter,
 )
+from fuselog.replay.timeline.drawing.close_up import draw_close_up
 
 SIGMAS = 2.0
 _AXES = ("w", "x", "y", "z", "vx", "vy", "vz", "yaw", "pitch", "roll")
 _TITLES = {"NEES": "NEES of this run,", "NIS": "NIS of"}
 # So many plots are seen one below another at most, and so many of them in one tab.
-MOST_STRIPS, TAB_STRIPS = 8, 4
+MOST_STRIPS, TAB_STRIPS = 6, 4
 # What a legend takes of a plot's height: for itself, for each entry, and at most.
 LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
 # The same in the low panels of NEES and NIS.
 SMALL_ENTRY, SMALL_MOST = 0.15, 0.7
+# An error plot names the estimators of which more than this share of the errors is outside.
+SILENT_SHARE = 0.01
 # Where plots of shares and probabilities end, below their legends.
 SHARES = 1.5
 WHOLE_RUN = rrb.TimeAxis(
@@ -79,23 +83,28 @@ class Squares(NamedTuple):
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True) -> list[Board]:
-    """Draw errors, NEES, NIS and effective particles of a case, at most `MOST_STRIPS` at once.
+    """Draw NEES, errors, NIS and effective particles of a case, at most `MOST_STRIPS` at once.
 
     If there are more, errors are in tabs by quantity, and the others too if they are still too many.
+    Single estimates in the plane are seen close up first, since their plots over time are dots.
     There are no plots without anything to judge. `legend` is False if a scene names the colours.
     """
     errors = draw_errors(canvas, scene, case)
-    others = {
-        "NEES": draw_nees(canvas, scene, case, legend=legend),
-        "NIS": draw_nis(canvas, scene, case, legend=legend),
-        "particles": draw_effective(canvas, scene, case),
-    }
-    strips: list[Board] = [view for views in others.values() for view in views]
-    if len(errors) + len(strips) <= MOST_STRIPS:
-        return [*errors.values(), *strips]
-    in_tabs = _tabs(_by_quantity(errors), TAB_STRIPS)
-    room = MOST_STRIPS - strips_of(in_tabs)
-    return [in_tabs, *(strips if len(strips) <= room else [_tabs(others, room)])]
+    nees = draw_nees(canvas, scene, case, legend=legend)
+    nis = draw_nis(canvas, scene, case, legend=legend)
+    particles = draw_effective(canvas, scene, case)
+    strips: list[Board] = [*nees, *errors.values(), *nis, *particles]
+    if len(strips) > MOST_STRIPS:
+        in_tabs = [_tabs(_by_quantity(errors), TAB_STRIPS)] if errors else []
+        room = MOST_STRIPS - sum(strips_of(each) for each in in_tabs)
+        strips = [*nees, *in_tabs, *nis, *particles]
+        if len(nees) + len(nis) + len(particles) > room:
+            strips = [_tabs({"NEES": nees, "NIS": nis, "particles": particles}, room), *in_tabs]
+    close_up = draw_close_up(canvas, scene, case)
+    if close_up is None:
+        return strips
+    shares = [float(strips_of(each)) for each in strips]
+    return [rrb.Tabs(close_up, rrb.Vertical(*strips, name="over time", row_shares=shares))]
 
 
 def in_strips(views: Mapping[str, rrb.View], name: str) -> rrb.Container:
@@ -161,13 +170,14 @@ def _draw_error(
 ) -> rrb.TimeSeriesView:
     quantity, unit, scale = shown_unit(component)
     plot = entity_path("plots", case, f"error_{component}")
-    extents = []
+    extents, judged, outside = [], [], []
     for errors in found:
         column = errors.components.index(component)
         rows = thin_curve(errors.time_ns, errors.error[:, column])
         error = scale * errors.error[rows, column]
         bound = scale * SIGMAS * np.sqrt(np.maximum(errors.covariance[rows, column, column], 0.0))
-        extents.append(np.quantile(np.maximum(np.abs(error), bound), 0.99))
+        extents.append(float(np.quantile(np.maximum(np.abs(error), bound), 0.99)))
+        judged.append(errors.is_bound or _is_credible(errors))
         zero = np.zeros(len(rows))
         entity, colour = f"{plot}/{errors.estimator}", scene.colour(errors.estimator)
         if len(rows) == 1:
@@ -183,10 +193,23 @@ def _draw_error(
             names=names, colors=[colour, (*colour, 150)], widths=[scene.width(errors.estimator), 0.0]
         )
         canvas.fix(entity, style)
-    # the most accurate estimator sets the range; one that drifts away leaves the picture
-    extent = nice(1.2 * max(float(min(extents)), np.finfo(float).tiny))
+    # the most accurate of the estimators that NEES does not refute sets the range, else of all
+    credible = list(compress(extents, judged)) or extents
+    extent = nice(1.2 * max(min(credible), np.finfo(float).tiny))
+    for errors in found:
+        beyond = np.abs(scale * errors.error[:, errors.components.index(component)]) > extent
+        if np.mean(beyond) > SILENT_SHARE:
+            outside.append(f"{errors.estimator} {np.count_nonzero(beyond)} of {len(beyond)}")
     note = f", axis to ±{extent:g}, bands ±{SIGMAS:g} sigma"
+    note += f"; outside: {', '.join(outside)}" if outside else ""
     return plot_view(plot, f"Error of {quantity}", unit, (-extent, extent), note=note, legend=False)
+
+
+def _is_credible(errors: Errors) -> bool:
+    """Tell whether at least half of the NEES of a run are below what bounds 95 % of consistent ones."""
+    high = chi_square_interval(len(errors.components), 1)[1]
+    known = errors.nees[np.isfinite(errors.nees)]
+    return bool(len(known)) and float(np.median(known)) <= high
 
 
 def _draw_point(
@@ -211,7 +234,7 @@ def draw_nees(
         for errors in scene.errors_of(case)
         if not errors.is_bound
     ]
-    return _draw_squares(canvas, scene, case, "NEES", found, line, legend=legend)
+    return _draw_squares(canvas, scene, case, "NEES", found, legend=legend)
 
 
 def draw_nis(
@@ -230,7 +253,7 @@ def draw_nis(
             of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
             squares = innovations.time_ns[rows], innovations.squared[rows]
             found.append(Squares(own, of, estimator, *squares))
-    return _draw_squares(canvas, scene, case, "NIS", found, dots, legend=legend)
+    return _draw_squares(canvas, scene, case, "NIS", found, scatter=True, legend=legend)
 
 
 def _draw_squares(
@@ -239,11 +262,11 @@ def _draw_squares(
     case: str,
     name: str,
     found: Sequence[Squares],
-    style: Callable[[float], Style],
     *,
+    scatter: bool = False,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
-    """Draw chi-square values of one run, and the band that holds 95 % of consistent ones.
+    """Draw chi-square values of one run, lines or a scatter, and the band of 95 % of consistent ones.
 
     Those above the panel are marks at its upper edge, and its title counts them. It ends above the band;
     where most values of every estimator are above that, the best one's set its range.
@@ -257,20 +280,23 @@ def _draw_squares(
         band = rr.Measurements.columns(
             values=[0.5 * (low + high)] * 2, variances=[0.25 * (high - low) ** 2] * 2
         )
-        look = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
+        grey = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
         canvas.send(f"{plot}/bounds", np.array(ends), band)
-        canvas.fix(f"{plot}/bounds", look)
+        canvas.fix(f"{plot}/bounds", grey)
         end = _end_of(high, [each.values for each in alike])
         counted = []
         for _, _, estimator, time_ns, values in alike:
             colour = scene.colour(estimator)
-            draw_curve(canvas, plot, estimator, colour, time_ns, values, style(scene.width(estimator)))
+            width = scene.width(estimator)
+            look = dots(0.5 * (WIDTH + width)) if scatter else line(width)
+            rows = thin_scatter(len(values)) if scatter else np.arange(len(values))
+            draw_curve(canvas, plot, estimator, colour, time_ns[rows], values[rows], look)
             above = values > end
             if above.any():
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
                 counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
-        note = f"; 95 % within {low:.3g} to {high:.3g}" if high < 0.2 * end or not legend else ""
-        note += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
+        note = f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
+        note += f"; 95 % within {low:.3g} to {high:.3g}" if high < 0.2 * end or not legend else ""
         title = f"{_TITLES[name]} {of or f'{degrees} component' + 's' * (degrees != 1)}"
         extent, locked = (-0.1 * end, end), not counted
         views.append(plot_view(plot, title, "-", extent, note=note, legend=legend, zoom_lock=locked))
@@ -405,17 +431,38 @@ def plot_view(
 
 
 def shown_unit(component: str) -> tuple[str, str, float]:
-    """Return quantity, the unit to show it in, and the factor to that unit: angles are in degrees."""
+    """Return quantity, the unit to show it in, and the factor to that unit: angles are in degrees.
+
+    A name that does not end in a unit, as `pressure_a`, is all quantity.
+    """
     quantity, _, unit = component.rpartition("_")
-    if not quantity:
-        return component, "-", 1.0
-    shown, scale = _SHOWN.get(unit, (unit, 1.0))
-    return quantity.replace("_", " "), shown, scale
+    if not quantity or unit not in _SHOWN:
+        return component.replace("_", " "), "-", 1.0
+    return quantity.replace("_", " "), *_SHOWN[unit]
 
 
 _SHOWN = {
     "rad": ("deg", 180 / np.pi),
+    "rad2": ("rad²", 1.0),
     "radps": ("deg/s", 180 / np.pi),
+    "deg": ("deg", 1.0),
+    "m": ("m", 1.0),
+    "m2": ("m²", 1.0),
     "mps": ("m/s", 1.0),
     "mps2": ("m/s²", 1.0),
+    "m2ps2": ("m²/s²", 1.0),
+    "s": ("s", 1.0),
+    "s2": ("s²", 1.0),
+    "ut": ("µT", 1.0),
+    "ut2": ("µT²", 1.0),
+    "mm": ("mm", 1.0),
+    "km": ("km", 1.0),
+    "degps": ("deg/s", 1.0),
+    "mrad": ("mrad", 1.0),
+    "hz": ("Hz", 1.0),
+    "db": ("dB", 1.0),
+    "h": ("h", 1.0),
+    "pa": ("Pa", 1.0),
+    "percent": ("%", 1.0),
+    "degC": ("°C", 1.0),
 }

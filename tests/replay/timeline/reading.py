@@ -252,7 +252,13 @@ OF_NO_ESTIMATOR = {
 # What a view has beside its data, and the names of columns that are data.
 FRAMES = ("grid", "decades", "bounds", "circle", "cells", "names", "numbers", "threshold")
 VALUES = ("scalars", "values", "strips", "positions", "centers", "vectors", "text", "buffer", "instance")
-SIZES = ("LineStrips2D:strips", "Points2D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips")
+SIZES = (
+    "LineStrips2D:strips",
+    "Points2D:positions",
+    "Ellipsoids3D:centers",
+    "LineStrips3D:strips",
+    "Points3D:positions",
+)
 
 
 def compare(moving: Mapping[str, Columns], wanted: Mapping[str, Wanted]) -> None:
@@ -447,11 +453,11 @@ def _title_of(view: View) -> str:
     if found:
         assert view.span is not None
         assert float(found[1]) == view.span[1] == -view.span[0]
-    within = re.search(r"(\d+) components? \(-\); 95 % within (\S+) to ([^;]+)", title)
+    within = re.search(r"(\d+) components? \(-\).*; 95 % within (\S+) to ([^;]+)", title)
     if within:
         low, high = chi_square_interval(int(within[1]), 1)
         assert (float(within[2]), float(within[3])) == pytest.approx((low, high), rel=1e-2)
-    return re.sub(r", axis to ±[^,]+|; 95 % within [^;]+", "", title)
+    return re.sub(r", axis to ±[^,]+|; (?:95 % within|outside:) [^;]+", "", title)
 
 
 def _check_bounds(picture: Picture, view: View) -> None:

@@ -7,6 +7,7 @@ an axis, a sign, a unit or a block that is taken for another shows.
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -93,7 +94,7 @@ def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> 
     widths = [
         run.picture.still[f"/plots/robot1/nees_3/{name}"]["SeriesLines:widths"] for name in ESTIMATORS
     ]
-    assert widths == [[[3.0]], [[1.5]]]  # the first is seen below the second
+    assert widths == [[[4.5]], [[1.5]]]  # the first is seen below the second
     colours = run.picture.moving["/map/robot2/sights"]["LineStrips2D:colors"]
     found = [each for row in colours for each in row or []]
     red, usual = (int.from_bytes(bytes(colour), "big") for colour in (GATED, SEEN))
@@ -148,6 +149,7 @@ def test_lines_of_sight_are_as_measured_and_as_corrected(tmp_path: Path) -> None
         for name in biases:
             column = truth.components.index(name)
             each["mean"][:, column] = truth["state"][:, column]
+    made[1]["covariance"][:] *= 100.0
     run = drawn(tmp_path, source, made)
     wanted, titles = run.quality()
     names = [name for name in truth.components if name.startswith("target")]
@@ -179,7 +181,15 @@ def test_lines_of_sight_are_as_measured_and_as_corrected(tmp_path: Path) -> None
         wanted[f"/space/{name}/targets"] = Wanted(
             "ellipsoids", np.repeat(stream.publish_time_ns, 3), values
         )
+        stamps = np.repeat(stream.publish_time_ns, 3)
+        wanted[f"/space/{name}/targets/place"] = Wanted("places in space", stamps, places)
     compare(run.picture.moving, wanted)
+    one, two = (
+        np.array(run.picture.moving[f"/space/{name}/targets"]["Ellipsoids3D:half_sizes"], float).ravel()
+        for name in ESTIMATORS
+    )
+    sizes = [np.sqrt(np.trace(block(each, *names[:3])[0])) for _, each, _ in run.estimates()]
+    assert np.linalg.norm(one[:3]) / np.linalg.norm(two[:3]) == pytest.approx(sizes[0] / sizes[1])
     [scene] = [view.name for view in run.picture.views if view.kind == "3D"]
     check_views(run.picture, {*titles, (scene, "space")})
     for what, places in (("sensor", None), ("target", targets)):

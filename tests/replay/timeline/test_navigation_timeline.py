@@ -135,9 +135,12 @@ def test_every_panel_is_called_by_what_it_shows(drawn: Picture):
     titles = {(name.rpartition("_")[0].replace("_", " "), name) for name in NAVIGATION}
     units = {"m": "m", "mps": "m/s", "radps": "deg/s", "mps2": "m/s²"}
     titles = {
-        (f"{quantity.capitalize()} ({units.get(name.rpartition('_')[2], name[-1])})", f"plots/{name}")
+        (f"{quantity.capitalize()} ({units[name.rpartition('_')[2]]})", f"plots/{name}")
         for quantity, name in titles
+        if quantity != "orientation"
     }
+    for part in "wxyz":  # which is no unit
+        titles.add((f"Orientation {part} (-)", f"plots/orientation_{part}"))
     for name in ("latitude", "longitude"):
         titles.add((f"{name.capitalize()} (deg)", f"plots/fix/{name}_deg"))
     titles |= {("Altitude (m)", "plots/fix/altitude_m"), ("Map", "map"), ("OpenStreetMap", "geodetic")}

@@ -126,13 +126,13 @@ def test_events_name_the_topic_of_what_was_gated(tmp_path: Path) -> None:
 
 
 def test_many_components_are_in_tabs_by_quantity() -> None:
-    """The axes of a vector are together, single numbers up to four; eight fit without tabs."""
+    """The axes of a vector are together, single numbers up to four; six fit without tabs."""
     vectors = [f"{stem}{axis}_{unit}" for stem, unit in (("", "m"), ("v", "mps")) for axis in "xyz"]
     biases = [f"sensor_1_{angle}_bias_rad" for angle in ("yaw", "pitch", "roll")]
     names = [*vectors, *biases, "room_degC", "door_degC", "window_degC", "wall_degC", "roof_degC"]
     views = {name: rrb.TimeSeriesView(name=name) for name in names}
-    few = in_strips({name: views[name] for name in names[:8]}, "state")
-    assert [each.name for each in few.contents] == names[:8]
+    few = in_strips({name: views[name] for name in names[:6]}, "state")
+    assert [each.name for each in few.contents] == names[:6]
     tabs = in_strips(views, "state")
     assert [(tab.name, [view.name for view in tab.contents]) for tab in tabs.contents] == [
         ("position", names[:3]),
@@ -141,6 +141,100 @@ def test_many_components_are_in_tabs_by_quantity() -> None:
         ("room to wall", names[9:13]),
         ("roof", ["roof_degC"]),
     ]
+
+
+@pytest.mark.parametrize(
+    ("named", "axis"),
+    [
+        # a refuted estimator does not set the range, although its errors are smaller
+        ({"right": (30.0, 900.0), "sure": (5.0, 0.01)}, "axis to ±100, bands ±2 sigma"),
+        # of two that are not refuted, the more accurate one does, and the other is said to be outside
+        (
+            {"right": (3.0, 9.0), "wide": (30.0, 900.0)},
+            "axis to ±10, bands ±2 sigma; outside: wide 50 of 50",
+        ),
+    ],
+)
+def test_an_error_plot_has_room_for_who_is_right(
+    named: dict[str, tuple[float, float]], axis: str, tmp_path: Path
+) -> None:
+    told = state_metadata(["x_m"])
+    truth = make_stream("/truth", schemas.TRUTH_STATE, STAMPS, metadata=told, state=np.zeros((50, 1)))
+    outputs = {
+        f"/estimates/{name}/state": gather(
+            [
+                make_stream(
+                    f"/estimates/{name}/state",
+                    schemas.GAUSSIAN_ESTIMATE,
+                    STAMPS,
+                    metadata={**told, "truth": "/truth"},
+                    mean=np.full((50, 1), error),
+                    covariance=np.full((50, 1), variance),
+                )
+            ]
+        )
+        for name, (error, variance) in named.items()
+    }
+    source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
+    errors = [each for each in Judge([source], {}, gap_limit_s=2.0).add(outputs).errors if each]
+    show(source, outputs, errors, save=tmp_path / "two.rrd")
+    assert f"Error of x (m), {axis}" in views(tmp_path / "two.rrd")
+
+
+def test_many_nis_without_errors_leave_no_empty_container(tmp_path: Path) -> None:
+    """Each of the seven sets of measured components has a plot, which is more than are seen at once."""
+    patterns = np.array(
+        [[1.0 if number >> axis & 1 else np.nan for axis in range(3)] for number in range(1, 8)]
+    )
+    names = ["room_degC", "door_degC", "wall_degC"]
+    innovation = make_stream(
+        "/estimates/ekf/innovation",
+        schemas.INNOVATION,
+        STAMPS[:7],
+        metadata=state_metadata(names),
+        target_id=np.zeros(7, np.int64),
+        accepted=np.ones(7, np.int64),
+        innovation=patterns,
+        covariance=np.tile(np.eye(3).ravel(), (7, 1)),
+        normalised_innovation_squared=np.ones(7),
+        log_likelihood=np.zeros(7),
+    )
+    told = state_metadata(names)
+    truth = make_stream("/truth", schemas.TRUTH_STATE, STAMPS, metadata=told, state=np.zeros((50, 3)))
+    source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
+    show(source, {innovation.topic: gather([innovation])}, [], save=tmp_path / "nis.rrd")
+    contents = "ContainerBlueprint:contents"
+    assert sum("NIS" in name for name in views(tmp_path / "nis.rrd")) == 7
+    assert all(part.get(contents, True) for part in layout(tmp_path / "nis.rrd").values())
+
+
+def test_a_long_scatter_of_nis_keeps_its_middle(tmp_path: Path) -> None:
+    """Three measurements a stamp: extremes of spans of time would leave out the middle one."""
+    count = 3 * 4000
+    innovation = make_stream(
+        "/estimates/ekf/innovation",
+        schemas.INNOVATION,
+        np.repeat(np.arange(4000) * 10**8, 3),
+        metadata={**state_metadata(["room_degC"]), "truth": "/truth"},
+        target_id=np.zeros(count, np.int64),
+        accepted=np.ones(count, np.int64),
+        innovation=np.ones((count, 1)),
+        covariance=np.ones((count, 1)),
+        normalised_innovation_squared=np.tile([0.1, 1.0, 4.0], 4000),
+        log_likelihood=np.zeros(count),
+    )
+    truth = make_stream(
+        "/truth",
+        schemas.TRUTH_STATE,
+        STAMPS,
+        metadata=state_metadata(["room_degC"]),
+        state=np.zeros((50, 1)),
+    )
+    source = MemorySource({truth.topic: truth}, RunMetadata("own", epoch_ns=0), "own")
+    show(source, {innovation.topic: gather([innovation])}, [], save=tmp_path / "nis.rrd")
+    drawn = np.ravel(read(tmp_path / "nis.rrd")["/plots/nis_1/ekf"]["Scalars:scalars"])
+    for value in (0.1, 1.0, 4.0):
+        assert np.mean(drawn == value) == pytest.approx(1 / 3, abs=0.03)
 
 
 def test_a_single_estimate_is_a_point_between_the_ends_of_its_band(tmp_path: Path) -> None:
@@ -161,8 +255,11 @@ def test_a_single_estimate_is_a_point_between_the_ends_of_its_band(tmp_path: Pat
     show(source, outputs, errors, save=tmp_path / "one.rrd")
     moving = read(tmp_path / "one.rrd")
     assert moving["/plots/error_x_m/ekf"]["Scalars:scalars"] == [[3.0, -4.0, 4.0]]
+    assert moving["/close/ekf/place"]["Points2D:positions"] == [[[3.0, 1.0]]]  # seen close up
     for name, place in (("truth", [2.0, 7.0]), ("ekf", [5.0, 8.0])):  # which has no path on the map
         assert moving[f"/map/{name}/place"]["Points2D:positions"] == [[place]]
     still = read(tmp_path / "one.rrd", static=True)
+    judged = still["/close/judged"]["Points2D:labels"]
+    assert judged == [["ekf: NEES 2.5, 95 % within 0.0506 to 7.38"]]
     assert "SeriesPoints:markers" in still["/plots/error_x_m/ekf"]
     assert "SeriesPoints:names" in still["/plots/nees_2/ekf"]

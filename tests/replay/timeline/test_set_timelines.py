@@ -111,6 +111,21 @@ def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
         ]
 
 
+def test_what_one_bearing_allows_ends_where_its_bound_does(tmp_path):
+    """Most corners see both landmarks at the measured angle plus or minus the bound."""
+    source, _, found = drawn("relative-bearings", {}, ["set-membership"], tmp_path)
+    [allowed] = found["/map/bearings/robot1/allowed"]["LineStrips2D:strips"]
+    seen, marks = (source.streams[topic] for topic in ("/robot1/relative_bearing", "/landmarks"))
+    place_of = dict(zip(marks["landmark_id"].tolist(), marks["position_m"][:, :2], strict=True))
+    assert len(allowed) == len(seen) == 3
+    for strip, first, second, angle in zip(
+        allowed, seen["first_id"].tolist(), seen["second_id"].tolist(), seen["angle_rad"], strict=True
+    ):
+        bearings = [np.arctan2(*(place_of[each] - np.array(strip)).T[::-1]) for each in (first, second)]
+        away = np.abs(np.angle(np.exp(1j * (bearings[0] - bearings[1] - angle))))
+        assert np.median(away) == pytest.approx(np.radians(4.0), rel=0.01)
+
+
 def test_particles_are_drawn_where_they_are_with_their_weights(tmp_path):
     source = memory_source(*record_run("landmarks", {"duration_s": 2.0}, 1))
     settings = {"kind": "particles:50", "model": "robot", "cloud": True}
