@@ -5,7 +5,7 @@ import rerun.blueprint as rrb
 
 from fuselog.recorders.log import Stream, schemas, topics_of
 from fuselog.replay.judging.errors.evaluation import Floats
-from fuselog.replay.timeline.drawing.canvas import WRONG, Canvas, Scene, Timeline, beside
+from fuselog.replay.timeline.drawing.canvas import WRONG, Board, Canvas, Scene, Timeline, beside
 from fuselog.replay.timeline.drawing.events import above_events, draw_events
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
@@ -25,7 +25,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the plane beside sizes, errors and consistency."""
+    """Return the plane beside consistency and errors, and sizes in a tab."""
     turn_up(canvas)
     shown = [np.empty((0, 2))]
     points = f"{ROOT}/points"
@@ -42,8 +42,12 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     board = with_legend(canvas, ROOT, colours, plane)
     board = above_events(board, draw_events(canvas, scene, ""))
     sizes = [*draw_components(canvas, scene, "", legend=False).values()][:2]
-    plots = [*sizes, *draw_quality(canvas, scene, "", legend=False)]
-    return beside(board, plots, "")
+    plots: dict[str, list[Board]] = {
+        "errors": draw_quality(canvas, scene, "", legend=False),
+        "sizes": [*sizes],
+    }
+    tabs = [rrb.Vertical(*views, name=name) for name, views in plots.items() if views]
+    return beside(board, [rrb.Tabs(*tabs)] if tabs else [], "")
 
 
 def _seen(scene: Scene) -> list[Stream]:

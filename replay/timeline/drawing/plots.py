@@ -144,14 +144,14 @@ def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
 
 
 def _vector_of(component: str) -> str:
-    """Name the quantity that a component is an axis of: position, target 1 velocity, gyro bias."""
+    """Name the quantity that a component is an axis of: position, half size, gyro bias."""
     quantity, unit, _ = shown_unit(component)
     words = quantity.split()
     kept = [word for word in words if word not in _AXES]
     if {"vx", "vy", "vz"} & {*words}:
         return " ".join([*kept, "velocity"])
     if len(kept) < len(words) and unit == "m":
-        return " ".join([*kept, "position"])
+        return " ".join([*kept, "size" if kept[-1:] == ["half"] else "position"])
     return " ".join(kept) or quantity
 
 

@@ -376,7 +376,7 @@ def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("
 
 def check_first_view(picture: Picture) -> None:
     """No view is empty, plots are high enough to be read and name units, every colour has a name."""
-    assert picture.strips <= 8
+    assert picture.strips <= 6
     names: dict[int, str] = {}
     for view in picture.views:
         shown = _shown(picture, view)

@@ -129,7 +129,9 @@ def test_many_components_are_in_tabs_by_quantity() -> None:
     """The axes of a vector are together, single numbers up to four; six fit without tabs."""
     vectors = [f"{stem}{axis}_{unit}" for stem, unit in (("", "m"), ("v", "mps")) for axis in "xyz"]
     biases = [f"sensor_1_{angle}_bias_rad" for angle in ("yaw", "pitch", "roll")]
-    names = [*vectors, *biases, "room_degC", "door_degC", "window_degC", "wall_degC", "roof_degC"]
+    sizes = ["half_x_m", "half_y_m"]
+    rooms = [f"{room}_degC" for room in ("room", "door", "window", "wall", "roof")]
+    names = [*vectors, *biases, *sizes, *rooms]
     views = {name: rrb.TimeSeriesView(name=name) for name in names}
     few = in_strips({name: views[name] for name in names[:6]}, "state")
     assert [each.name for each in few.contents] == names[:6]
@@ -138,8 +140,9 @@ def test_many_components_are_in_tabs_by_quantity() -> None:
         ("position", names[:3]),
         ("velocity", names[3:6]),
         ("sensor 1 bias", biases),
-        ("room to wall", names[9:13]),
-        ("roof", ["roof_degC"]),
+        ("half size", sizes),
+        ("room to wall", rooms[:4]),
+        ("roof", rooms[4:]),
     ]
 
 
