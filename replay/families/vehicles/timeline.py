@@ -93,7 +93,7 @@ class Points(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the map above the close-up, beside errors, GOSPA and NEES."""
+    """Return the map above the close-up, beside GOSPA, errors in a tab, and NEES."""
     turn_up(canvas)
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}
@@ -112,6 +112,9 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     close = plane_view(canvas, CLOSE, [], [], cells)
     sensor.name = "Raw detections, sensor's frame"
     close.name = f"Close-up about the true places, {CELL_M:g} m each"
+    has_links = bool(len(_links(scene)[0]))
+    if has_links:
+        close.name += "; white lines: predicted place to associated fix"
     board: Board = rrb.Vertical(
         rrb.Tabs(
             whole,
@@ -125,7 +128,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     colours = {"truth": TRUTH} | {name: scene.colour(name) for name in scene.estimators}
     sensed = {"fixes": (FIX, "/network/detection"), "detections": (SEEN, "/infrastructure/detection")}
     colours |= {name: colour for name, (colour, topic) in sensed.items() if topic in scene.source.topics}
-    if len(_links(scene)[0]):
+    if has_links:
         colours["association"] = LINK[:3]
     board = with_legend(canvas, "vehicles", colours, board)
     if not scene.outputs:
@@ -134,8 +137,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         *(view for case in scene.cases for view in _nees(canvas, scene, case)),
         *(view for case in scene.cases for view in _own(canvas, scene, case)),
     ]
-    errors = _draw_errors(canvas, scene, vehicles, tracks)
-    plots = rrb.Vertical(*errors, *([rrb.Tabs(*quality)] if quality else []))
+    tabs = [_draw_errors(canvas, scene, vehicles, tracks), quality]
+    plots = rrb.Vertical(*(rrb.Tabs(*views) for views in tabs if views))
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 
 
@@ -379,7 +382,7 @@ def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
 def _draw_errors(
     canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot all vehicles' error together, labels as they are, and GOSPA, which sees none."""
+    """Plot GOSPA, which sees no labels, and all vehicles' error together, labels as they are."""
     for name, places in tracks.items():
         known = np.isfinite(places).all(axis=(1, 2))
         there, truths = places[known], vehicles.places[known]
@@ -394,11 +397,9 @@ def _draw_errors(
             colour = scene.colour(found.estimator)
             curve, style = (colour, found.time_ns), line(scene.width(found.estimator))
             draw_curve(canvas, "plots/gospa", found.estimator, *curve, found.gospa, style)
-    views = {
-        "error": plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0)),
-        "gospa": plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0)),
-    }
-    return [view for name, view in views.items() if tracks or name == "gospa"]
+    labelled = plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0))
+    unlabelled = plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0))
+    return [unlabelled, labelled] if tracks else [unlabelled]
 
 
 TIMELINE = Timeline(draw)

@@ -343,10 +343,11 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
         each["covariance"][2] *= 1e3
     run = drawn(tmp_path, source, [*made, innovations])
     wanted: dict[str, Wanted] = {}
+    close_up = "Close-up about the true places, 8 m each; white lines: predicted place to associated fix"
     titles: Titles = {
         ("Map", "map/map"),
         ("Raw detections, sensor's frame", "map/sensor"),
-        ("Close-up about the true places, 8 m each", "map/close"),
+        (close_up, "map/close"),
         ("OpenStreetMap", "geodetic"),
         ("Error of all vehicles together (m)", "plots/error"),
         ("GOSPA, cutoff 10 m (m)", "plots/gospa"),
