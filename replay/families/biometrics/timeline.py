@@ -1,13 +1,15 @@
 """Draws score fusion: how scores are spread, rates of both errors, probes as they come."""
 
+from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.recorders.families.biometrics.models import TOPIC, matchers_of
-from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log import schemas
 from fuselog.replay.families.biometrics.pairs import subsets_of
 from fuselog.replay.families.biometrics.verification import Floats, Fused, fused_of, roc
 from fuselog.replay.timeline.drawing.canvas import (
@@ -30,6 +32,18 @@ BINS = 60
 UPDATES = 50
 # How many of the genuine scores are below the histogram's upper end.
 SHOWN_SHARE = 0.95
+# What is plotted of a probe's comparisons.
+OF_PROBE = "genuine and greatest impostor of each probe"
+
+
+class Fusion(NamedTuple):
+    """Holds what an estimator fused; `note` tells where a threshold is from that it does not state."""
+
+    estimator: str
+    fused: Fused
+    time_ns: Times
+    threshold: float
+    note: str
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
@@ -38,38 +52,54 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
-    fusions = scene.outputs_of(case, schemas.SCORE_VECTOR)
-    rows = [_draw_fusion(canvas, case, *fusion) for fusion in fusions]
-    matched = _draw_matchers(canvas, scene, case)
-    boards: list[rrb.Container | rrb.View] = []
-    if rows:
-        rates = rrb.Horizontal(_draw_rates(canvas, scene, case), _draw_errors(canvas, scene, case))
-        boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), rates]
-    if matched:
-        boards.append(rrb.Horizontal(*matched))
+    """Draw how fused scores are spread and what errors they make; in a tab, the scores of each probe."""
+    fusions = list(_fusions(scene, case))
+    probes = [_draw_fused_probes(canvas, case, fusion) for fusion in fusions]
+    rows = [rrb.Horizontal(*views) for views in (probes, _draw_matchers(canvas, scene, case)) if views]
+    boards = [rrb.Vertical(*rows, name="scores of each probe")] if rows else []
     colours = scene.colours(case) | {"genuine": GENUINE, "impostor": IMPOSTOR}
-    board = with_legend(canvas, entity_path("biometrics", case), colours, rrb.Vertical(*boards))
+    if fusions:
+        colours["threshold"] = WRONG
+        spreads = [_draw_distribution(canvas, case, fusion) for fusion in fusions]
+        rates = _draw_rates(canvas, scene, case, fusions), _draw_errors(canvas, scene, case, fusions)
+        spread = rrb.Tabs(*spreads, active_tab=len(spreads) - 1)
+        boards.insert(0, rrb.Vertical(spread, rrb.Horizontal(*rates), name="fused"))
+    board = with_legend(canvas, entity_path("biometrics", case), colours, rrb.Tabs(*boards))
     return rrb.Vertical(board, name=case or "run")
 
 
-def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> rrb.Container:
-    """Draw genuine and greatest impostor score of each probe, and how the scores so far are spread."""
-    fused, time_ns = fused_of(stream), stream.publish_time_ns
-    root = entity_path("fusion", case, estimator)
-    of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
-    _draw_probes(canvas, f"{root}/scores", fused, time_ns)
-    return rrb.Horizontal(
-        _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
-        plot_view(f"{root}/scores", f"{of_probe} of each probe", "-", legend=False),
-        name=estimator,
-    )
+def _fusions(scene: Scene, case: str) -> Iterator[Fusion]:
+    """Yield a case's fusions.
 
-
-def _draw_rates(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Draw both rates of errors at every threshold, a curve for each fusion of a case."""
-    curves, strokes = {}, {}
+    One without a threshold decides half-way between the medians of genuine and impostor scores.
+    """
     for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
         fused = fused_of(stream)
+        threshold, note = fused.threshold, ""
+        if threshold is None:
+            medians = [np.median(fused.score[rows]) for rows in (fused.genuine, ~fused.genuine)]
+            threshold, note = float(np.mean(medians)), "; threshold half-way between medians"
+        yield Fusion(estimator, fused, stream.publish_time_ns, threshold, note)
+
+
+def _quantity_of(fusion: Fusion) -> str:
+    return f"{fusion.estimator}: {'log-likelihood ratio' if fusion.fused.is_ratio else 'fused score'}"
+
+
+def _draw_fused_probes(canvas: Canvas, case: str, fusion: Fusion) -> rrb.View:
+    """Draw genuine and greatest impostor score of each probe."""
+    plot = entity_path("fusion", case, fusion.estimator, "scores")
+    _draw_probes(canvas, plot, fusion.fused, fusion.time_ns)
+    ends = fusion.time_ns[[0, -1]]
+    canvas.send(f"{plot}/threshold", ends, rr.Scalars.columns(scalars=[fusion.threshold] * 2))
+    canvas.fix(f"{plot}/threshold", LINE(names=["threshold"], colors=[WRONG]))
+    return plot_view(plot, f"{_quantity_of(fusion)}, {OF_PROBE}", "-", note=fusion.note, legend=False)
+
+
+def _draw_rates(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusion]) -> rrb.View:
+    """Draw both rates of errors at every threshold, a curve for each fusion of a case."""
+    curves, strokes = {}, {}
+    for estimator, fused, *_ in fusions:
         found = roc(fused.score, fused.genuine)
         curves[estimator] = np.stack([found.false_accept, 1.0 - found.genuine_accept], axis=1)
         strokes[estimator] = stroke_of(scene, estimator)
@@ -77,11 +107,11 @@ def _draw_rates(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
     return curve_view(canvas, entity_path("rates", case), CurvePanel(name, curves, strokes))
 
 
-def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
+def _draw_errors(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusion]) -> rrb.View:
     """Plot the share of wrong decisions so far of every fusion of a case."""
     plot = entity_path("errors", case)
-    for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
-        wrong, time_ns = _errors_so_far(fused_of(stream)), stream.publish_time_ns
+    for estimator, fused, time_ns, threshold, _ in fusions:
+        wrong = _errors_so_far(fused, threshold)
         # a probe's comparisons share a stamp: the last one holds
         last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
         canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
@@ -98,11 +128,6 @@ def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> Non
         score = fused.score[chosen][rows]
         canvas.send(f"{plot}/{name}", time_ns[chosen][rows], rr.Scalars.columns(scalars=score))
         canvas.fix(f"{plot}/{name}", POINTS(names=[name], colors=[colour]))
-    if fused.threshold is not None:
-        ends = np.array([time_ns[0], time_ns[-1]])
-        level = rr.Scalars.columns(scalars=[fused.threshold] * 2)
-        canvas.send(f"{plot}/threshold", ends, level)
-        canvas.fix(f"{plot}/threshold", LINE(names=["threshold"], colors=[WRONG]))
 
 
 def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
@@ -111,15 +136,8 @@ def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
     return order[np.append(time_ns[order][1:] != time_ns[order][:-1], True)]
 
 
-def _errors_so_far(fused: Fused) -> Floats:
-    """Compute per cent of comparisons so far that were decided wrongly: the mean of both classes' rates.
-
-    A fusion without a threshold is judged half-way between the medians of genuine and impostor scores.
-    """
-    threshold = fused.threshold
-    if threshold is None:
-        medians = [np.median(fused.score[rows]) for rows in (fused.genuine, ~fused.genuine)]
-        threshold = float(np.mean(medians))
+def _errors_so_far(fused: Fused, threshold: float) -> Floats:
+    """Compute per cent of comparisons so far that were decided wrongly: mean of both classes' rates."""
     wrong = (fused.score > threshold) != fused.genuine
     rates = []
     for chosen in (fused.genuine, ~fused.genuine):
@@ -128,11 +146,13 @@ def _errors_so_far(fused: Fused) -> Floats:
     return 50 * np.sum(rates, axis=0)
 
 
-def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
+def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChartView:
     """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars.
 
     Their bars stand side by side within each bin. A bar as high as all marks the threshold.
     """
+    estimator, fused, time_ns, threshold, note = fusion
+    entity = entity_path("fusion", case, estimator, "distribution")
     low = np.quantile(fused.score[~fused.genuine], 0.001)
     high = np.quantile(fused.score[fused.genuine], SHOWN_SHARE)
     edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
@@ -157,14 +177,13 @@ def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times
             )
             canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
         largest = max(largest, float(shares[-1].max()))
-    if fused.threshold is not None:
-        # a single bar is none to Rerun
-        heights, places = np.array([0.0, largest]), np.array([low, fused.threshold])
-        mark = rr.BarChart(heights, abscissa=places, color=WRONG, widths=[0.2 * width] * 2)
-        canvas.fix(f"{entity}/threshold", mark)
+    # a single bar is none to Rerun
+    heights, places = np.array([0.0, largest]), np.array([low, threshold])
+    mark = rr.BarChart(heights, abscissa=places, color=WRONG, widths=[0.2 * width] * 2)
+    canvas.fix(f"{entity}/threshold", mark)
     return rrb.BarChartView(
         origin=escaped(entity),
-        name="Scores so far (share in each bin)",
+        name=f"{_quantity_of(fusion)}, all comparisons so far (share in each bin){note}",
         plot_legend=rrb.PlotLegend(visible=False),
     )
 
@@ -186,8 +205,8 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
         left_out = len(np.unique(probe[~known]))
         without = f", without {left_out} that it could not enrol" if left_out else ""
         extent = below_legend([fused.score[fused.genuine], fused.score[~fused.genuine]])
-        title = f"{matchers[index].name}: score of each probe{without}"
-        views.append(plot_view(plot, title, "-", extent, legend=False, zoom_lock=False))
+        title, note = f"{matchers[index].name}: score", f"{without}; {OF_PROBE}"
+        views.append(plot_view(plot, title, "-", extent, note=note, legend=False, zoom_lock=False))
     return views
 
 

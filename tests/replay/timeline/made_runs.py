@@ -53,7 +53,7 @@ def sets(rings: list[Any]) -> MadeRun:
     return MadeRun(own("relative-bearings", truth, marks), [vertices, sizes])
 
 
-def scores(given: Any, arrivals: Any) -> MadeRun:
+def scores(given: Any, arrivals: Any, threshold: str = "3.0") -> MadeRun:
     """Scores (users, users, 2) of two fingers, one probe of each user; their sums are what is fused."""
     matchers = (
         Matcher(name="left", modality="finger", failure=-1.0),
@@ -64,7 +64,7 @@ def scores(given: Any, arrivals: Any) -> MadeRun:
         "/estimates/one/finger/score",
         schemas.SCORE_VECTOR,
         np.repeat(arrivals, len(users)),
-        metadata={"components": "log_likelihood_ratio", "threshold": "3.0"},
+        metadata={"components": "log_likelihood_ratio", "threshold": threshold},
         probe_id=np.repeat(users, len(users)),
         gallery_id=np.tile(users, len(users)),
         scores=given.sum(axis=2).reshape(-1, 1),

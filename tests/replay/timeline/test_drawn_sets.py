@@ -9,6 +9,7 @@ from matplotlib.colors import rgb_to_hsv
 from scipy.stats import chi2
 
 from fuselog.recorders.log import make_stream, schemas
+from fuselog.replay.families.biometrics.timeline import OF_PROBE
 from fuselog.replay.families.tracking.ais_timeline import track_colours
 from fuselog.replay.timeline.drawing.canvas import PALETTE, WRONG
 from fuselog.replay.timeline.show import Drawing
@@ -81,14 +82,33 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
         abs=width / 30,
     )
     titles = {
-        ("Log-likelihood ratio of each probe (-)", "fusion/finger/one/scores"),
-        ("Scores so far (share in each bin)", "fusion/finger/one/distribution"),
+        (f"one: log-likelihood ratio, {OF_PROBE} (-)", "fusion/finger/one/scores"),
+        (
+            "one: log-likelihood ratio, all comparisons so far (share in each bin)",
+            "fusion/finger/one/distribution",
+        ),
         ("Wrong decisions so far (%)", "errors/finger"),
         ("ROC: genuine rejected (share) over impostors accepted (share)", "rates/finger"),
-        ("left: score of each probe (-)", "matchers/finger/left"),
-        ("right: score of each probe (-)", "matchers/finger/right"),
+        (f"left: score (-); {OF_PROBE}", "matchers/finger/left"),
+        (f"right: score (-); {OF_PROBE}", "matchers/finger/right"),
     }
     check_views(run.picture, titles)
+
+
+def test_a_fusion_without_a_threshold_decides_half_way_between_the_medians(tmp_path: Path) -> None:
+    """The histogram and the probes have that threshold, and their titles tell where it is from."""
+    given = np.random.default_rng(1).uniform(0.0, 1.0, (4, 4, 2)) + 2.0 * np.eye(4)[:, :, None]
+    run = drawn(tmp_path, *scores(given, SECOND * np.arange(1, 5), threshold=""))
+    sums, own_user = given.sum(axis=2), np.eye(4) > 0
+    middle = 0.5 * (np.median(sums[own_user]) + np.median(sums[~own_user]))
+    root = "/fusion/finger/one"
+    assert np.ravel(run.picture.moving[f"{root}/scores/threshold"]["Scalars:scalars"]) == (
+        pytest.approx([middle] * 2)
+    )
+    bars = run.picture.still[f"{root}/distribution/threshold"]["BarChart:abscissa"][0][0]
+    assert np.array(bars["buffer"])[1] == pytest.approx(middle)
+    told = [view.name for view in run.picture.views if "half-way between medians" in view.name]
+    assert len(told) == 2
 
 
 def test_a_failure_to_enrol_is_no_score(tmp_path: Path) -> None:
@@ -98,8 +118,8 @@ def test_a_failure_to_enrol_is_no_score(tmp_path: Path) -> None:
     drawn_scores = np.ravel(run.picture.moving["/matchers/finger/left/genuine"]["Scalars:scalars"])
     assert drawn_scores == pytest.approx(np.diag(given[:, :, 0])[[0, 2, 3]])
     names = {view.name for view in run.picture.views}
-    assert "left: score of each probe, without 1 that it could not enrol (-)" in names
-    assert "right: score of each probe (-)" in names
+    assert f"left: score (-), without 1 that it could not enrol; {OF_PROBE}" in names
+    assert f"right: score (-); {OF_PROBE}" in names
 
 
 def test_neighbours_in_number_are_far_apart_in_hue() -> None:
