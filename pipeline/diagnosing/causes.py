@@ -390,8 +390,8 @@ class _Search:
             return self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
         for place, each in enumerate(found):
             found[place] = self._likelier(found, place, fitted.log_likelihood)
-            if found[place].supposed.of is not each.supposed.of:
-                return self._together(found)
+            if found[place].supposed.of is not each.supposed.of:  # it comes after what was likelier
+                return self._together([*found[:place], *found[place + 1 :], found[place]])
         return found
 
     def _needed(self, found: list[Found], fitted: Fit) -> list[Found]:
