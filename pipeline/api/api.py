@@ -19,7 +19,7 @@ from fuselog.pipeline.api.catalog import LISTS, Entries, Entry, entry_or_why
 from fuselog.pipeline.api.lists import listed
 from fuselog.pipeline.output.outputs import LOG, check_files, check_folder
 from fuselog.pipeline.output.results import Result, read_table
-from fuselog.pipeline.output.showing import Shown, shown_metrics
+from fuselog.pipeline.output.showing import Showing, Shown, shown_metrics
 from fuselog.pipeline.output.summary import summary_table
 from fuselog.pipeline.output.terminal import PrintedTable
 from fuselog.pipeline.runs.ensemble import Progress, no_progress
@@ -103,7 +103,7 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
 
 
 @dataclass(frozen=True, repr=False)
-class ResultFolder:
+class ResultFolder(Showing):
     """Represents a result folder, and what its result.json says.
 
     Attributes:
@@ -113,12 +113,6 @@ class ResultFolder:
 
     folder: Path
     result: Result
-
-    def __repr__(self) -> str:
-        return self._shown.text
-
-    def _repr_html_(self) -> str:
-        return self._shown.html
 
     @property
     def _shown(self) -> Shown:

@@ -26,7 +26,7 @@ from fuselog.pipeline.output.charts import draw
 from fuselog.pipeline.output.coverage import coverage_table, sentences
 from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
 from fuselog.pipeline.output.results import in_order, plain, result_folder, write_outcome
-from fuselog.pipeline.output.showing import Shown, shown_metrics
+from fuselog.pipeline.output.showing import Showing, Shown, shown_metrics
 from fuselog.pipeline.output.summary import error_charts, summarise, summary_table
 from fuselog.pipeline.runs.ensemble import Pass, Settings, judge_logs
 from fuselog.pipeline.runs.estimates import add_to_hash
@@ -126,7 +126,7 @@ class _Estimated(LogSource):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Replay:
+class Replay(Showing):
     """Holds what estimators made of logs.
 
     Attributes:
@@ -150,12 +150,6 @@ class Replay:
     def judge(self) -> Judge:
         """Judge what the estimators are worth."""
         return self.done.judge
-
-    def __repr__(self) -> str:
-        return self._shown.text
-
-    def _repr_html_(self) -> str:
-        return self._shown.html
 
     @property
     def _shown(self) -> Shown:

@@ -9,12 +9,12 @@ from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
-    ESTIMATOR,
     EXPERIMENT,
     PAGE,
     RESULT,
     arrival_option,
     errors_option,
+    estimator_option,
     json_option,
     late_option,
     parameters_alone_option,
@@ -42,14 +42,7 @@ stress_option = click.option(
     "fuselog run a.mcap b.mcap -e ekf -e ukf --out out/mine",
 )
 @click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
-@click.option(
-    "-e",
-    "--estimator",
-    "labels",
-    type=ESTIMATOR,
-    multiple=True,
-    help="For logs: an estimator (repeatable).",
-)
+@estimator_option("labels", "For logs: an estimator (repeatable).", many=True)
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option(
@@ -98,14 +91,7 @@ def run(
     "fuselog sweep landmarks --over robots=1,2 --over duration_s=10:60:6",
 )
 @click.argument("experiment", nargs=-1, required=True, type=EXPERIMENT)
-@click.option(
-    "-e",
-    "--estimator",
-    "labels",
-    type=ESTIMATOR,
-    multiple=True,
-    help="For logs: an estimator (repeatable).",
-)
+@estimator_option("labels", "For logs: an estimator (repeatable).", many=True)
 @click.option(
     "--over",
     "swept",

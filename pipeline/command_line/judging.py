@@ -8,7 +8,6 @@ import click
 from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
-    ESTIMATOR,
     FORMAT,
     METRIC,
     MODEL,
@@ -17,6 +16,7 @@ from fuselog.pipeline.command_line.options import (
     Seconds,
     TimeOffset,
     errors_option,
+    estimator_option,
     gap_option,
     json_option,
     recover_option,
@@ -133,9 +133,7 @@ def evaluate(
     "fuselog compare out/landmarks/logs -e ekf -e smoother:ekf",
 )
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
-@click.option(
-    "-e", "--estimator", "labels", type=ESTIMATOR, multiple=True, help="Which estimators (repeatable)."
-)
+@estimator_option("labels", "Which estimators (repeatable).", many=True)
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
 @click.option(
     "--case", help="Which truth trajectory files are judged by, such as robot2, where a log has several."
@@ -179,13 +177,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     "fuselog diagnose run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
-@click.option(
-    "-e",
-    "--estimator",
-    "label",
-    type=ESTIMATOR,
-    help="The estimator; by default the only one of estimates.",
-)
+@estimator_option("label", "The estimator; by default the only one of estimates.")
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
 @click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
 @click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
@@ -207,15 +199,7 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     "fuselog stress run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=ANY_PATH)
-@click.option(
-    "-e",
-    "--estimator",
-    "labels",
-    type=ESTIMATOR,
-    multiple=True,
-    required=True,
-    help="Which estimators (repeatable).",
-)
+@estimator_option("labels", "Which estimators (repeatable).", many=True, required=True)
 @click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
 @click.option(

@@ -202,6 +202,15 @@ foxglove_option = click.option(
 )
 
 
+def estimator_option(
+    name: str, text: str, *, many: bool = False, required: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add `-e`, which names an estimator, as the argument `name`; `many` takes it several times."""
+    return click.option(
+        "-e", "--estimator", name, type=ESTIMATOR, multiple=many, required=required, help=text
+    )
+
+
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return the option --set of a command; `fuselog.pipeline.api.asking.TAKERS` says what takes it.
 

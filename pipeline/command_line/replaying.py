@@ -9,7 +9,6 @@ from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
-    ESTIMATOR,
     GOLDEN,
     JUNIT,
     LOG_OR_FOLDER,
@@ -18,6 +17,7 @@ from fuselog.pipeline.command_line.options import (
     TIMELINE,
     Seconds,
     arrival_option,
+    estimator_option,
     foxglove_option,
     gap_option,
     json_option,
@@ -53,15 +53,7 @@ folds_option = click.option(
     "fuselog replay run.mcap -e ekf --arrival-order --late rewind:0.5",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option(
-    "-e",
-    "--estimator",
-    "names",
-    type=ESTIMATOR,
-    multiple=True,
-    required=True,
-    help="An estimator (repeatable).",
-)
+@estimator_option("names", "An estimator (repeatable).", many=True, required=True)
 @click.option(
     "-o",
     "--out",
@@ -123,15 +115,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "fuselog explore run.mcap -e ekf -e ukf --set gate_probability=1",
 )
 @click.argument("log", type=ANY_PATH)
-@click.option(
-    "-e",
-    "--estimator",
-    "names",
-    type=ESTIMATOR,
-    multiple=True,
-    required=True,
-    help="An estimator, or two (repeatable).",
-)
+@estimator_option("names", "An estimator, or two (repeatable).", many=True, required=True)
 @click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
 @click.option("--no-browser", is_flag=True, help="Print the page's address, and open nothing.")
 @recover_option
@@ -155,7 +139,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     "fuselog tune train -e ekf --free sigma_range_m --validate test",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "label", type=ESTIMATOR, required=True, help="The estimator.")
+@estimator_option("label", "The estimator.", required=True)
 @click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
 @click.option(
     "--by",
@@ -204,7 +188,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     "fuselog calibrate train -e ekf --fixed lever_y_m --validate test",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-e", "--estimator", "label", type=ESTIMATOR, required=True, help="The estimator.")
+@estimator_option("label", "The estimator.", required=True)
 @click.option(
     "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
 )
@@ -248,14 +232,11 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("path", type=ANY_PATH)
 @click.option("--against", "golden", type=GOLDEN, required=True, help="The golden, a .golden.xz file.")
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
-@click.option(
-    "-e",
-    "--estimator",
+@estimator_option(
     "labels",
-    type=ESTIMATOR,
-    multiple=True,
-    help="With --update: an estimator of the golden (repeatable). Without: a program to check in the "
+    "With --update: an estimator of the golden (repeatable). Without: a program to check in the "
     "place of the golden's estimator, as lib:./robot_ekf.so.",
+    many=True,
 )
 @arrival_option
 @late_option
@@ -300,9 +281,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     "fuselog deploy run.mcap -e ekf --settings tuned.toml --single -o robot_ekf",
 )
 @click.argument("log", type=ANY_PATH)
-@click.option(
-    "-e", "--estimator", "name", type=ESTIMATOR, required=True, help="The filter: ekf, or ukf."
-)
+@estimator_option("name", "The filter: ekf, or ukf.", required=True)
 @click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
 @click.option(
     "-o",

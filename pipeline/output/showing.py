@@ -1,5 +1,6 @@
 """Shows what an object of the Python interface holds: in a few lines, and as tables in a notebook."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, NamedTuple
@@ -40,6 +41,20 @@ class Shown(NamedTuple):
     def _first(self) -> list[str]:
         more = len(self.sentences) - MOST_SENTENCES
         return [*self.sentences[:MOST_SENTENCES], *([f"and {more} more"] if more > 0 else [])]
+
+
+class Showing(ABC):
+    """Prints as what `_shown` gives: as text, and as HTML in a notebook."""
+
+    @property
+    @abstractmethod
+    def _shown(self) -> Shown: ...
+
+    def __repr__(self) -> str:
+        return self._shown.text
+
+    def _repr_html_(self) -> str:
+        return self._shown.html
 
 
 def shown_metrics(
