@@ -144,7 +144,8 @@ def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[floa
     step = 1e-3 * max(abs(value), 1.0)
     for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
         costs = near([-step, 0.0, step])
-        bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
+        with np.errstate(invalid="ignore"):  # infinite costs have no curvature
+            bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
         step = bend**-0.5 if 0.0 < bend < np.inf else step * (10.0 if bend <= 0.0 else 0.1)
     return UNIT * step, costs
 

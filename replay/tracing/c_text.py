@@ -114,7 +114,15 @@ class Precision(NamedTuple):
     ending: str = ""
 
     def number(self, value: float) -> str:
-        """Write a number, so that it is read as the same one."""
+        """Write a number, so that it is read as the same one.
+
+        What `float` would round to zero is its least normal number, so that nothing is divided by zero
+        that is not zero in double precision; what is beyond its range is infinite.
+        """
+        if self.ending and np.isfinite(value) and value != 0.0:
+            limits = np.finfo(np.float32)
+            size = max(abs(value), float(limits.tiny))
+            value = math.copysign(size if size <= limits.max else math.inf, value)
         if math.isnan(value):
             return f"({self.real})NAN"
         if math.isinf(value):

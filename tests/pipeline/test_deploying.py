@@ -255,6 +255,17 @@ def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
 
 @pytest.mark.paper
 @needs_compiler
+def test_a_body_that_does_not_turn_has_an_orientation_in_single_precision(tmp_path: Path) -> None:
+    """A rotation by nothing is divided by its angle, which a tiny constant keeps from being zero."""
+    samples = carried()[0].take(slice(0, 60))
+    at_rest = replace(samples, columns={**samples.columns, "turn_rate_radps": np.zeros((60, 3))})
+    fl.write(tmp_path / "rest.mcap", [at_rest])
+    folder = fl.deploy(tmp_path / "rest.mcap", "ekf", tmp_path / "hand", model="orientation", single=True)
+    assert furthest(compiled(folder)) < 1e-3
+
+
+@pytest.mark.paper
+@needs_compiler
 @pytest.mark.parametrize(("label", "single"), [("ekf", True), ("sqrt:ukf", False)])
 def test_a_hostile_caller_gets_outcomes_and_finite_states(
     tmp_path: Path, label: str, single: bool

@@ -257,6 +257,20 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
 
 
 @pytest.mark.paper
+def test_fixes_at_the_limit_of_what_is_possible_are_outliers() -> None:
+    """A larger scale would leave them out, as impossible, and gain by that."""
+    fix, seen = {"rate_hz": 2.0, "sigma_m": 0.3}, {"rate_hz": 0.0}
+    log = fl.record("landmarks", seed=3, duration_s=30.0, fix=fix, range_bearing=seen)
+    right = log.streams["/robot1/fix"]
+    wild = right["position_m"].copy()
+    wild[5::12] = 1e12
+    faulty = replace(right, columns={**right.columns, "position_m": wild})
+    found = fl.diagnose(replace(log, streams={**log.streams, right.topic: faulty}), "ekf")
+    assert found.sentences[0].kind == "outliers"
+    assert not any("left out" in note for note in found.notes)
+
+
+@pytest.mark.paper
 def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
     """The second gains what it gains after the first is undone."""
     faulty = alter.altered(run, SEEN, alter.shifted("range_m"), 0.2)
