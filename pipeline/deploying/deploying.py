@@ -1,5 +1,6 @@
 """Writes a filter as C99: `deploy`."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,7 @@ def deploy(
     run, name = open_source(log), identifier(place.resolve().name)
     precision = SINGLE if single else DOUBLE
     bound, made = _made(name, label, {**settings, **parameters}, run, precision)
+    made = _without_clash(made)
     vectors = vectors_of(run, bound, made.filtering)
     files = {
         f"{made.name}.h": header(made),
@@ -144,6 +146,13 @@ def _made(
     bound, filtering, kind = _bound(label, dict(settings), run)
     origin = f"{filtering.stage.model.summary}: {filtering.method.summary}."
     return bound, CFilter(name, filtering, whole_steps(filtering, kind), precision, origin)
+
+
+def _without_clash(made: CFilter) -> CFilter:
+    """Return the filter under a name that is no other word of its C, such as a variable's."""
+    text = source(made._replace(name="fuselog_filter"))
+    words = re.findall(r"\w+", re.sub(r'/\*.*?\*/|//[^\n]*|"[^"\n]*"', " ", text, flags=re.DOTALL))
+    return made._replace(name=f"{made.name}_") if made.name in words else made
 
 
 def _check_empty(folder: Path) -> None:

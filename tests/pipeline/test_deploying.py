@@ -256,11 +256,14 @@ def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
 @pytest.mark.paper
 @needs_compiler
 def test_a_body_that_does_not_turn_has_an_orientation_in_single_precision(tmp_path: Path) -> None:
-    """A rotation by nothing is divided by its angle, which a tiny constant keeps from being zero."""
+    """A rotation by nothing is divided by its angle, which a tiny constant keeps from being zero.
+
+    The folder has the name of a variable of its own C.
+    """
     samples = carried()[0].take(slice(0, 60))
     at_rest = replace(samples, columns={**samples.columns, "turn_rate_radps": np.zeros((60, 3))})
     fl.write(tmp_path / "rest.mcap", [at_rest])
-    folder = fl.deploy(tmp_path / "rest.mcap", "ekf", tmp_path / "hand", model="orientation", single=True)
+    folder = fl.deploy(tmp_path / "rest.mcap", "ekf", tmp_path / "c", model="orientation", single=True)
     assert furthest(compiled(folder)) < 1e-3
 
 
