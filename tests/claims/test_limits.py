@@ -98,6 +98,7 @@ def _ours(made: Made, factor: float) -> str:
     return claim.ours
 
 
+@pytest.mark.paper
 def test_nothing_is_decided_by_what_is_missing() -> None:
     """A claim that lacks the numbers that it reads is neither confirmed nor refuted."""
     for made, found in all_limits():

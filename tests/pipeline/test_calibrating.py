@@ -386,6 +386,7 @@ def late_fixes(delay_s: float, first: int) -> fl.MemorySource:
     return replace(log, streams={**log.streams, "/robot1/fix": late})
 
 
+@pytest.mark.paper
 def test_a_delay_may_put_fixes_before_the_prior() -> None:
     """With a little more than the delay the first fix is before the prior, and gives no innovation."""
     found = fl.tune(late_fixes(0.06, first=0), "ekf", "fix_delay_s")

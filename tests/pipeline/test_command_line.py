@@ -880,6 +880,7 @@ def test_an_environment_variable_that_cannot_be_is_named(
 
 
 @pytest.mark.parametrize(("name", "value"), [("RERUN", "off"), ("RERUN_FLUSH_NUM_ROWS", "x")])
+@pytest.mark.paper
 def test_variables_of_rerun_leave_a_timeline_as_it_is(
     name: str, value: str, world: Path, tmp_path: Path, start_fuselog: Callable[..., Any]
 ) -> None:

@@ -239,6 +239,7 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     assert (told.kind, told.topic) == ("clock drift", SEEN)
 
 
+@pytest.mark.paper
 def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
     """No noise explains it: the likelihood of a noise that lets the filter follow is a spike."""
     fix, seen = {"rate_hz": 5.0, "sigma_m": 0.3}, {"rate_hz": 0.0}

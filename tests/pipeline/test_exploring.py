@@ -499,6 +499,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.paper
 def test_a_script_that_ends_with_an_open_page_ends_the_server(log: Path, tmp_path: Path) -> None:
     """Python up to 3.13 breaks off threads that are still at work, which can abort the process."""
     pytest.importorskip("bokeh")

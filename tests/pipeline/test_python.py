@@ -119,6 +119,7 @@ def test_plug_ins_import_from_fuselog_alone() -> None:
     assert imported - sys.stdlib_module_names == {"fuselog", "numpy", "pydantic"}
 
 
+@pytest.mark.paper
 def test_a_user_may_have_modules_of_the_same_names(tmp_path: Path) -> None:
     """Of our rooms, beside a script that uses both."""
     names = "pipeline", "recorders", "replay"

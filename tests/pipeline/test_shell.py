@@ -21,6 +21,7 @@ BIN = Path(sys.executable).parent
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
+@pytest.mark.paper
 def test_the_readmes_line_completes_commands_options_names_and_settings() -> None:
     """What bash offers after what was typed so far, once the line has been run."""
     page = (ROOT / "README.md").read_text(encoding="utf-8")
