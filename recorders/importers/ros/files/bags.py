@@ -53,7 +53,8 @@ class Bag:
     @property
     def losses(self) -> list[str]:
         """Return what cannot be read, a sentence each; whole after the reading."""
-        return [*self.missing, *(loss for file in self.files for loss in file.losses)]
+        found = [*self.missing, *(loss for file in self.files for loss in file.losses)]
+        return list(dict.fromkeys(found))  # what is read twice is told twice
 
 
 def looks_like_bag(path: Path) -> bool:
@@ -106,7 +107,7 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
     if place.suffix == ".db3":
         from fuselog.recorders.importers.ros.files.sqlite_file import SqliteFile
 
-        return SqliteFile(place)
+        return SqliteFile(place, scratch)
     if place.suffix in (".bag", ".active"):
         from fuselog.recorders.importers.ros.files.ros1_file import Ros1File
 

@@ -45,14 +45,16 @@ class Batch(NamedTuple):
 class BagFile(Protocol):
     """Reads one file of a bag.
 
-    `losses` says what of it cannot be read; it is whole after the reading. `others` names what is in it
-    beside messages.
+    `losses` is whole after the reading. `others` names what is in the file beside messages.
     """
 
     path: Path
     connections: list[Connection]
     others: list[str]
-    losses: list[str]
+
+    @property
+    def losses(self) -> list[str]:
+        """Return what cannot be read, a sentence each."""
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
         """Return the messages of the wanted connections, a chunk of the file at a time."""

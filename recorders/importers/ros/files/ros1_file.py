@@ -110,7 +110,7 @@ class Ros1File:
             elif record.kind == _CHUNK_INFO:
                 for number, count in np.frombuffer(_read(file, record), _COUNT).tolist():
                     self._counts[number] += count
-        if self._chunks and not has_index:
+        if self._chunks and (self.losses or not has_index):  # an index that was cut off lacks some
             if not self.losses:
                 self.losses.append(f"{self.path}: was not closed; it has no index, and is read without")
             self._counts.clear()
@@ -153,6 +153,13 @@ class Ros1File:
                 if found.end < len(data):
                     lost = len(data) - found.end
                     self.losses.append(f"{place}: its last {lost} bytes are not a whole message")
+                is_known = np.isin(found.connections, list(self._by_id))
+                strange = (found.kinds != _CONNECTION) & ~((found.kinds == _MESSAGE) & is_known)
+                if strange.any():
+                    count = int(strange.sum())
+                    self.losses.append(
+                        f"{place}: {count} records are no messages of its topics, and lost"
+                    )
                 for number, connection in chosen.items():
                     rows = (found.kinds == _MESSAGE) & (found.connections == number)
                     if rows.any():
