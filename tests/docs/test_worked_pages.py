@@ -30,6 +30,7 @@ from tests.pipeline.conftest import run_here
 DOCS = Path(__file__).parents[2] / "docs"
 WORKED = [
     "start",
+    "inconsistent",
     "judge",
     "smooth",
     "contract",
