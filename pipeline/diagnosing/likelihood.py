@@ -12,6 +12,7 @@ Methods, 2nd ed. 2012, chapter 7.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -75,7 +76,7 @@ class Scored(NamedTuple):
 class Likelihood:
     """Computes the log-likelihood of trials that have the measurements of one run.
 
-    Trials of equal settings are replayed together, as the runs of an ensemble.
+    Trials whose estimators differ only in numbers are replayed together, as the runs of an ensemble.
 
     Attributes:
         label: the estimator's.
@@ -103,7 +104,7 @@ class Likelihood:
         From the likeliest part of broad starts, where the log does not state one. Raises BadInput where
         the estimator cannot begin.
         """
-        bound = self._bound_to(trial, _key(trial))
+        bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
         later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
         self.starts = broad_starts(replace(trial.source, streams=later), bound)
@@ -119,7 +120,7 @@ class Likelihood:
             if topic not in reading.controls and len(trial.source.streams[topic])
         }
         scored = self._scored(trial, bound)
-        [parts] = self._innovations(bound, [scored])
+        [parts] = self._innovations([bound], [scored])
         found = max(parts, key=_stated)
         for name, reading in self.readings.items():
             if _topic(name) in found:
@@ -141,24 +142,24 @@ class Likelihood:
         Minus infinity where the estimator fails or loses measurements.
         """
         together: dict[Hashable, list[int]] = {}
+        bound: dict[int, list[Bound]] = {}
         for place, trial in enumerate(trials):
-            together.setdefault(_key(trial), []).append(place)
+            stated, key = _stated_by(trial), _key(trial)
+            with suppress(BadInput):  # no run can be followed with these
+                bound[place] = self._bound_to(trial, (key, stated))
+                together.setdefault((_alike(bound[place]) or key, stated), []).append(place)
         found = np.full((len(trials), count), -np.inf)
-        for key, of_key in together.items():
-            try:
-                bound = self._bound_to(trials[of_key[0]], key)
-            except BadInput:  # no run can be followed with these
-                continue
-            for places in self._parts(trials, of_key):
-                scored = [self._scored(trials[place], bound) for place in places]
-                outputs = self._innovations(bound, scored)
+        for alike in together.values():
+            for places in self._parts(trials, alike):
+                scored = [self._scored(trials[place], bound[place]) for place in places]
+                outputs = self._innovations([bound[place] for place in places], scored)
                 for place, part, of_run in zip(places, scored, outputs, strict=True):
                     found[place] = self._totals(part, of_run, count)
         return found
 
     def disturbed(self, trial: Trial) -> list[MemorySource]:
         """Return copies of a trial's log with noise added to what drives."""
-        return disturbed(trial.source, self._bound_to(trial, _key(trial)))
+        return disturbed(trial.source, self._bound_to(trial))
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
         """Divide trials into portions that memory holds."""
@@ -166,7 +167,8 @@ class Likelihood:
         size = max(1, MOST_MESSAGES // max(messages, 1))
         return (places[first : first + size] for first in range(0, len(places), size))
 
-    def _bound_to(self, trial: Trial, key: Hashable) -> list[Bound]:
+    def _bound_to(self, trial: Trial, key: Hashable = None) -> list[Bound]:
+        key = key or (_key(trial), _stated_by(trial))
         if key not in self._bound:
             self._bound[key] = bind(self.label, [trial.source], trial.settings)
         return self._bound[key]
@@ -202,10 +204,11 @@ class Likelihood:
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
-        self, bound: Sequence[Bound], scored: Sequence[Scored]
+        self, bounds: Sequence[Sequence[Bound]], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
-        """Return the innovations of trials of equal settings, by part and topic; none where it fails."""
+        """Return the innovations of trials of alike estimators, by part and topic; none if it fails."""
         count = part_count(self.starts)
+        bound = [_together(each, count) for each in zip(*bounds, strict=True)]
         sources = [each.source for each in scored for _ in range(count)]
         begins_ns = [each.begin_ns for each in scored]
         try:
@@ -217,7 +220,10 @@ class Likelihood:
             ]
             outputs = collect(replay(Ensemble(sources), begun, is_part=True))
         except BadInput:  # no run can be followed with these
-            return [[{}] * count for _ in scored]
+            outputs = {}
+        if not outputs and any(each is not bounds[0] for each in bounds):
+            alone = zip(bounds, scored, strict=True)
+            return [parts for each, own in alone for parts in self._innovations([each], [own])]
         innovations = {
             topic: rows
             for topic, rows in outputs.items()
@@ -361,10 +367,28 @@ def _stated(innovations: Mapping[str, Stream]) -> float:
     return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
-def _key(trial: Trial) -> Hashable:
-    """Return what has to be equal of trials that are replayed together."""
-    stated = [(topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items()]
-    return repr(sorted(trial.settings.items())), *stated
+def _stated_by(trial: Trial) -> Hashable:
+    """Return what channels state, which has to be equal of trials that are replayed together."""
+    return tuple((topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items())
+
+
+def _key(trial: Trial) -> str:
+    return repr(sorted(trial.settings.items()))
+
+
+def _alike(bound: Sequence[Bound]) -> Hashable:
+    """Return what has to be equal of estimators that are replayed together; None if nothing suffices."""
+    keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
+    return tuple(keys) if len(keys) == len(bound) else None
+
+
+def _together(bounds: Sequence[Bound], count: int) -> Bound:
+    """Make one estimator of runs that stand there `count` times each, and each have their own."""
+    first = bounds[0]
+    alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
+    if all(each is first for each in bounds):
+        return first
+    return alike[0].together(np.repeat([each.numbers for each in alike], count, axis=0))
 
 
 def _extents(stream: Stream) -> Floats:

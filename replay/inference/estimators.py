@@ -13,8 +13,14 @@ from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import Topic
 from fuselog.recorders.parameters import Parameters, build, meanings
 from fuselog.recorders.registry import available, load
-from fuselog.replay.engine.arrays import AnyArgument
-from fuselog.replay.engine.replaying.estimator import AnyEstimator, Bound, Estimator, Recursive
+from fuselog.replay.engine.arrays import AnyArgument, Floats
+from fuselog.replay.engine.replaying.estimator import (
+    Alike,
+    AnyEstimator,
+    Bound,
+    Estimator,
+    Recursive,
+)
 from fuselog.replay.engine.replaying.truth import refuse_named_truths
 from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.model.augmentation import (
@@ -322,6 +328,9 @@ def bind_model(
             truth=found.truth,
             is_bound=filtering.is_bound,
         )
+        if type(filtering) is Filter and not (is_random or added.names):
+            together = partial(_together, made, filtering)
+            made = replace(made, alike=Alike(filtering.beside_settings, settings, together))
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 
@@ -361,6 +370,12 @@ def _reprocessing(
         )
     back = OutOfSequenceFilter(filtering, window_ns)
     return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
+
+
+def _together(bound: Recursive, filtering: Filter, settings: Floats) -> Recursive:
+    """Make the estimator whose runs have settings (runs, 1 + sensors, fields) of their own."""
+    each = replace(filtering, each_run=settings)
+    return replace(bound, start=each.start, run=each.run, finish=each.finish)
 
 
 def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Method:

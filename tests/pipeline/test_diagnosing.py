@@ -16,6 +16,7 @@ import fuselog as fl
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.altering import sources as altering
 from fuselog.pipeline.diagnosing import diagnosis, study
+from fuselog.pipeline.diagnosing import likelihood as trials_of
 from fuselog.pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from fuselog.pipeline.diagnosing.consistency import of_each_component
 from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
@@ -131,6 +132,32 @@ def test_every_search_ends(name: str) -> None:
 def run() -> fl.MemorySource:
     """A robot for half a minute, without a fault."""
     return fl.record("landmarks", seed=3, duration_s=30.0, speed_mps=2.0)
+
+
+def test_trials_with_other_numbers_are_replayed_together(
+    run: fl.MemorySource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has exactly the likelihood that it has by itself; another gate is another filter."""
+    late = replace(run, streams={**run.streams, SEEN: alter.delayed(run.streams[SEEN], 0.2)})
+    given = {"kind": "ekf", "sigma_range_m": 0.1}
+    tried = [
+        Trial(run, given),
+        Trial(run, {**given, "sigma_bearing_rad": 0.05}),
+        Trial(late, {**given, "bias_range_m": 0.1}),
+        Trial(run, {**given, "gate_probability": 0.9}),
+    ]
+    told, replay, runs = Likelihood("ekf"), trials_of.replay, list[int]()
+    told.begin(tried[0])
+    alone = [told([each])[0] for each in tried]
+
+    def counting(sources: Sequence[Any], *others: Any, **named: Any) -> Any:
+        runs.append(len(sources))
+        return replay(sources, *others, **named)
+
+    monkeypatch.setattr(trials_of, "replay", counting)
+    assert told(tried) == alone
+    assert len({*alone}) == 4
+    assert runs == [3, 1]
 
 
 def first(source: fl.MemorySource, **settings: float) -> Any:

@@ -184,10 +184,14 @@ def in_sense(
 
 def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
     """Return what undoing faults of these numbers, each by itself, gains over a trial."""
-    [before] = likelihood([now])
-    return lambda asked: [
-        found - before for found in likelihood([each.without(now, at) for each, at in asked])
-    ]
+    known: list[float] = []  # the trial's own log-likelihood
+
+    def gains(asked: Sequence[tuple[Hypothesis, Number]]) -> list[float]:
+        found = likelihood([*[now][len(known) :], *(each.without(now, at) for each, at in asked)])
+        known.extend(found[: 1 - len(known)])
+        return [each - known[0] for each in found[len(found) - len(asked) :]]
+
+    return gains
 
 
 def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, gain: float) -> bool:

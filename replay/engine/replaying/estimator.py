@@ -7,7 +7,7 @@ the runs replayed one by one, bit for bit.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -115,6 +115,21 @@ class Needed(NamedTuple):
     refusal: str
 
 
+class Alike(NamedTuple):
+    """Describes bound estimators that differ only in numbers, which may go through runs together.
+
+    Attributes:
+        key: equal for those that may.
+        numbers: those of this estimator.
+        together: the numbers of each run -> the estimator in which each run has numbers of its own. An
+            initialization must not depend on them.
+    """
+
+    key: Hashable
+    numbers: NDArray[np.float64]
+    together: "Callable[[NDArray[np.float64]], Recursive]"
+
+
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True, eq=False)
 class Recursive:
@@ -146,6 +161,8 @@ class Recursive:
         needed: by topic, a field without which it does not fit a log.
         truth: the topic by which its estimates are judged, which it must not read.
         is_bound: whether it is a bound of estimates, which may read the truth.
+        alike: how it goes through runs together with others that differ only in numbers; None if it
+            cannot.
     """
 
     name: str
@@ -166,6 +183,7 @@ class Recursive:
     needed: Mapping[str, Needed] = field(default_factory=dict)
     truth: str = ""
     is_bound: bool = False
+    alike: Alike | None = None
 
 
 @renamed(whole="static")

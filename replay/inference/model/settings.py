@@ -175,14 +175,15 @@ def placed_settings(
     """Repeat settings (1 + sensors, fields) for each run, with the numbers of its plane's origin.
 
     Args:
-        settings: see `settings_of`.
+        settings: see `settings_of`; or (runs, 1 + sensors, fields) if each run has its own.
         names: of its columns.
         found: the topics.
         parameters: as given by the user.
         origins: (runs, 3) of every run's plane, first fixes if none is stated; None without fixes.
         runs: how many there are.
     """
-    placed = np.repeat(settings[None], runs, axis=0)
+    placed = np.empty((runs, *settings.shape[-2:]))
+    placed[:] = settings
     if origins is None or found.origin is not None:
         return placed
     known = np.isfinite(origins[:, 0])

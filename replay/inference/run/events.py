@@ -92,7 +92,7 @@ def events_of(
     read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
     origins = None if context.origins is None else context.origins.tobytes()
     noise = [
-        _own_variances(stage, number, settings).tobytes()
+        own_variances(stage, number, settings).tobytes()
         for number, sensor in enumerate(stage.sensors)
         if sensor.covariance
     ]
@@ -231,7 +231,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     without_covariance = np.zeros(len(stream), bool)
     if sensor.covariance:
         value, spread, without_covariance = with_covariance(sensor, ragged)
-        variances = _own_variances(stage, number, settings)
+        variances = own_variances(stage, number, settings)
         if np.isfinite(variances).all():
             spread[without_covariance], without_covariance = (
                 np.diag(variances),
@@ -264,7 +264,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
-def _own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
+def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
     """Compute the variances that a sensor gives messages without a covariance; NaN where it has none."""
     sensor = stage.sensors[number]
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)

@@ -1,6 +1,6 @@
 """Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
@@ -33,13 +33,18 @@ from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.linear_algebra.covariances import Form
 from fuselog.replay.inference.model.binding import Found
 from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
-from fuselog.replay.inference.model.settings import placed_settings, reading_settings
+from fuselog.replay.inference.model.settings import (
+    origin_parameters,
+    placed_settings,
+    reading_settings,
+)
 from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.events import (
     Context,
     data_columns,
     events_of,
     not_driven,
+    own_variances,
     passed_over,
     points_of,
 )
@@ -136,6 +141,7 @@ class Filter:
         stage, method, parameters: what it is made of.
         settings: (1 + sensors, fields), see `settings_of`.
         samplers: one for each of `Steps.sampled`.
+        each_run: (runs, 1 + sensors, fields), the settings of runs that have their own.
     """
 
     name: str
@@ -145,6 +151,7 @@ class Filter:
     parameters: CombinedParameters
     settings: Floats
     samplers: tuple[Sampler, ...]
+    each_run: Floats | None = None
     is_bound: ClassVar[bool] = False
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
@@ -193,7 +200,8 @@ class Filter:
     def settings_of_runs(self, context: Context, runs: int) -> Floats:
         """Repeat the settings for each run (runs, 1 + sensors, fields), see `placed_settings`."""
         names, of = number_fields(self.stage.model.parameters), (self.found, self.parameters)
-        return placed_settings(self.settings, names, *of, context.origins, runs)
+        settings = self.settings if self.each_run is None else self.each_run
+        return placed_settings(settings, names, *of, context.origins, runs)
 
     def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
@@ -271,6 +279,25 @@ class Filter:
         """Return what drives the motion before the first message of the control."""
         control = self.stage.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
+
+    @cached_property
+    def beside_settings(self) -> Hashable:
+        """Return all that it is made of beside settings that only the loop over the runs reads."""
+        names = {*number_fields(self.stage.model.parameters)} - {"gate_probability"} | {"of_topics"}
+        return (
+            self.name,
+            self.stage,
+            self.method,
+            repr({name: value for name, value in self.parameters if name not in names}),
+            origin_parameters(self.found, self.parameters),
+            self.delays_ns.tobytes(),
+            self.gap_ns,
+            *(
+                own_variances(self.stage, number, self.settings).tobytes()
+                for number, sensor in enumerate(self.stage.sensors)
+                if sensor.covariance
+            ),
+        )
 
     @property
     def why_in_sequence(self) -> str:
