@@ -22,6 +22,7 @@ from pydantic_core import CoreSchema
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parsing import DEEPEST, parse_toml
+from fuselog.recorders.units import unit_of
 
 _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML does not take
 
@@ -128,29 +129,11 @@ def _table_in(annotation: Any) -> type[BaseModel] | None:
     return next(filter(None, map(_table_in, get_args(annotation))), None)
 
 
-# What the end of a parameter's name says of its unit.
-_UNITS = {
-    "s": "s", "h": "h", "hz": "Hz", "m": "m", "m2": "m^2", "mps": "m/s", "mps2": "m/s^2", "ut": "uT",
-    "rad": "rad", "mrad": "mrad", "deg": "deg", "radps": "rad/s", "degps": "deg/s", "db": "dB",
-    "per_s": "1/s", "per_minute": "1/min", "per_m2": "1/m^2", "per_rad": "1/rad",
-    "per_km2_h": "1/(km^2 h)",
-}  # fmt: skip
-_UNIT = re.compile(f"_({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
 _ATTRIBUTES = re.compile(r"^Attributes:\n(?P<entries>(?: .*(?:\n|$)|\n)*)", re.MULTILINE)
 _ENTRY = re.compile(r"^    (?P<names>\w+(?:, \w+)*): (?P<meaning>\S.*(?:\n {5,}\S.*)*)", re.MULTILINE)
 
 
 MOST_WORDS = 8  # of a name
-
-
-def unit_of(name: str) -> str:
-    """Return the unit of a parameter, as the end of its name says it; empty where it says none.
-
-    >>> unit_of("turn_bias_radps"), unit_of("clutter_per_m2"), unit_of("gate_probability")
-    ('rad/s', '1/m^2', '')
-    """
-    found = _UNIT.search(name)
-    return _UNITS[found[1]] if found else ""
 
 
 @cache

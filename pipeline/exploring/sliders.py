@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.pipeline.output.words import MINUS, number
+from fuselog.pipeline.output.words import MINUS, scale
 from fuselog.pipeline.tuning.tuning import value_at_start
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import bounds_of, describe, field_of, roles_of
+from fuselog.recorders.units import parted
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.model.parameters import number_fields
@@ -18,13 +19,6 @@ STEPS = 400  # between the ends of a slider
 FACTOR = 10.0  # a positive parameter goes from its own value divided by this to as many times it
 # How far a parameter of either sign goes where its own value is zero, by its unit.
 REACH = {"m": 1.0, "rad": 0.2, "rad/s": 0.05, "m/s": 1.0, "s": 1.0, "m/s^2": 0.5}
-# Units as people write them: by what to multiply, and what to write, up to a value.
-SMALLER = {
-    "m": ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm")),
-    "s": ((1.0, 1000.0, "ms"),),
-    "rad": ((math.inf, 180.0 / math.pi, "°"),),
-    "rad/s": ((math.inf, 180.0 / math.pi, "°/s"),),
-}
 STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
 
@@ -57,8 +51,7 @@ class Slider(NamedTuple):
         >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
         'sigma range'
         """
-        end = "_" + self.unit.replace("^", "").replace("1/", "per_").replace("/", "p").lower()
-        return self.name.removesuffix(end).replace("_", " ")
+        return parted(self.name)[0].replace("_", " ")
 
     def place(self, value: float) -> float:
         """Return where a value lies between the ends: 0 to 1, beyond them less or more."""
@@ -94,17 +87,9 @@ def in_words(value: float, unit: str) -> str:
     >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
     ('10 cm', '1.15°', '−0.99', '0°')
     """
-    factor, sign = _unit_for(value, unit)
-    text = f"{value * factor:.3g}".replace("-", MINUS)
-    return f"{number(value * factor) if 'e' in text else text}{sign}"
-
-
-def _unit_for(value: float, unit: str) -> tuple[float, str]:
-    """Choose by what to multiply so that a number is handy, and what to write behind it."""
-    for most, factor, shorter in SMALLER.get(unit, ()):
-        if 0.0 < abs(value) < most or most == math.inf:
-            return factor, shorter if shorter.startswith("°") else f" {shorter}"
-    return 1.0, f" {unit}" if unit else ""
+    own = scale(unit, value)
+    text = f"{value * own.factor:.3g}".replace("-", MINUS)
+    return own.signed(own.text(value) if "e" in text else text)
 
 
 def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
@@ -113,13 +98,13 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
     >>> ticks_between(-0.03, 0.03, "m")
     {-0.02: '−2 cm', 0.0: '0', 0.02: '2 cm'}
     """
-    factor, sign = _unit_for(max(abs(low), abs(high)), unit)
-    first, last = low * factor, high * factor
+    own = scale(unit, max(abs(low), abs(high)))
+    first, last = low * own.factor, high * own.factor
     power = 10.0 ** math.floor(math.log10((last - first) / 5))
     step = power * next(each for each in STEPS_OF_TICKS if power * each >= (last - first) / 5)
     places = [place * step for place in range(math.ceil(first / step), math.floor(last / step) + 1)]
-    texts = [f"{f'{place:.6g}'.replace('-', MINUS)}{sign}" if place else "0" for place in places]
-    return {place / factor: text for place, text in zip(places, texts, strict=True)}
+    texts = [own.signed(f"{place:.6g}".replace("-", MINUS)) if place else "0" for place in places]
+    return {place / own.factor: text for place, text in zip(places, texts, strict=True)}
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:

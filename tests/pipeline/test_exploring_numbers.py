@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from fuselog.pipeline.diagnosing.hypotheses.parameters import STEPS
 from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
 from fuselog.pipeline.exploring.verdict import mean_nis, verdict_of
 from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.words import quantity
+from fuselog.pipeline.sensing.preparing import _STILL
+from fuselog.recorders.importers.tables.columns import _ENDINGS, _WRITTEN
+from fuselog.recorders.log.impossible import LIMITS
+from fuselog.recorders.units import ENDINGS, MISTAKEN, Unit, conversion, parted, unit, written
+from fuselog.replay.timeline.drawing.plots import shown_unit
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +71,26 @@ def test_a_place_of_a_slider_is_a_value_of_four_digits(made: Slider, place: floa
     assert made.place(value) == pytest.approx(place, abs=2e-4)
     assert [made.values(3)[0], made.values(3)[-1]] == [made.low, made.high]
     assert made.words(made.own) == in_words(made.own, "m")
+
+
+def test_every_unit_that_one_place_knows_all_know() -> None:
+    """Its size, how it converts, what a report and a timeline write, and how numbers below zero look."""
+    of_units = {*REACH, *STEPS, *LIMITS, *_STILL, *MISTAKEN} - {""}
+    assert of_units <= set(ENDINGS.values())
+    for written_by_others in (_ENDINGS, _WRITTEN):
+        assert all(isinstance(unit(each), Unit) for each in written_by_others.values())
+    for ending, own in ENDINGS.items():
+        name = f"own_{ending}"
+        assert parted(name) == ("own", own)
+        assert conversion(own, name) == 1.0
+        assert quantity(name).unit == own
+        shown, sign, factor = shown_unit(name)
+        degrees = own.replace("rad", "deg") if own in ("rad", "rad/s") else own
+        assert (shown, sign, factor) == ("own", written(degrees), unit(own).size / unit(degrees).size)
+        for value in (1e-5, 0.003, 0.05, 2.0):
+            assert in_words(-value, own) == f"\N{MINUS SIGN}{in_words(value, own)}"
+    for own, others in MISTAKEN.items():
+        assert all(unit(other).powers == unit(own).powers for other in others)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,6 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from fuselog.pipeline.diagnosing.likelihood import Trial
 from fuselog.pipeline.tuning.objective import with_values
-from fuselog.recorders.importers.units import unit_of
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import (
     Described,
@@ -34,6 +33,7 @@ from fuselog.recorders.parameters import (
     in_few_words,
     roles_of,
 )
+from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.engine.streams.sources import MemorySource
