@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.pipeline.output.words import MINUS, scale
 from fuselog.pipeline.tuning.tuning import value_at_start
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.parameters import bounds_of, describe, field_of, roles_of
+from fuselog.recorders.parameters import Parameter, number_of, numbers_of
 from fuselog.recorders.units import parted
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
@@ -23,32 +22,19 @@ STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
 
 
-class Slider(NamedTuple):
-    """Describes a parameter that can be dragged.
+class Slider(Parameter):
+    """Is a parameter that can be dragged; `default` is its own value on the log.
 
-    Attributes:
-        name: of the parameter.
-        group: what it is of: a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
-        meaning, unit: of the parameter.
-        own: its value as the log and the settings have it.
-        low, high: the ends of the slider.
-        is_logarithmic: whether equal ways are equal factors.
+    Its group is a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
     """
 
-    name: str
-    group: str
-    meaning: str
-    unit: str
-    own: float
-    low: float
-    high: float
-    is_logarithmic: bool
+    __slots__ = ()
 
     @property
     def title(self) -> str:
         """Return the name as a person reads it: without its unit.
 
-        >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
+        >>> Slider("sigma_range_m").title
         'sigma range'
         """
         return parted(self.name)[0].replace("_", " ")
@@ -62,9 +48,9 @@ class Slider(NamedTuple):
         """Return the value at a place from 0 to 1, to four digits; the own value where it is that."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
-        value = float(f"{math.exp(there) if self.is_logarithmic else there:.4g}")
-        if abs(place - self.place(self.own)) < 0.5 / STEPS:
-            return self.own
+        value = float(f"{math.exp(there) if self.is_log else there:.4g}")
+        if abs(place - self.place(self.default)) < 0.5 / STEPS:
+            return self.default
         return min(max(value, self.low), self.high)
 
     def values(self, count: int) -> list[float]:
@@ -72,7 +58,7 @@ class Slider(NamedTuple):
         return [self.value(place) for place in np.linspace(0.0, 1.0, count).tolist()]
 
     def _straight(self, value: float) -> float:
-        if not self.is_logarithmic:
+        if not self.is_log:
             return value
         return math.log(value) if value > 0.0 else -math.inf
 
@@ -121,13 +107,8 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
     for label, each in bound.items():
         if each.parameters is None:
             continue
-        meanings = {entry.name: entry for entry in describe(type(each.parameters))}
         for name, group in _groups(label, each).items():
-            if name in found or field_of(name) not in meanings:
-                continue
-            entry = meanings[field_of(name)]
-            slider = _slider(name, group, entry.meaning, entry.unit, source, each)
-            if slider is not None:
+            if name not in found and (slider := _slider(name, group, source, each)) is not None:
                 found[name] = slider
     groups = dict.fromkeys([slider.group for slider in found.values() if slider.group != GATE])
     return [slider for group in (*groups, GATE) for slider in found.values() if slider.group == group]
@@ -137,8 +118,8 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
     """Name the parameters that matter on this log, with what they are of."""
     assert bound.parameters is not None
     if not isinstance(bound, Recursive) or bound.reading is None:
-        roles = roles_of(type(bound.parameters))
-        return {name: label for name, role in roles.items() if role != "setting"}
+        numbers = numbers_of(type(bound.parameters))
+        return {name: label for name, each in numbers.items() if each.role != "setting"}
     reading = bound.reading()
     found = {name: topic or MOTION for name, topic in reading.noises.items()}
     for name, (_, topics) in reading.augmentable.items():
@@ -156,29 +137,26 @@ def _order(group: str, topics: Sequence[str]) -> int:
     return topics.index(group) if group in topics else len(topics)
 
 
-def _slider(
-    name: str, group: str, meaning: str, unit: str, source: LogSource | MemorySource, bound: Bound
-) -> Slider | None:
+def _slider(name: str, group: str, source: LogSource | MemorySource, bound: Bound) -> Slider | None:
     """Make the slider of a parameter; None where it is no number, or has no value on this log."""
+    assert bound.parameters is not None
     try:
-        least, greatest = bounds_of(type(bound.parameters), name)  # type: ignore[arg-type]
-        own, _ = value_at_start(name, source, bound)
+        each = number_of(type(bound.parameters), name)
+        own = float(value_at_start(name, source, bound)[0])
     except BadInput:
         return None
-    if isinstance(own, bool):
-        return None
-    own = float(own)
-    if math.isfinite(least) and math.isfinite(greatest):
-        low = least if least < own else own
-        ends, is_logarithmic = (max(low, 0.5) if name == "gate_probability" else low, greatest), False
-    elif own > 0.0 and least >= 0.0:
-        ends, is_logarithmic = (own / FACTOR, min(own * FACTOR, greatest)), True
-    elif own == 0.0 and least >= 0.0:
-        ends, is_logarithmic = (0.0, REACH.get(unit, 1.0)), False
+    is_log = False
+    if math.isfinite(each.low) and math.isfinite(each.high):
+        low, high = min(each.low, own), each.high
+        low = max(low, 0.5) if name == "gate_probability" else low
+    elif own > 0.0 and each.low >= 0.0:
+        low, high, is_log = own / FACTOR, min(own * FACTOR, each.high), True
+    elif own == 0.0 and each.low >= 0.0:
+        low, high = 0.0, REACH.get(each.unit, 1.0)
     else:
-        reach = 0.5 * abs(own) or REACH.get(unit, 1.0)
-        ends, is_logarithmic = (max(own - reach, least), min(own + reach, greatest)), False
-    return Slider(name, group, meaning, unit, own, *ends, is_logarithmic)
+        reach = 0.5 * abs(own) or REACH.get(each.unit, 1.0)
+        low, high = max(own - reach, each.low), min(own + reach, each.high)
+    return Slider(*each._replace(default=own, low=low, high=high, is_log=is_log, group=group))
 
 
 def setting_text(values: Mapping[str, float]) -> Iterable[str]:

@@ -107,8 +107,8 @@ def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
     } <= found.keys()
     assert not {"sigma_fix_m", "lever_x_m", "sigma_heading_rad"} & found.keys()
     for slider in found.values():
-        assert slider.low <= slider.own <= slider.high
-        assert slider.value(slider.place(slider.own)) == slider.own
+        assert slider.low <= slider.default <= slider.high
+        assert slider.value(slider.place(slider.default)) == slider.default
         ends = slider.value(0.0), slider.value(1.0)
         assert ends == pytest.approx((slider.low, slider.high), rel=1e-3)
     assert found["sigma_range_m"].value(0.0) == pytest.approx(0.01)

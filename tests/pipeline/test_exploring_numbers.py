@@ -19,6 +19,7 @@ from fuselog.pipeline.output.words import quantity
 from fuselog.pipeline.sensing.preparing import _STILL
 from fuselog.recorders.importers.tables.columns import _ENDINGS, _WRITTEN
 from fuselog.recorders.log.impossible import LIMITS
+from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.units import ENDINGS, MISTAKEN, Unit, conversion, parted, unit, written
 from fuselog.replay.timeline.drawing.plots import shown_unit
 
@@ -54,7 +55,7 @@ def test_the_lens_begins_at_a_typical_second() -> None:
 
 
 def slider(own: float, low: float, high: float, *, is_logarithmic: bool) -> Slider:
-    return Slider("sigma_range_m", "", "", "m", own, low, high, is_logarithmic)
+    return Slider("sigma_range_m", own, "m", low=low, high=high, is_log=is_logarithmic)
 
 
 @pytest.mark.parametrize(
@@ -67,10 +68,10 @@ def slider(own: float, low: float, high: float, *, is_logarithmic: bool) -> Slid
     ],
 )
 def test_a_place_of_a_slider_is_a_value_of_four_digits(made: Slider, place: float, value: float) -> None:
-    assert made.value(place) == (made.own if value == made.own else float(f"{value:.4g}"))
+    assert made.value(place) == (made.default if value == made.default else float(f"{value:.4g}"))
     assert made.place(value) == pytest.approx(place, abs=2e-4)
     assert [made.values(3)[0], made.values(3)[-1]] == [made.low, made.high]
-    assert made.words(made.own) == in_words(made.own, "m")
+    assert made.words(made.default) == in_words(made.default, "m")
 
 
 def test_every_unit_that_one_place_knows_all_know() -> None:
@@ -114,10 +115,13 @@ def test_ends_of_a_slider_follow_from_bounds_and_value(
     ends: tuple[float, float],
     is_logarithmic: bool,
 ) -> None:
-    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.bounds_of", lambda *_: bounds)
+    number = Parameter(name, None, unit, low=bounds[0], high=bounds[1])
+    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.number_of", lambda *_: number)
     monkeypatch.setattr("fuselog.pipeline.exploring.sliders.value_at_start", lambda *_: (own, False))
-    made: Any = _slider(name, "group", "what it is", unit, None, SimpleNamespace(parameters=None))  # type: ignore[arg-type]
-    assert made == Slider(name, "group", "what it is", unit, own, *ends, is_logarithmic)
+    made: Any = _slider(name, "group", None, SimpleNamespace(parameters=0))  # type: ignore[arg-type]
+    low, high = ends
+    wanted = number._replace(default=own, low=low, high=high, is_log=is_logarithmic, group="group")
+    assert made == Slider(*wanted)
 
 
 def test_settings_are_kept_as_toml_with_what_is_estimated(log: fl.MemorySource) -> None:
