@@ -22,6 +22,7 @@ from pydantic_core import CoreSchema
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parsing import DEEPEST, parse_toml
+from fuselog.recorders.units import unit_of
 
 _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML does not take
 
@@ -61,7 +62,7 @@ Role = Literal["process noise", "measurement noise", "parameter", "setting"]
 
 
 def has_role(role: Role) -> Any:
-    """Return the annotation of a number that has this role, see `roles_of`."""
+    """Return the annotation of a number that has this role, see `Parameter`."""
     return Field(json_schema_extra={"role": role})
 
 
@@ -128,29 +129,11 @@ def _table_in(annotation: Any) -> type[BaseModel] | None:
     return next(filter(None, map(_table_in, get_args(annotation))), None)
 
 
-# What the end of a parameter's name says of its unit.
-_UNITS = {
-    "s": "s", "h": "h", "hz": "Hz", "m": "m", "m2": "m^2", "mps": "m/s", "mps2": "m/s^2", "ut": "uT",
-    "rad": "rad", "mrad": "mrad", "deg": "deg", "radps": "rad/s", "degps": "deg/s", "db": "dB",
-    "per_s": "1/s", "per_minute": "1/min", "per_m2": "1/m^2", "per_rad": "1/rad",
-    "per_km2_h": "1/(km^2 h)",
-}  # fmt: skip
-_UNIT = re.compile(f"_({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
 _ATTRIBUTES = re.compile(r"^Attributes:\n(?P<entries>(?: .*(?:\n|$)|\n)*)", re.MULTILINE)
 _ENTRY = re.compile(r"^    (?P<names>\w+(?:, \w+)*): (?P<meaning>\S.*(?:\n {5,}\S.*)*)", re.MULTILINE)
 
 
 MOST_WORDS = 8  # of a name
-
-
-def unit_of(name: str) -> str:
-    """Return the unit of a parameter, as the end of its name says it; empty where it says none.
-
-    >>> unit_of("turn_bias_radps"), unit_of("clutter_per_m2"), unit_of("gate_probability")
-    ('rad/s', '1/m^2', '')
-    """
-    found = _UNIT.search(name)
-    return _UNITS[found[1]] if found else ""
 
 
 @cache
@@ -198,20 +181,47 @@ def _prose(kind: type[BaseModel]) -> str:
     return "\n\n".join(filter(None, dict.fromkeys(texts)))
 
 
-class Described(NamedTuple):
-    """Describes one parameter to a person: full name, default, unit, what it accepts, what it means.
+class Parameter(NamedTuple):
+    """Describes one parameter, to a person and to whatever varies it.
 
-    Unit and meaning are empty where the type does not say them.
+    Attributes:
+        name: in full.
+        default: its default; where it is varied, its value there.
+        unit, meaning: empty where the type does not say them.
+        accepts: in words.
+        role: what a number is to its estimator; empty for anything else.
+        low, high: between what bounds a number lies, or is varied.
+        is_log: whether its logarithm is varied.
+        is_assumed: whether neither a setting nor the log states the value.
+        useful: the standard error that a calibration wants; zero of what is none.
+        group: what it is shown with, such as a topic.
     """
 
     name: str
-    default: Any
-    unit: str
-    accepts: str
-    meaning: str
+    default: Any = None
+    unit: str = ""
+    accepts: str = "number"
+    meaning: str = ""
+    role: Role | Literal[""] = ""
+    low: float = -math.inf
+    high: float = math.inf
+    is_log: bool = False
+    is_assumed: bool = False
+    useful: float = 0.0
+    group: str = ""
+
+    @property
+    def fixed(self) -> "Parameter":
+        """Return the same, fixed at its value."""
+        return self._replace(low=self.default, high=self.default)
+
+    @property
+    def is_fixed(self) -> bool:
+        """Tell whether it stays at its value."""
+        return self.low == self.high
 
 
-def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
+def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Parameter]:
     """List all parameters of a type, nested ones by full names; `values` stand for defaults.
 
     In a list of tables names are such as `nodes[].sigma_m`, in tables by name `cases.NAME.sigma_m`.
@@ -245,18 +255,33 @@ def _tables(
 
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
-) -> Iterator[Described]:
+) -> Iterator[Parameter]:
     """Walk a JSON schema; `given` are defaults that the table above states for this one."""
     for name, entry in table["properties"].items():
         value = given.get(name, entry.get("default"))
         below = next(_below(entry, definitions, f"{prefix}{name}"), None)
         is_table = below is not None and below[0] == f"{prefix}{name}."
-        accepts = _accepts(entry, definitions)
-        shown = None if is_table else value
-        yield Described(f"{prefix}{name}", shown, entry["unit"], accepts, entry["description"])
+        yield _parameter(f"{prefix}{name}", None if is_table else value, entry, definitions)
         if below is not None:
             values = merge(entry.get("default") or {}, given.get(name) or {}) if is_table else {}
             yield from _described(below[1], definitions, below[0], values)
+
+
+def _parameter(
+    name: str, default: Any, entry: Mapping[str, Any], definitions: Mapping[str, Any]
+) -> Parameter:
+    """Describe the parameter of one entry of a JSON schema."""
+    accepts, meaning = _accepts(entry, definitions), entry.get("description", "")
+    found = Parameter(name, default, entry.get("unit", unit_of(name)), accepts, meaning)
+    options = [_resolved(each, definitions) for each in entry.get("anyOf", [entry])]
+    for each in options:
+        if each.get("type") == "number":
+            found = found._replace(
+                role=each.get("role", entry.get("role", "parameter")),
+                low=max(found.low, each.get("exclusiveMinimum", each.get("minimum", -math.inf))),
+                high=min(found.high, each.get("exclusiveMaximum", each.get("maximum", math.inf))),
+            )
+    return found
 
 
 def _below(
@@ -315,31 +340,27 @@ def field_of(key: str) -> str:
     return f"n{field}" if field[:1].isdigit() else field
 
 
-def roles_of(kind: type[BaseModel]) -> dict[str, Role]:
-    """Return what the numbers of a type are to their estimator, by name: "parameter" unless one says so.
+def numbers_of(kind: type[Parameters]) -> dict[str, Parameter]:
+    """Describe the numbers of a type by name, without those of its tables.
 
     >>> class Own(Parameters):
     ...     drift_density: ProcessNoise | None = None
     ...     lever_m: float = 0.0
     ...     label: str = ""
-    >>> roles_of(Own)
-    {'drift_density': 'process noise', 'lever_m': 'parameter'}
+    >>> {name: (each.role, each.low) for name, each in numbers_of(Own).items()}
+    {'drift_density': ('process noise', 0.0), 'lever_m': ('parameter', -inf)}
     """
-    return {
-        name: number.get("role", entry.get("role", "parameter"))
-        for name, entry in kind.model_json_schema()["properties"].items()
-        for number in entry.get("anyOf", [entry])
-        if number.get("type") == "number"
-    }
+    return {each.name: each for each in describe(kind) if each.role and "." not in each.name}
 
 
-def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
-    """Return the least and greatest value of a number by its full name; infinite for no bound.
+def number_of(kind: type[BaseModel], name: str) -> Parameter:
+    """Describe a number of a type by its full name, in which a table's own names may stand for `NAME`.
 
     Raises BadInput where a type has no number of this name.
     """
     schema = kind.model_json_schema()
-    tables, known = [schema], set[str]()
+    tables: list[Mapping[str, Any]] = [schema]
+    entries, known = list[Mapping[str, Any]](), set[str]()
     parts = [field_of(name)] if field_of(name) in schema.get("properties", {}) else name.split(".")
     for part in parts:
         known = {each for table in tables for each in table.get("properties", {})}
@@ -349,17 +370,16 @@ def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
             if part in table.get("properties", {}) or isinstance(table.get(_OTHERS), dict)
         ]
         tables = [
-            schema["$defs"][option["$ref"].rpartition("/")[2]] if "$ref" in option else option
+            _resolved(option, schema.get("$defs", {}))
             for entry in entries
             for option in entry.get("anyOf", [entry])
         ]
-    numbers = [each for each in tables if each.get("type") == "number"]
-    if not tables:
+    if not entries:
         raise BadInput(f"no parameter '{name}'; {choices(name.rpartition('.')[2], sorted(known))}")
-    if not numbers:
+    found = _parameter(name, None, {**entries[0], "anyOf": tables}, schema.get("$defs", {}))
+    if not found.role:
         raise BadInput(f"parameter '{name}' is not a number, so that it cannot be searched for")
-    low = max(each.get("exclusiveMinimum", each.get("minimum", -math.inf)) for each in numbers)
-    return low, min(each.get("exclusiveMaximum", each.get("maximum", math.inf)) for each in numbers)
+    return found
 
 
 _OTHERS = "additionalProperties"  # of a table whose names are the user's

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.recorders.importers.units import conversion, unit_of
 from fuselog.recorders.log import Stream, Topic, schemas
 from fuselog.recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from fuselog.recorders.parameters import merge, nested
+from fuselog.recorders.units import conversion, parted, unit_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.estimators import registered_models
 from fuselog.replay.inference.model.own_parameters import read_by
@@ -188,7 +188,7 @@ def _parameters() -> set[str]:
 
 def bare(name: str) -> str:
     """Return the name of a field or component without its unit: `x` of `x_m`."""
-    return name.rpartition("_")[0] if unit_of(name) else name
+    return parted(name)[0]
 
 
 def names_in(stream: Stream, field_: str) -> list[str]:

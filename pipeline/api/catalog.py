@@ -258,7 +258,9 @@ def rows_of(entry: Entry) -> list[list[object]]:
         [
             f"{entry.prefix}{each.name}",
             _default(each.default, is_stated=each.name in entry.stated),
-            *each[2:],
+            each.unit,
+            each.accepts,
+            each.meaning,
         ]
         for each in describe(entry.parameters, entry.values)
     ]

@@ -18,13 +18,12 @@ from fuselog.pipeline.calibrating.ellipsoid_fit import AXES, NAMES, Fit, fit, ma
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
-from fuselog.pipeline.sensing.units import unit_of
 from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2, unit_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 Floats = NDArray[np.float64]
-GRAVITY_MPS2 = 9.80665
 FEWEST, MOST = 30, 20_000  # readings; of more, one in so many is taken
 _STILL_S = 0.5  # of an accelerometer, readings are means over so long in which it is still
 _STILL = 3.0  # times the spread of the quietest tenth
@@ -205,7 +204,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     topic, _, name = field.rpartition(".")
     _, unit = middle(readings)
     fitted = fit(readings / unit)
-    stated = GRAVITY_MPS2 if length is None and unit_of(name) == "m/s^2" else length
+    stated = STANDARD_GRAVITY_MPS2 if length is None and unit_of(name) == "m/s^2" else length
     return Ellipsoid(
         topic,
         name,

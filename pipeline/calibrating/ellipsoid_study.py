@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
-from fuselog.pipeline.calibrating.ellipsoid import GRAVITY_MPS2, Ellipsoid, ellipsoid
+from fuselog.pipeline.calibrating.ellipsoid import Ellipsoid, ellipsoid
 from fuselog.pipeline.calibrating.ellipsoid_fit import NAMES, matrix_of
 from fuselog.pipeline.output.charts import coverage
 from fuselog.pipeline.output.results import Outcome
@@ -22,6 +22,7 @@ from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
@@ -115,7 +116,7 @@ def put_down(rng: np.random.Generator) -> tuple[Floats, float]:
     directions = rng.standard_normal((POSITIONS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     held, moved = round(HELD_S / STEP_S), round(MOVED_S / STEP_S)
-    forces = np.repeat(GRAVITY_MPS2 * directions, held + moved, axis=0)
+    forces = np.repeat(STANDARD_GRAVITY_MPS2 * directions, held + moved, axis=0)
     is_moved = np.arange(len(forces)) % (held + moved) >= held
     forces[is_moved] += rng.standard_normal((int(is_moved.sum()), 3))
     return forces, 0.05

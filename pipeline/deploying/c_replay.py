@@ -5,7 +5,8 @@ from typing import Any
 
 from fuselog.pipeline.deploying.c_source.braces import braced
 from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
-from fuselog.recorders.parameters import Role, field_of, meanings, unit_of
+from fuselog.recorders.parameters import Role, field_of, meanings
+from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.replaying.estimator import Reading
 from fuselog.replay.inference.model.model import Map, Sensor
 

@@ -20,12 +20,12 @@ from fuselog.pipeline.tuning.search import (
     LEAST_GAIN,
     UNIT,
     Coordinates,
-    Free,
     coordinates_of,
     curvature,
     least,
 )
 from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 TINY, OFF = 1e-6, 2e-3  # of a number: how far a jump is seen from, and how far a search begins from it
@@ -166,7 +166,7 @@ class _Together:
         self.places = [[next(places) for _ in each.numbers] for each in faults]
         limits = [each.of.limit if each.of.has_end else np.inf for each in faults]
         self.free = [
-            Free(each.of.name, number, -limit, limit, is_positive=False)
+            Parameter(each.of.name, number, low=-limit, high=limit)
             for each, limit in zip(faults, limits, strict=True)
             for number in each.numbers
         ]

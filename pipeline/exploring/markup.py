@@ -22,8 +22,8 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
     Of a parameter in the state the value is where the estimate begins.
     """
     name = f"{slider.title}, estimated from" if is_estimated else slider.title
-    changed = "" if value == slider.own else f"color:{COLOURS[0]};"
-    mark = 100.0 * min(max(slider.place(slider.own), 0.0), 1.0)
+    changed = "" if value == slider.default else f"color:{COLOURS[0]};"
+    mark = 100.0 * min(max(slider.place(slider.default), 0.0), 1.0)
     return (
         f'<div title="{escape(f"{slider.name}: {slider.meaning}")}" style="width:{SIDE - 20}px">'
         f"{SPREAD}<span>{escape(name)}</span>"
@@ -32,7 +32,7 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
         f'position:relative"><span>{escape(slider.words(slider.low))}</span>'
         f'<span style="position:absolute;top:9px;left:{mark:.1f}%;transform:translateX(-50%)" '
         f"title=\"the log's own, "
-        f'{escape(slider.words(slider.own))}">▾</span>'
+        f'{escape(slider.words(slider.default))}">▾</span>'
         f"<span>{escape(slider.words(slider.high))}</span></div></div>"
     )
 

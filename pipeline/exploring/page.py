@@ -148,7 +148,7 @@ class Page:
                 group = slider.group
                 shown.append(Div(text=f"<b>{escape(group)}</b>", width=SIDE, styles={"color": QUIET}))
             label = Div(width=SIDE, name=f"label-{slider.name}", margin=(0, 5, 0, 5))
-            widget = widget_of(slider, self.values.get(slider.name, slider.own))
+            widget = widget_of(slider, self.values.get(slider.name, slider.default))
             widget.on_change("value", partial(self._dragged, slider))
             self._widgets[slider.name] = slider, widget, label
             shown += [label, widget]
@@ -158,7 +158,7 @@ class Page:
 
     def _label(self, slider: Slider) -> None:
         """Write the name of a slider, its value, its ends and the log's own value."""
-        value = self.values.get(slider.name, slider.own)
+        value = self.values.get(slider.name, slider.default)
         _, widget, label = self._widgets[slider.name]
         label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
         widget.tags = tags_of(slider, value)
@@ -195,7 +195,7 @@ class Page:
         if self._is_setting:
             return
         value = slider.value(new)
-        if value == slider.own:
+        if value == slider.default:
             self.values.pop(slider.name, None)
         else:
             self.values[slider.name] = value
@@ -284,7 +284,9 @@ class Page:
         self._is_setting = True
         try:
             for slider, widget, _ in self._widgets.values():
-                widget.value = min(max(slider.place(self.values.get(slider.name, slider.own)), 0.0), 1.0)
+                widget.value = min(
+                    max(slider.place(self.values.get(slider.name, slider.default)), 0.0), 1.0
+                )
                 self._label(slider)
         finally:
             self._is_setting = False
@@ -326,7 +328,7 @@ class Page:
                 if is_newer():
                     return
                 points.append(point)
-            now = values.get(active.name, active.own)
+            now = values.get(active.name, active.default)
             along = partial(show_likelihood, self.plots["likelihood"], active, points, now=now)
             self._later(lambda: self._rest(along))
 

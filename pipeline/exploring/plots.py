@@ -29,7 +29,7 @@ from fuselog.pipeline.exploring.curves import (
 from fuselog.pipeline.exploring.session import Played
 from fuselog.pipeline.exploring.sliders import Slider, ticks_between
 from fuselog.pipeline.output.words import label_of, quantity
-from fuselog.recorders.parameters import unit_of
+from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.sources import MemorySource
 
 # The report's ink, quiet grey and crimson; a filter has its own colour, what is pinned is a grey ghost.

@@ -162,7 +162,7 @@ class Session:
         """
         slider = self.slider(name)
         opened = OPEN if name not in OPEN and self._takes(label, *OPEN) else {}
-        for value in sorted({*slider.values(count), values.get(name, slider.own)}):
+        for value in sorted({*slider.values(count), values.get(name, slider.default)}):
             with suppress(BadInput):
                 yield value, self._likelihoods(label, {**values, **opened, name: value})
 

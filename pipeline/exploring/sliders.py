@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.pipeline.output.words import MINUS, number
+from fuselog.pipeline.output.words import MINUS, scale
 from fuselog.pipeline.tuning.tuning import value_at_start
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.parameters import bounds_of, describe, field_of, roles_of
+from fuselog.recorders.parameters import Parameter, number_of, numbers_of
+from fuselog.recorders.units import parted
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.model.parameters import number_fields
@@ -18,47 +18,26 @@ STEPS = 400  # between the ends of a slider
 FACTOR = 10.0  # a positive parameter goes from its own value divided by this to as many times it
 # How far a parameter of either sign goes where its own value is zero, by its unit.
 REACH = {"m": 1.0, "rad": 0.2, "rad/s": 0.05, "m/s": 1.0, "s": 1.0, "m/s^2": 0.5}
-# Units as people write them: by what to multiply, and what to write, up to a value.
-SMALLER = {
-    "m": ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm")),
-    "s": ((1.0, 1000.0, "ms"),),
-    "rad": ((math.inf, 180.0 / math.pi, "°"),),
-    "rad/s": ((math.inf, 180.0 / math.pi, "°/s"),),
-}
 STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
 
 
-class Slider(NamedTuple):
-    """Describes a parameter that can be dragged.
+class Slider(Parameter):
+    """Is a parameter that can be dragged; `default` is its own value on the log.
 
-    Attributes:
-        name: of the parameter.
-        group: what it is of: a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
-        meaning, unit: of the parameter.
-        own: its value as the log and the settings have it.
-        low, high: the ends of the slider.
-        is_logarithmic: whether equal ways are equal factors.
+    Its group is a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
     """
 
-    name: str
-    group: str
-    meaning: str
-    unit: str
-    own: float
-    low: float
-    high: float
-    is_logarithmic: bool
+    __slots__ = ()
 
     @property
     def title(self) -> str:
         """Return the name as a person reads it: without its unit.
 
-        >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
+        >>> Slider("sigma_range_m").title
         'sigma range'
         """
-        end = "_" + self.unit.replace("^", "").replace("1/", "per_").replace("/", "p").lower()
-        return self.name.removesuffix(end).replace("_", " ")
+        return parted(self.name)[0].replace("_", " ")
 
     def place(self, value: float) -> float:
         """Return where a value lies between the ends: 0 to 1, beyond them less or more."""
@@ -69,9 +48,9 @@ class Slider(NamedTuple):
         """Return the value at a place from 0 to 1, to four digits; the own value where it is that."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
-        value = float(f"{math.exp(there) if self.is_logarithmic else there:.4g}")
-        if abs(place - self.place(self.own)) < 0.5 / STEPS:
-            return self.own
+        value = float(f"{math.exp(there) if self.is_log else there:.4g}")
+        if abs(place - self.place(self.default)) < 0.5 / STEPS:
+            return self.default
         return min(max(value, self.low), self.high)
 
     def values(self, count: int) -> list[float]:
@@ -79,7 +58,7 @@ class Slider(NamedTuple):
         return [self.value(place) for place in np.linspace(0.0, 1.0, count).tolist()]
 
     def _straight(self, value: float) -> float:
-        if not self.is_logarithmic:
+        if not self.is_log:
             return value
         return math.log(value) if value > 0.0 else -math.inf
 
@@ -94,17 +73,9 @@ def in_words(value: float, unit: str) -> str:
     >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
     ('10 cm', '1.15°', '−0.99', '0°')
     """
-    factor, sign = _unit_for(value, unit)
-    text = f"{value * factor:.3g}".replace("-", MINUS)
-    return f"{number(value * factor) if 'e' in text else text}{sign}"
-
-
-def _unit_for(value: float, unit: str) -> tuple[float, str]:
-    """Choose by what to multiply so that a number is handy, and what to write behind it."""
-    for most, factor, shorter in SMALLER.get(unit, ()):
-        if 0.0 < abs(value) < most or most == math.inf:
-            return factor, shorter if shorter.startswith("°") else f" {shorter}"
-    return 1.0, f" {unit}" if unit else ""
+    own = scale(unit, value)
+    text = f"{value * own.factor:.3g}".replace("-", MINUS)
+    return own.signed(own.text(value) if "e" in text else text)
 
 
 def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
@@ -113,13 +84,13 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
     >>> ticks_between(-0.03, 0.03, "m")
     {-0.02: '−2 cm', 0.0: '0', 0.02: '2 cm'}
     """
-    factor, sign = _unit_for(max(abs(low), abs(high)), unit)
-    first, last = low * factor, high * factor
+    own = scale(unit, max(abs(low), abs(high)))
+    first, last = low * own.factor, high * own.factor
     power = 10.0 ** math.floor(math.log10((last - first) / 5))
     step = power * next(each for each in STEPS_OF_TICKS if power * each >= (last - first) / 5)
     places = [place * step for place in range(math.ceil(first / step), math.floor(last / step) + 1)]
-    texts = [f"{f'{place:.6g}'.replace('-', MINUS)}{sign}" if place else "0" for place in places]
-    return {place / factor: text for place, text in zip(places, texts, strict=True)}
+    texts = [own.signed(f"{place:.6g}".replace("-", MINUS)) if place else "0" for place in places]
+    return {place / own.factor: text for place, text in zip(places, texts, strict=True)}
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
@@ -136,13 +107,8 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
     for label, each in bound.items():
         if each.parameters is None:
             continue
-        meanings = {entry.name: entry for entry in describe(type(each.parameters))}
         for name, group in _groups(label, each).items():
-            if name in found or field_of(name) not in meanings:
-                continue
-            entry = meanings[field_of(name)]
-            slider = _slider(name, group, entry.meaning, entry.unit, source, each)
-            if slider is not None:
+            if name not in found and (slider := _slider(name, group, source, each)) is not None:
                 found[name] = slider
     groups = dict.fromkeys([slider.group for slider in found.values() if slider.group != GATE])
     return [slider for group in (*groups, GATE) for slider in found.values() if slider.group == group]
@@ -152,8 +118,8 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
     """Name the parameters that matter on this log, with what they are of."""
     assert bound.parameters is not None
     if not isinstance(bound, Recursive) or bound.reading is None:
-        roles = roles_of(type(bound.parameters))
-        return {name: label for name, role in roles.items() if role != "setting"}
+        numbers = numbers_of(type(bound.parameters))
+        return {name: label for name, each in numbers.items() if each.role != "setting"}
     reading = bound.reading()
     found = {name: topic or MOTION for name, topic in reading.noises.items()}
     for name, (_, topics) in reading.augmentable.items():
@@ -171,29 +137,26 @@ def _order(group: str, topics: Sequence[str]) -> int:
     return topics.index(group) if group in topics else len(topics)
 
 
-def _slider(
-    name: str, group: str, meaning: str, unit: str, source: LogSource | MemorySource, bound: Bound
-) -> Slider | None:
+def _slider(name: str, group: str, source: LogSource | MemorySource, bound: Bound) -> Slider | None:
     """Make the slider of a parameter; None where it is no number, or has no value on this log."""
+    assert bound.parameters is not None
     try:
-        least, greatest = bounds_of(type(bound.parameters), name)  # type: ignore[arg-type]
-        own, _ = value_at_start(name, source, bound)
+        each = number_of(type(bound.parameters), name)
+        own = float(value_at_start(name, source, bound)[0])
     except BadInput:
         return None
-    if isinstance(own, bool):
-        return None
-    own = float(own)
-    if math.isfinite(least) and math.isfinite(greatest):
-        low = least if least < own else own
-        ends, is_logarithmic = (max(low, 0.5) if name == "gate_probability" else low, greatest), False
-    elif own > 0.0 and least >= 0.0:
-        ends, is_logarithmic = (own / FACTOR, min(own * FACTOR, greatest)), True
-    elif own == 0.0 and least >= 0.0:
-        ends, is_logarithmic = (0.0, REACH.get(unit, 1.0)), False
+    is_log = False
+    if math.isfinite(each.low) and math.isfinite(each.high):
+        low, high = min(each.low, own), each.high
+        low = max(low, 0.5) if name == "gate_probability" else low
+    elif own > 0.0 and each.low >= 0.0:
+        low, high, is_log = own / FACTOR, min(own * FACTOR, each.high), True
+    elif own == 0.0 and each.low >= 0.0:
+        low, high = 0.0, REACH.get(each.unit, 1.0)
     else:
-        reach = 0.5 * abs(own) or REACH.get(unit, 1.0)
-        ends, is_logarithmic = (max(own - reach, least), min(own + reach, greatest)), False
-    return Slider(name, group, meaning, unit, own, *ends, is_logarithmic)
+        reach = 0.5 * abs(own) or REACH.get(each.unit, 1.0)
+        low, high = max(own - reach, each.low), min(own + reach, each.high)
+    return Slider(*each._replace(default=own, low=low, high=high, is_log=is_log, group=group))
 
 
 def setting_text(values: Mapping[str, float]) -> Iterable[str]:

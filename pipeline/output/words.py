@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
+from fuselog.recorders.units import parted, written
+
 DIGITS = 3
 MOST_APART = 30.0  # numbers of which one is more times another have decimals of their own
 # As people write them, not as keyboards do.
@@ -111,8 +113,6 @@ QUANTITIES: dict[str, Quantity] = {
         "age of an estimate", "From its stamp to when it could be given.", COST, "s"
     ),
 }
-_UNITS = {"m": "m", "m2": "m²", "mm": "mm", "km": "km", "s": "s", "rad": "rad", "deg": "°", "mps": "m/s",
-          "radps": "rad/s", "mps2": "m/s²", "percent": "%", "bytes": "bytes", "pa": "Pa"}  # fmt: skip
 LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "localisation_m2")
 
 
@@ -120,13 +120,11 @@ def quantity(key: str) -> Quantity:
     """Return a quantity of a result in words; one that is not known by its own name, readably.
 
     >>> quantity("turn_rmse_radps").name, quantity("turn_rmse_radps").unit
-    ('turn error, RMS', 'radps')
+    ('turn error, RMS', 'rad/s')
     """
     if key in QUANTITIES:
         return QUANTITIES[key]
-    stem, _, unit = key.rpartition("_")
-    if unit not in _UNITS or not stem:
-        stem, unit = key, ""
+    stem, unit = parted(key)
     if stem.endswith("_rmse") or stem.startswith("rmse_"):
         what = stem.removesuffix("_rmse").removeprefix("rmse_").replace("_", " ")
         return Quantity(f"{what} error, RMS", _RMS, ACCURACY, unit)
@@ -142,8 +140,7 @@ def label_of(key: str, meaning: str = "") -> str:
     ('position error, RMS (m)', 'standard deviation of a range (m)')
     """
     words = quantity(key)
-    sign = _UNITS.get(words.unit, words.unit)
-    name = meaning or words.name
+    sign, name = _sign(words.unit), meaning or words.name
     return f"{name} ({sign})" if sign else name
 
 
@@ -175,11 +172,11 @@ class Scale(NamedTuple):
     def with_unit(self, value: float | None, digits: int = DIGITS) -> str:
         """Return a number with the unit."""
         text = self.text(value, digits)
-        return (
-            text
-            if text == MISSING or not self.sign
-            else f"{text}{'' if self.sign == '°' else ' '}{self.sign}"
-        )
+        return text if text == MISSING else self.signed(text)
+
+    def signed(self, text: str) -> str:
+        """Return a number that was written in this unit with the unit's sign."""
+        return f"{text}{self.sign}" if self.sign in ("", "°", "°/s") else f"{text} {self.sign}"
 
 
 def scale(unit: str, *values: float | None) -> Scale:
@@ -203,9 +200,13 @@ def scale(unit: str, *values: float | None) -> Scale:
         return Scale(1e6, "µs")
     if unit == "s" and least < 0.5:
         return Scale(1000.0, "ms")
-    if unit in ("rad", "radps"):
-        return Scale(math.degrees(1.0), "°" if unit == "rad" else "°/s")
-    return Scale(100.0, "%") if unit == "share" else Scale(1.0, _UNITS.get(unit, unit))
+    if unit in ("rad", "rad/s"):
+        return Scale(math.degrees(1.0), unit.replace("rad", "°"))
+    return Scale(100.0, "%") if unit == "share" else Scale(1.0, _sign(unit))
+
+
+def _sign(unit: str) -> str:
+    return "°" if unit == "deg" else written(unit)
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:

@@ -27,7 +27,7 @@ from fuselog.pipeline.runs.executors import PoolFactory
 from fuselog.pipeline.runs.experiment import Experiment, Setting
 from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.parameters import describe, in_few_words, merge, nested, parse_settings, unit_of
+from fuselog.recorders.parameters import describe, in_few_words, merge, nested, parse_settings
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import load
 from fuselog.replay.engine.replaying.estimator import configure
@@ -66,8 +66,7 @@ class Over(NamedTuple):
     @property
     def label(self) -> str:
         """Return what an axis says."""
-        unit = unit_of(self.key)
-        return f"{self.name}{f' ({unit})' if unit else ''}" if self.name else self.key
+        return label_of(self.key, self.name) if self.name else self.key
 
 
 def parse_over(text: str) -> Over:

@@ -3,8 +3,11 @@
 Begin here: `noise` goes through the columns of a log's topics, `_analysed` through one column.
 """
 
+import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,15 +19,19 @@ from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom, 
 from fuselog.pipeline.sensing.fitting import choose, profile_interval, walk_below
 from fuselog.pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
 from fuselog.pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
-from fuselog.pipeline.sensing.units import parse_sheet, unit_of
+from fuselog.recorders import units
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Stream
+from fuselog.recorders.units import unit_of
 
 Floats = NDArray[np.float64]
 _DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times
 _FEWEST_DEGREES = 3.0
 _CLOCKS = "publish_time_ns", "log_time_ns", "position"
 _BLOCK = 1 << 18  # messages that are read at once
+# What a data sheet's number is by its unit, {} being the column's.
+_STATED = {"white": "{}/sqrt(Hz)", "walk": "{}/sqrt(s)"}
+_USUAL = "rad/s", "m/s^2"  # units of columns whose names end with none
 
 
 @without_warnings_of_numbers()
@@ -71,6 +78,32 @@ def noise(
         name = min(unknown)
         raise BadInput(f"--sheet {name}: {choices(name, sorted({each.field for each in found}))}")
     return SensorNoise(source.name, found)
+
+
+def parse_sheet(field: str, text: str) -> tuple[str, float]:
+    """Return what a data sheet states, as `white` or `walk` and a number in our units.
+
+    A one-sided density, as spectrum analysers show it, is sqrt(2) times the two-sided one.
+
+    Raises BadInput if the text is no number with a unit, or the unit is another quantity's.
+    """
+    found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s+(\S.*?)\s*(one-sided)?\s*", text)
+    value = float(found[1]) if found else 0.0
+    if found is None or not 0.0 < value < math.inf:
+        example = "expected a number and a unit, as '0.007 deg/s/sqrt(Hz)'"
+        raise BadInput(f"--sheet {field}={text}: {example}")
+    written = found[2].replace("°", "deg").replace("µ", "u")
+    try:
+        here = units.unit(written)
+    except BadInput as error:
+        raise BadInput(f"--sheet {field}={text}: {error}") from None
+    own = unit_of(field)
+    for column, (term, of) in product([own] if own else _USUAL, _STATED.items()):
+        there = units.unit(of.format(column))
+        if here.powers == there.powers:
+            return term, value * here.size / there.size / (math.sqrt(2) if found[3] else 1.0)
+    wanted = " or ".join(of.format(own or "UNIT") for of in _STATED.values())
+    raise BadInput(f"--sheet {field}={text}: {written} is no {wanted}; give a unit of that kind")
 
 
 def _one(sources: Sequence[Any]) -> Sequence[Any]:

@@ -9,9 +9,9 @@ from scipy.ndimage import median_filter
 
 from fuselog.pipeline.sensing.fitting import fit
 from fuselog.pipeline.sensing.likelihood import Samples, likelihood, residuals
-from fuselog.pipeline.sensing.units import unit_of
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
+from fuselog.recorders.units import unit_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from fuselog.pipeline.tuning.search import UNIT, Coordinates, Cost, Free
+from fuselog.pipeline.tuning.search import UNIT, Coordinates, Cost
+from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
@@ -152,7 +153,7 @@ def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Fl
     """
     places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]
-    is_log = np.array([each.is_positive for each in own])
+    is_log = np.array([each.is_log for each in own])
     useful = np.array([each.useful for each in own])
     diagonal = np.diagonal(confidence.curvature)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -174,7 +175,7 @@ def _factor(value: float) -> float:
     return float(np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0)))
 
 
-def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
+def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str:
     """Say what it means that the cost has only this curvature along a unit direction (m,)."""
     names = [each.name for each in free]
     first, *others = _involved(direction)
@@ -185,7 +186,7 @@ def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
     if not others:
         return (
             f"{names[first]}: the logs determine it not at all, but that the start, "
-            f"{free[first].start:g}, explains them worse"
+            f"{free[first].default:g}, explains them worse"
         )
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
@@ -232,7 +233,7 @@ def profiles(
         error, free = confidence.errors[index], coordinates.free[place]
         if not np.isfinite(error):
             continue
-        reach = min(PROFILE_ERRORS * error, WIDEST if free.is_positive else np.inf)
+        reach = min(PROFILE_ERRORS * error, WIDEST if free.is_log else np.inf)
         way = np.linspace(-reach, reach, PROFILE_POINTS)
         points = np.tile(point, (PROFILE_POINTS, 1))
         points[:, list(confidence.places)] += np.outer(way, confidence.covariance[:, index] / error**2)

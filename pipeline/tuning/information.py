@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.pipeline.tuning.objective import Objective, Run, innovations_in
-from fuselog.pipeline.tuning.search import MOVES, Free
+from fuselog.pipeline.tuning.search import MOVES
 from fuselog.recorders.log import Stream
+from fuselog.recorders.parameters import Parameter
 from fuselog.replay.judging.consistency.whiteness import whitened
 
 Floats = NDArray[np.float64]
@@ -92,7 +93,7 @@ def undetermined(scaled: Floats) -> Undetermined:
 
 
 def in_words(
-    names: Sequence[str], lacking: Undetermined, free: Sequence[Free], held: Sequence[str]
+    names: Sequence[str], lacking: Undetermined, free: Sequence[Parameter], held: Sequence[str]
 ) -> str:
     """Name what the motion does not determine: parameters (m,), combinations of them; what stays."""
     alone: list[str] = []
@@ -102,7 +103,7 @@ def in_words(
             names[place] for place in np.argsort(-np.abs(direction)) if abs(direction[place]) > NAMED
         ]
         (together if len(parts) > 1 else alone).append(" with ".join(parts))
-    stay = ", ".join(f"{each.name} = {each.start:g}" for each in free if each.name in held)
+    stay = ", ".join(f"{each.name} = {each.default:g}" for each in free if each.name in held)
     return (
         f"the motion in the logs does not determine {', '.join([*alone, *together])}: held where they "
         f"started ({stay}), without an interval; record turns in both senses at changing speed"
@@ -110,7 +111,7 @@ def in_words(
 
 
 def conditions(
-    scaled: Floats, places: Sequence[int], free: Sequence[Free], held: Sequence[str]
+    scaled: Floats, places: Sequence[int], free: Sequence[Parameter], held: Sequence[str]
 ) -> Iterator[str]:
     """Yield a sentence for each parameter whose interval is right only if one that is held is right.
 

@@ -81,7 +81,7 @@ class Tuning:
         return pd.DataFrame(
             {
                 "parameter": [each.name for each in free],
-                "start": [each.start for each in free],
+                "start": [each.default for each in free],
                 "value": self.found.optimum,
                 "low": low,
                 "high": high,
@@ -134,7 +134,7 @@ class Tuning:
         the next, Ljung and Box's Q, and how probable a larger one is if they are white.
         """
         rows = []
-        start = np.array([each.start for each in self.found.coordinates.free])
+        start = np.array([each.default for each in self.found.coordinates.free])
         for label, values in ((START, start), (TUNED, self.found.optimum)):
             series: dict[tuple[str, str], list[Floats]] = {}
             for run in self.objective.runs:
@@ -223,16 +223,16 @@ class Tuning:
         for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
             if each.is_assumed:
                 yield (
-                    f"{each.name}: no channel states it; the search starts from {each.start:g}, which "
+                    f"{each.name}: no channel states it; the search starts from {each.default:g}, which "
                     f"replay assumes too; --set {each.name}=... sets another start"
                 )
-            if each.is_kept and each.name not in found.held:
+            if each.is_fixed and each.name not in found.held:
                 yield (
-                    f"{each.name}: the logs determine it not at all; it stays at {each.start:g}, where "
-                    "the search began"
+                    f"{each.name}: the logs determine it not at all; it stays at {each.default:g}, "
+                    "where the search began"
                 )
-            elif is_beyond and not each.is_kept:
-                side = "lower" if value < each.start else "upper"
+            elif is_beyond and not each.is_fixed:
+                side = "lower" if value < each.default else "upper"
                 yield (
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
@@ -387,7 +387,7 @@ class Tuning:
     @property
     def profile_chart(self) -> Chart:
         """Return the log-likelihood along each parameter, and where 95 % of it ends."""
-        positive = {each.name: each.is_positive for each in self.found.coordinates.free}
+        positive = {each.name: each.is_log for each in self.found.coordinates.free}
         panels = [
             Panel(
                 x=Axis(

@@ -7,13 +7,14 @@ own. Gradient and curvature are central differences, whose points are handed ove
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from fuselog.recorders.errors import BadInput
+from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 # Points (n, k) of k values -> what each costs (n,); infinity where it cannot be used.
@@ -34,37 +35,11 @@ UNIT = 10.0  # standard errors that it has alone
 MOST_GRID_POINTS = 10_000
 
 
-class Free(NamedTuple):
-    """Describes a parameter that is searched for: where from, and between what bounds.
-
-    Where it is positive, its logarithm is searched for. `is_assumed` says that neither a setting nor the
-    log states the start. `useful` is the standard error that a calibration wants; zero of what is none.
-    """
-
-    name: str
-    start: float
-    low: float
-    high: float
-    is_positive: bool
-    is_assumed: bool = False
-    useful: float = 0.0
-
-    @property
-    def kept(self) -> "Free":
-        """Return the same, kept at its start."""
-        return self._replace(low=self.start, high=self.start)
-
-    @property
-    def is_kept(self) -> bool:
-        """Tell whether it stays at its start."""
-        return self.low == self.high
-
-
 @dataclass(frozen=True)
 class Coordinates:
     """Holds what is searched over: of k parameters the logarithm, or the value in a unit of its own."""
 
-    free: Sequence[Free]
+    free: Sequence[Parameter]
     units: Floats
 
     def of(self, values: Floats) -> Floats:
@@ -94,14 +69,14 @@ class Coordinates:
 
     @property
     def _is_log(self) -> NDArray[np.bool_]:
-        return np.array([each.is_positive for each in self.free])
+        return np.array([each.is_log for each in self.free])
 
     @property
     def _ends(self) -> tuple[Floats, Floats]:
         return np.array([each.low for each in self.free]), np.array([each.high for each in self.free])
 
 
-def coordinates_of(cost: Cost, free: Sequence[Free], about: Floats) -> Coordinates:
+def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coordinates:
     """Return the coordinates to search in.
 
     Args:
@@ -116,17 +91,17 @@ def coordinates_of(cost: Cost, free: Sequence[Free], about: Floats) -> Coordinat
     """
     units = np.ones(len(free))
     for place, each in enumerate(free):
-        if each.is_kept:
+        if each.is_fixed:
             continue
         value = float(about[place])
 
-        def near(steps: Sequence[float], place: int = place, each: Free = each) -> Floats:
+        def near(steps: Sequence[float], place: int = place, each: Parameter = each) -> Floats:
             """Return what it costs so far from the values along this parameter."""
             points = np.tile(about, (len(steps), 1))
             points[:, place] = np.clip(about[place] + np.array(steps), each.low, each.high)
             return cost(points)
 
-        if each.is_positive:
+        if each.is_log:
             below, middle, above = near([-0.3 * value, 0.0, 0.3 * value])
         else:
             units[place], (below, middle, above) = _unit(near, value)
@@ -168,7 +143,7 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
             f"{MOST_GRID_POINTS} at most"
         )
     axes = [np.linspace(begin, end, points) for begin, end in zip(low, high, strict=True)]
-    start = coordinates.of(np.array([each.start for each in coordinates.free]))
+    start = coordinates.of(np.array([each.default for each in coordinates.free]))
     tried = np.array([start, *product(*axes)])
     return tried[np.argmin(cost(coordinates.values(tried)))]
 
@@ -224,11 +199,11 @@ def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
-            (np.log(FACTORS) if each.is_positive else MOVES * each.useful / unit)[:, None] * along
+            (np.log(FACTORS) if each.is_log else MOVES * each.useful / unit)[:, None] * along
             for along, unit, each in zip(
                 np.eye(len(start)), coordinates.units, coordinates.free, strict=True
             )
-            if not each.is_kept and (each.is_positive or each.useful)
+            if not each.is_fixed and (each.is_log or each.useful)
         ]
         or [np.empty((0, len(start)))]
     )
@@ -251,7 +226,7 @@ def _minimum(
     In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """
     low, high = coordinates.bounds
-    if all(each.is_kept for each in coordinates.free):
+    if all(each.is_fixed for each in coordinates.free):
         return low, True
     # what cannot be used is a wall that a search turns back from
     at_start = float(cost(coordinates.values(start[None]))[0])

@@ -46,7 +46,6 @@ from fuselog.pipeline.tuning.search import (
     MOVES,
     Coordinates,
     Cost,
-    Free,
     coordinates_of,
     curvature,
     least,
@@ -54,7 +53,7 @@ from fuselog.pipeline.tuning.search import (
     scanned,
 )
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
-from fuselog.recorders.parameters import bounds_of, field_of, merge
+from fuselog.recorders.parameters import Parameter, field_of, merge, number_of
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.channels import stated
@@ -144,7 +143,7 @@ def tune(
     by = by or _criterion(runs[0], bound)
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
     _refuse_random(label, bound, by)
-    start = np.array([each.start for each in searched])
+    start = np.array([each.default for each in searched])
     others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
     opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and gate_of(bound) < 1.0 else settings
     names = [each.name for each in searched]
@@ -219,7 +218,7 @@ def _searched(
     by: By,
     source: Source,
     bound: Sequence[Bound],
-) -> list[Free]:
+) -> list[Parameter]:
     """List what is searched for, by the parameters that an estimator was bound with.
 
     Raises BadInput where a name is none, stands twice, or its start or bounds cannot be.
@@ -240,30 +239,37 @@ def _searched(
     return [_free(name, bounds.get(name), source, bound[0]) for name in names]
 
 
-def _free(name: str, given: tuple[float, float] | None, source: Source, bound: Bound) -> Free:
-    parameters = bound.parameters
-    assert parameters is not None
+def _free(name: str, given: tuple[float, float] | None, source: Source, bound: Bound) -> Parameter:
+    assert bound.parameters is not None
     try:
-        least, greatest = bounds_of(type(parameters), name)
+        declared = number_of(type(bound.parameters), name)
     except BadInput as error:
         raise BadInput(f"--free {name}: {error}") from None
+    least, greatest = declared.low, declared.high
     start, is_assumed = value_at_start(name, source, bound)
     useful = 0.0
     if least < 0.0 and isinstance(bound, Recursive) and bound.reading is not None:
         useful = bound.reading().calibration.get(name, 0.0)
-    is_positive = least >= 0.0 or (given is not None and given[0] > 0.0 and not useful)
-    if is_positive and start <= 0.0 and given is None:
+    is_log = least >= 0.0 or (given is not None and given[0] > 0.0 and not useful)
+    if is_log and start <= 0.0 and given is None:
         raise BadInput(
             f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
             f"above zero, --set {name}=..."
         )
-    low, high = given or ((start / REACH, start * REACH) if is_positive else (least, greatest))
-    if not (low < start < high and (low > 0.0 if is_positive else low >= least)):
+    low, high = given or ((start / REACH, start * REACH) if is_log else (least, greatest))
+    if not (low < start < high and (low > 0.0 if is_log else low >= least)):
         raise BadInput(
             f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
-            f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
+            f"{' two numbers above zero' if is_log else ''}; give other bounds, or --set {name}=..."
         )
-    return Free(name, start, low, min(high, greatest), is_positive, is_assumed, useful)
+    return declared._replace(
+        default=start,
+        low=low,
+        high=min(high, greatest),
+        is_log=is_log,
+        is_assumed=is_assumed,
+        useful=useful,
+    )
 
 
 def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
@@ -284,12 +290,12 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
     return stated(read, own, kind), False
 
 
-def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
+def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
     """Find the values of least cost, corrected if the noise of the controls moves it; and no spike.
 
     Ctrl-C ends it, wherever it is, with the best values so far.
     """
-    start = np.array([each.start for each in free])
+    start = np.array([each.default for each in free])
     try:
         if reaches_s := _blocked(objective, _held(objective, free, start)[0], start):
             objective.begin_after(start, reaches_s)
@@ -310,12 +316,12 @@ def _found(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutco
         return SearchOutcome(coordinates, best.point, best.evaluations, was_stopped=True)
 
 
-def _blocked(objective: Objective, free: Sequence[Free], values: Floats) -> dict[str, float]:
+def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
     """Return how far calibrated parameters may reach that beside values (k,) give fewer measurements.
 
     A delay does so if it puts a message before the start.
     """
-    places = [place for place, each in enumerate(free) if each.useful and not each.is_kept]
+    places = [place for place, each in enumerate(free) if each.useful and not each.is_fixed]
     if not places:
         return {}
     steps = np.diag([each.useful for each in free])[places]
@@ -357,14 +363,14 @@ def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
     return is_moved
 
 
-def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
+def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
     """Find the values of least cost with which filters begin where they began in the search.
 
     Without a prior in the log, where a filter begins depends on the values: on how far it trusts its
     path between the first fixes, say. That is held during a search, else likelihoods of different
     measurements would be compared; the next search holds where filters begin with the values found.
     """
-    start = np.array([each.start for each in free])
+    start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)
     found = _search(objective, free, grid)._replace(**open_)
     nearer, there = _held(objective, free, found.optimum)
@@ -382,8 +388,8 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
 
 
 def _held(
-    objective: Objective, free: Sequence[Free], values: Floats
-) -> tuple[list[Free], dict[str, Any]]:
+    objective: Objective, free: Sequence[Parameter], values: Floats
+) -> tuple[list[Parameter], dict[str, Any]]:
     """Keep at its start what of a calibration the motion does not determine, at values (k,).
 
     Far from the best values innovations are large, so that it is looked at there once more. What was
@@ -398,24 +404,24 @@ def _held(
     held = [
         free[place].name
         for number, place in enumerate(places)
-        if number in lacking.places or free[place].is_kept
+        if number in lacking.places or free[place].is_fixed
     ]
     if not held:
         return list(free), {}
     sentence = in_words([free[place].name for place in places], lacking, free, held)
-    kept = [each.kept if each.name in held else each for each in free]
+    kept = [each.fixed if each.name in held else each for each in free]
     return kept, {"held": held, "lacks": [sentence, *conditions(known, places, free, held)]}
 
 
 def _search(
-    objective: Objective, free: Sequence[Free], grid: int, point: Floats | None = None
+    objective: Objective, free: Sequence[Parameter], grid: int, point: Floats | None = None
 ) -> SearchOutcome:
     """Find the values of least cost, and how well they are told; from a point (k,), if given.
 
     A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
     change with one of them.
     """
-    start = np.array([each.start for each in free])
+    start = np.array([each.default for each in free])
     coordinates = coordinates_of(objective, free, start)
     if point is None:
         point = coordinates.of(start)
@@ -429,7 +435,7 @@ def _search(
     point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
     point, known, at_edge = _confidence_at(objective, coordinates, point)
     if known is not None and (places := unknown(known, coordinates)):
-        kept = [each.kept if place in places else each for place, each in enumerate(free)]
+        kept = [each.fixed if place in places else each for place, each in enumerate(free)]
         nearer = replace(coordinates, free=kept)
         low, high = nearer.bounds
         ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
@@ -483,8 +489,8 @@ def _noisy_steps(
     standard errors.
     """
     free, units = [coordinates.free[place] for place in places], coordinates.units[list(places)]
-    useful = np.array([0.0 if each.is_positive else each.useful for each in free]) / units
-    others = np.where([each.is_positive for each in free], CURVATURE_STEP, NOISY_STEP)
+    useful = np.array([0.0 if each.is_log else each.useful for each in free]) / units
+    others = np.where([each.is_log for each in free], CURVATURE_STEP, NOISY_STEP)
     steps = np.where(useful > 0.0, useful, others)
     for _ in range(LOOKS):
         ahead, here, behind = _beside(objective, coordinates, point, places, steps)
@@ -578,7 +584,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
         return found
     coordinates = found.coordinates
     moves = [  # none that the scan makes up for
-        0.0 if each.is_kept else np.log(2.0) if each.is_positive else 2.0 * (each.useful or unit) / unit
+        0.0 if each.is_fixed else np.log(2.0) if each.is_log else 2.0 * (each.useful or unit) / unit
         for each, unit in zip(coordinates.free, coordinates.units, strict=True)
     ]
     low, high = coordinates.bounds
@@ -594,11 +600,11 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
 
 
 def _row_of_fold(
-    number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
+    number: int, left_out: Objective, rest: Objective, free: Sequence[Parameter], grid: int
 ) -> dict[str, Any]:
     """Return what all other logs give, and what the logs of a fold cost with that."""
     found = _found(rest, free, grid)
-    start = np.array([each.start for each in free])
+    start = np.array([each.default for each in free])
     costs = left_out(np.array([start, found.optimum]))
     return {
         "fold": number,

@@ -17,10 +17,10 @@ from pydantic import Field, PositiveFloat
 from scipy.spatial.transform import Rotation
 
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.recorders.importers.units import conversion
 from fuselog.recorders.log import Schema, schemas
 from fuselog.recorders.models.orientation import compose
 from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.units import conversion
 
 Floats = NDArray[np.float64]
 Value = TypeVar("Value")
@@ -284,7 +284,10 @@ class _Maker(NamedTuple):
             names = [name] * width
         given = self._spread(self.mapping.units[name], width, f"units of {name}")
         try:
-            return np.array([conversion(*pair) for pair in zip(given, names, strict=True)])
+            is_root = name in self.mapping.deviations
+            return np.array(
+                [conversion(*pair, is_root=is_root) for pair in zip(given, names, strict=True)]
+            )
         except BadInput as error:
             raise BadInput(f"{self.where}: {error}") from None
 

@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.log.schemas import BODY_POINT, LANDMARK
 from fuselog.recorders.log.streams import Stream
+from fuselog.recorders.units import unit_of
 
 # By the unit that ends a name: far beyond what is measured, wrongly scaled integers included.
 LIMITS = {
     "m": 1e12,
-    "mps": 1e10,
-    "mps2": 1e12,
+    "m/s": 1e10,
+    "m/s^2": 1e12,
     "rad": 1e6,
-    "radps": 1e6,
+    "rad/s": 1e6,
     "deg": 1e12,
     "s": 1e12,
-    "ut": 1e12,
+    "uT": 1e12,
 }
 # Of all others, as covariances and scores: squares of it are still numbers.
 LIMIT = 1e50
@@ -157,7 +158,7 @@ def limit_of(name: str) -> float:
     >>> limit_of("range_m"), limit_of("covariance_m2"), limit_of("quaternion")
     (1000000000000.0, 1e+50, 1e+50)
     """
-    return LIMITS.get(name.rpartition("_")[2], LIMIT)
+    return LIMITS.get(unit_of(name), LIMIT)
 
 
 def _components(stream: Stream, field: str) -> list[str]:

@@ -9,9 +9,8 @@ from fuselog.recorders.plausibility.body import Floats, PlaceSeries, Series
 from fuselog.recorders.plausibility.finding import Finding, digits
 from fuselog.recorders.plausibility.motion import LONG_S, BodyMotion
 from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
+from fuselog.recorders.units import mistaken
 
-# By what a speed is too large that was logged in another unit and read as m/s.
-UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}
 NEAR = 0.05  # of a factor
 SCALE = (0.8, 1.25)  # what a metre of a speed may move places by
 SPREAD = 0.25
@@ -108,7 +107,7 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
         if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:
             continue
         assert motion.places is not None
-        known = {**UNITS, **{1 / factor: name for factor, name in UNITS.items()}}
+        known = {power: name for name, by in mistaken("m/s").items() for power in (by, 1.0 / by)}
         nearest = min(known, key=lambda each: abs(np.log(each * ratio.value)))
         is_unit = abs(np.log(nearest * ratio.value)) < NEAR
         factor = nearest if is_unit else 1.0 / ratio.value

@@ -12,6 +12,7 @@ from fuselog.recorders.plausibility.body import Floats, Series
 from fuselog.recorders.plausibility.finding import Finding, digits
 from fuselog.recorders.plausibility.motion import BodyMotion, Slope
 from fuselog.recorders.plausibility.windows import FEWEST, pairs
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 
 NEAR_DEGREES = 0.1
 TOO_FAST_RADPS = 35.0
@@ -25,7 +26,6 @@ TURNS_RADPS = 0.05
 UNIT_TOLERANCE = 1e-3
 NORM_G, NORM_MILLI = (0.9, 1.1), (930.0, 1030.0)
 LARGEST_SHARE = 0.9
-G_MPS2 = 9.80665
 
 
 def signs(motion: BodyMotion) -> Iterator[Finding]:
@@ -200,10 +200,10 @@ def gravity(motion: BodyMotion) -> Iterator[Finding]:
         norm = float(np.linalg.norm(mean))
         scale, given = 1.0, ""
         if NORM_G[0] <= norm <= NORM_G[1]:
-            scale, given = G_MPS2, "g"
+            scale, given = STANDARD_GRAVITY_MPS2, "g"
         elif NORM_MILLI[0] <= norm <= NORM_MILLI[1]:
             is_milli = abs(norm - 1000.0) < abs(norm - 980.665)
-            scale, given = (1e-3 * G_MPS2, "mg") if is_milli else (0.01, "cm/s^2")
+            scale, given = (1e-3 * STANDARD_GRAVITY_MPS2, "mg") if is_milli else (0.01, "cm/s^2")
         if given:
             yield Finding(
                 "gravity",

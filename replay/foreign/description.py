@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic
-from fuselog.recorders.parameters import Parameters, Role, build, has_role, unit_of
+from fuselog.recorders.parameters import Parameters, Role, build, has_role
 from fuselog.recorders.parsing import parse_json
+from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.channels import resolved
 from fuselog.replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
 

@@ -5,14 +5,14 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.parameters import Described, Parameters, build, describe, merge, nested
+from fuselog.recorders.parameters import Parameter, Parameters, build, describe, merge, nested
 
 # Numbers of what happens so often, by how their names end, and one under which other parameters count.
 OFTEN = {"rate_hz": 2.0, "_per_minute": 20.0, "_per_scan": 2.0, "_probability": 0.5}
 BOUND = re.compile(r"(?:number|integer)((?: [<>]=? \S+)+)")
 
 
-def settable(kind: type[Parameters]) -> list[Described]:
+def settable(kind: type[Parameters]) -> list[Parameter]:
     """The parameters that can be set by themselves.
 
     Not so are tables that always stand, what is in lists of tables, and what is in a table that is none
@@ -61,7 +61,7 @@ def _others(value: Any, accepts: str) -> Iterator[Any]:
                 yield [*value[:place], other, *value[place + 1 :]]
 
 
-def moved(kind: type[Parameters], base: Mapping[str, Any], each: Described) -> dict[str, Any]:
+def moved(kind: type[Parameters], base: Mapping[str, Any], each: Parameter) -> dict[str, Any]:
     """The base with one parameter at another value; LookupError where none is known that it accepts."""
     value = value_of(build(kind, base, "base").model_dump(), each.name)
     for other in _others(value, each.accepts):
@@ -74,7 +74,7 @@ def moved(kind: type[Parameters], base: Mapping[str, Any], each: Described) -> d
     raise LookupError(f"{each.name}: no other value is known beside {value!r}; state one")
 
 
-def bounds_of(each: Described) -> tuple[list[float], list[float]]:
+def bounds_of(each: Parameter) -> tuple[list[float], list[float]]:
     """The values on the bounds of a number that it accepts, and some that it does not."""
     found = BOUND.match(each.accepts)
     accepted, refused = [], []

@@ -36,11 +36,12 @@ from fuselog.pipeline.tuning.command import progress_of
 from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.pipeline.tuning.information import information
 from fuselog.pipeline.tuning.objective import Best, Objective, in_memory
-from fuselog.pipeline.tuning.search import Coordinates, Free
+from fuselog.pipeline.tuning.search import Coordinates
 from fuselog.pipeline.tuning.tuning import _levelled
 from fuselog.recorders.common_streams import fix_stream, prior_stream, truth_stream
 from fuselog.recorders.log import RunMetadata
 from fuselog.recorders.models.inertial import from_mounting
+from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import memory_source
@@ -337,7 +338,7 @@ def test_a_level_point_is_not_attracted_by_an_edge() -> None:
             x = points[:, 0]
             return 50.0 * (x - 0.1) ** 2 - 20.0 * np.abs(x)
 
-    free = [Free("delay_s", 0.0, -10.0, 10.0, is_positive=False, useful=1.0)]
+    free = [Parameter("delay_s", 0.0, low=-10.0, high=10.0, useful=1.0)]
     coordinates = Coordinates(free, np.ones(1))
     level = _levelled(Edged(), coordinates, np.array([0.3]), [0], np.ones(1))  # type: ignore[arg-type]
     assert level[0] == pytest.approx(0.1 / (1.0 - 20.0 / 100.0), abs=0.01)

@@ -251,7 +251,7 @@ def test_a_comparison_has_the_difference_of_the_second_less_the_first() -> None:
 
 def test_a_profile_falls_from_the_maximum_along_its_parameter() -> None:
     """The level is where 95 % end: half of 1.96 squared below."""
-    free = [SimpleNamespace(name=name, is_positive=name == "sigma") for name in ("sigma", "bias")]
+    free = [SimpleNamespace(name=name, is_log=name == "sigma") for name in ("sigma", "bias")]
     profiles = [
         SimpleNamespace(
             name=each.name, along=at + TIMES, parabola=(TIMES - 1) ** 2, rise=2 * (TIMES - 1) ** 2

@@ -14,7 +14,7 @@ import pytest
 
 from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.parameters import Described, Parameters, merge, nested
+from fuselog.recorders.parameters import Parameter, Parameters, merge, nested
 from fuselog.recorders.recording import record_run
 from fuselog.recorders.registry import available
 from fuselog.replay.engine.replaying.estimator import configure, find_estimator
@@ -71,7 +71,7 @@ def own_of(name: str) -> set[str]:
     return METHODS[name.partition(":")[0]].parameters.model_fields.keys() - COMMON
 
 
-def parameters_of(tried: Tried) -> tuple[type[Parameters], dict[str, Described]]:
+def parameters_of(tried: Tried) -> tuple[type[Parameters], dict[str, Parameter]]:
     """The type of the parameters, and those of them that are tried."""
     estimator, variant = find_estimator(tried.case.kind)
     by_model = estimator.parameters_by_model(tried.case.kind, variant)
@@ -107,7 +107,7 @@ def fingerprint_of(scenario: str, recorded_as: str, settings: str) -> str:
     return digest.hexdigest()
 
 
-def counts(tried: Tried, kind: type[Parameters], parameter: Described) -> bool:
+def counts(tried: Tried, kind: type[Parameters], parameter: Parameter) -> bool:
     """Whether another value of a parameter gives other estimates; it does not where it is refused."""
     case, name = tried.case, parameter.name
     situation = case.under.get(name, case.usual)

@@ -25,7 +25,6 @@ from fuselog.pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, t
 from fuselog.pipeline.exploring.curves import Path as Track
 from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.session import Session, open_session
-from fuselog.pipeline.exploring.sliders import SMALLER, in_words
 from fuselog.pipeline.exploring.verdict import numbers_of
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.estimators.landmarks import ROBOT
@@ -108,8 +107,8 @@ def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
     } <= found.keys()
     assert not {"sigma_fix_m", "lever_x_m", "sigma_heading_rad"} & found.keys()
     for slider in found.values():
-        assert slider.low <= slider.own <= slider.high
-        assert slider.value(slider.place(slider.own)) == slider.own
+        assert slider.low <= slider.default <= slider.high
+        assert slider.value(slider.place(slider.default)) == slider.default
         ends = slider.value(0.0), slider.value(1.0)
         assert ends == pytest.approx((slider.low, slider.high), rel=1e-3)
     assert found["sigma_range_m"].value(0.0) == pytest.approx(0.01)
@@ -281,12 +280,6 @@ def test_the_page_draws_and_says_what_was_replayed(
         page._show_head()
         assert ("One replay takes" in page._head.text) == is_said
     assert "--set sigma_range_m=0.03" in page._command.text
-
-
-def test_numbers_below_zero_are_written_as_those_above() -> None:
-    for unit in SMALLER:
-        for value in (1e-5, 0.003, 0.05, 2.0):
-            assert in_words(-value, unit) == f"\N{MINUS SIGN}{in_words(value, unit)}"
 
 
 def test_the_newest_work_wins() -> None:

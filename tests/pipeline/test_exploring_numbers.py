@@ -9,11 +9,19 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from fuselog.pipeline.diagnosing.hypotheses.parameters import STEPS
 from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
 from fuselog.pipeline.exploring.verdict import mean_nis, verdict_of
 from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.words import quantity
+from fuselog.pipeline.sensing.preparing import _STILL
+from fuselog.recorders.importers.tables.columns import _ENDINGS, _WRITTEN
+from fuselog.recorders.log.impossible import LIMITS
+from fuselog.recorders.parameters import Parameter
+from fuselog.recorders.units import ENDINGS, MISTAKEN, Unit, conversion, parted, unit, written
+from fuselog.replay.timeline.drawing.plots import shown_unit
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +55,7 @@ def test_the_lens_begins_at_a_typical_second() -> None:
 
 
 def slider(own: float, low: float, high: float, *, is_logarithmic: bool) -> Slider:
-    return Slider("sigma_range_m", "", "", "m", own, low, high, is_logarithmic)
+    return Slider("sigma_range_m", own, "m", low=low, high=high, is_log=is_logarithmic)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +68,30 @@ def slider(own: float, low: float, high: float, *, is_logarithmic: bool) -> Slid
     ],
 )
 def test_a_place_of_a_slider_is_a_value_of_four_digits(made: Slider, place: float, value: float) -> None:
-    assert made.value(place) == (made.own if value == made.own else float(f"{value:.4g}"))
+    assert made.value(place) == (made.default if value == made.default else float(f"{value:.4g}"))
     assert made.place(value) == pytest.approx(place, abs=2e-4)
     assert [made.values(3)[0], made.values(3)[-1]] == [made.low, made.high]
-    assert made.words(made.own) == in_words(made.own, "m")
+    assert made.words(made.default) == in_words(made.default, "m")
+
+
+def test_every_unit_that_one_place_knows_all_know() -> None:
+    """Its size, how it converts, what a report and a timeline write, and how numbers below zero look."""
+    of_units = {*REACH, *STEPS, *LIMITS, *_STILL, *MISTAKEN} - {""}
+    assert of_units <= set(ENDINGS.values())
+    for written_by_others in (_ENDINGS, _WRITTEN):
+        assert all(isinstance(unit(each), Unit) for each in written_by_others.values())
+    for ending, own in ENDINGS.items():
+        name = f"own_{ending}"
+        assert parted(name) == ("own", own)
+        assert conversion(own, name) == 1.0
+        assert quantity(name).unit == own
+        shown, sign, factor = shown_unit(name)
+        degrees = own.replace("rad", "deg") if own in ("rad", "rad/s") else own
+        assert (shown, sign, factor) == ("own", written(degrees), unit(own).size / unit(degrees).size)
+        for value in (1e-5, 0.003, 0.05, 2.0):
+            assert in_words(-value, own) == f"\N{MINUS SIGN}{in_words(value, own)}"
+    for own, others in MISTAKEN.items():
+        assert all(unit(other).powers == unit(own).powers for other in others)
 
 
 @pytest.mark.parametrize(
@@ -87,10 +115,13 @@ def test_ends_of_a_slider_follow_from_bounds_and_value(
     ends: tuple[float, float],
     is_logarithmic: bool,
 ) -> None:
-    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.bounds_of", lambda *_: bounds)
+    number = Parameter(name, None, unit, low=bounds[0], high=bounds[1])
+    monkeypatch.setattr("fuselog.pipeline.exploring.sliders.number_of", lambda *_: number)
     monkeypatch.setattr("fuselog.pipeline.exploring.sliders.value_at_start", lambda *_: (own, False))
-    made: Any = _slider(name, "group", "what it is", unit, None, SimpleNamespace(parameters=None))  # type: ignore[arg-type]
-    assert made == Slider(name, "group", "what it is", unit, own, *ends, is_logarithmic)
+    made: Any = _slider(name, "group", None, SimpleNamespace(parameters=0))  # type: ignore[arg-type]
+    low, high = ends
+    wanted = number._replace(default=own, low=low, high=high, is_log=is_logarithmic, group="group")
+    assert made == Slider(*wanted)
 
 
 def test_settings_are_kept_as_toml_with_what_is_estimated(log: fl.MemorySource) -> None:

@@ -7,6 +7,7 @@ import re
 import tarfile
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from fuselog.pipeline.sensing import exports, study
 from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom
 from fuselog.pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from fuselog.pipeline.sensing.likelihood import Samples, likelihood
-from fuselog.pipeline.sensing.noise import _drifts
+from fuselog.pipeline.sensing.noise import _drifts, parse_sheet
 from fuselog.pipeline.sensing.preparing import (
     Drift,
     check_at_rest,
@@ -28,7 +29,6 @@ from fuselog.pipeline.sensing.preparing import (
     white_block,
 )
 from fuselog.pipeline.sensing.terms import Terms
-from fuselog.pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
 from tests.goldens import keeping
 from tests.pipeline.conftest import Said
@@ -182,23 +182,35 @@ def test_vibration_is_noticed(walking: np.ndarray) -> None:
     assert (frequency_hz, amplitude) == pytest.approx((7.3, 1e-3), rel=0.1)
 
 
-def test_units_of_sheets_are_what_their_words_multiply_to() -> None:
+@pytest.mark.parametrize("words", ["rad deg mdeg", "g mg ug", "m"])
+def test_units_of_sheets_are_what_their_words_multiply_to(words: str) -> None:
     """Beside the column's unit white noise has s to the half, and a walk s to minus the half."""
     degree, g = np.pi / 180, 9.80665
     sizes = {"deg": degree, "mdeg": degree / 1e3, "g": g, "mg": g / 1e3, "ug": g / 1e6}
-    columns = {"rad/s": ("turn_rate_radps", -1), "m/s^2": ("specific_force_mps2", -2)}
-    for unit, (column, term, _) in UNITS.items():
-        word, rest = re.fullmatch(r"(m?deg|rad|[mu]?g|m)(.*)", unit).groups()
+    field, power, rests = {
+        "rad deg mdeg": (
+            "turn_rate_radps",
+            -1,
+            "/s/sqrt(Hz) /sqrt(s) /sqrt(h) /h/sqrt(Hz) /s^2/sqrt(Hz) /s/sqrt(s) /s*sqrt(Hz) /h/sqrt(h)",
+        ),
+        "g mg ug": ("specific_force_mps2", -2, "/sqrt(Hz) /sqrt(s)"),
+        "m": (
+            "specific_force_mps2",
+            -2,
+            "/s^2/sqrt(Hz) /s/sqrt(s) /s/sqrt(h) /s^3/sqrt(Hz) /s^2/sqrt(s) /s^2*sqrt(Hz)",
+        ),
+    }[words]
+    for word, rest in product(words.split(), rests.split()):
         by_seconds = []
         for s in (1.0, 4.0):
             known = {"s": s, "h": 3600 * s, "Hz": 1 / s, "sqrt": math.sqrt}
             acceleration = s**-2 if word in ("g", "mg", "ug") else 1.0
             by_seconds.append(acceleration * eval(f"1.0{rest.replace('^', '**')}", known))
-        field, power = columns[column]
         value = 3 * sizes.get(word, 1.0) * by_seconds[0]
-        assert parse_sheet(field, f"3 {unit}") == (term, pytest.approx(value, rel=1e-12)), unit
-        left = {"white": 0.5, "walk": -0.5}[term]
-        assert by_seconds[1] == pytest.approx(by_seconds[0] * 4.0 ** (power + left)), unit
+        left = math.log(by_seconds[1] / by_seconds[0], 4.0) - power
+        term = {0.5: "white", -0.5: "walk"}[round(left, 9)]
+        for name in (field, "value"):  # of a field without a unit both quantities are tried
+            assert parse_sheet(name, f"3 {word}{rest}") == (term, pytest.approx(value, rel=1e-12))
     half = parse_sheet("turn_rate_radps", "1 deg/s/sqrt(Hz) one-sided")
     assert half == ("white", pytest.approx(degree / np.sqrt(2)))
 
@@ -329,7 +341,9 @@ def test_bad_input_is_a_sentence() -> None:
     stamps[1000:] -= 1_000_000_007
     assert "stamps go back" in refused(replace(rest(size), publish_time_ns=stamps))
     assert "a third of its length" in refused(rest(size), taus=[30.0])
-    assert "is a unit for m/s^2" in refused(rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"})
+    assert "ug/sqrt(Hz) is no rad/s/sqrt(Hz) or rad/s/sqrt(s)" in refused(
+        rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"}
+    )
 
 
 def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:

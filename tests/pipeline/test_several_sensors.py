@@ -166,7 +166,7 @@ def test_what_is_wrong_is_named_by_its_topic(drive: fl.MemorySource) -> None:
         "/gps2/fix.lever_y_m": pytest.approx(0.2, abs=0.03),
     }
     session = Session(drive, {"ekf": {**TAKEN, **LEVERS, **OFFSETS}})
-    own = {slider.name: slider.own for slider in session.sliders}
+    own = {slider.name: slider.default for slider in session.sliders}
     assert own["/gps1/fix.lever_x_m"] == 0.5
     assert own["/gps2/fix.lever_x_m"] == -0.5
     right, worse = (session.play("ekf", values) for values in ({}, {"/gps2/fix.lever_x_m": 0.0}))

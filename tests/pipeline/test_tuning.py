@@ -21,9 +21,10 @@ from fuselog.pipeline.output.results import read_result
 from fuselog.pipeline.runs.executors import InlineExecutor
 from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence
 from fuselog.pipeline.tuning.objective import Best, Objective
-from fuselog.pipeline.tuning.search import Coordinates, Cost, Free, curvature, least, scanned
+from fuselog.pipeline.tuning.search import Coordinates, Cost, curvature, least, scanned
 from fuselog.pipeline.tuning.tuning import ENOUGH, _confirmed
 from fuselog.recorders.log import RunMetadata
+from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.streams.sources import memory_source
 from fuselog.replay.judging.consistency.whiteness import whitened
@@ -305,7 +306,7 @@ def test_a_spike_that_a_second_start_does_not_find_has_no_interval(
             x = points[:, 0]
             return np.minimum(0.5 * (x - 5.3) ** 2, 1e6 * x**2 - 50.0)
 
-    free = [Free("x", 0.0, -100.0, 100.0, is_positive=False, useful=1.0)]
+    free = [Parameter("x", 0.0, low=-100.0, high=100.0, useful=1.0)]
     known = confidence([0], np.ones((1, 1)))
     found = SearchOutcome(Coordinates(free, np.ones(1)), np.zeros(1), 0, known)
     ended = _confirmed(Valleys(), found)  # type: ignore[arg-type]
@@ -560,7 +561,7 @@ def test_a_search_ends_whatever_the_cost_is(cost: Callable[[Any], Any], is_smoot
         assert asked_for < 10_000
         return cost(values[:, 0])
 
-    coordinates = Coordinates([Free("sigma_m", 1.0, 0.0, np.inf, is_positive=True)], np.ones(1))
+    coordinates = Coordinates([Parameter("sigma_m", 1.0, low=0.0, is_log=True)], np.ones(1))
     found, _ = least(counted, coordinates, np.zeros(1), is_smooth=is_smooth)
     assert not np.isnan(found).any()
 
@@ -579,7 +580,7 @@ def test_what_need_not_be_positive_is_found_too() -> None:
 
 @pytest.mark.parametrize("lowest", [0.1, 10**-0.5, 10**-0.2, 10**0.2, 10**0.5, 10.0])
 def test_a_scan_finds_a_lower_minimum_up_to_ten_times_away(lowest: float) -> None:
-    coordinates = Coordinates([Free("sigma_m", 1.0, 1e-3, 1e3, is_positive=True)], np.ones(1))
+    coordinates = Coordinates([Parameter("sigma_m", 1.0, low=1e-3, high=1e3, is_log=True)], np.ones(1))
 
     def cost(values: np.ndarray) -> np.ndarray:
         return np.where(np.abs(np.log(values[:, 0] / lowest)) < 0.05, 0.0, 1.0)

@@ -8,8 +8,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.mapping import Mapped, StreamMapping, mapped
-from fuselog.recorders.importers.units import NAMED, conversion, unit
+from fuselog.recorders.units import NAMED, conversion, unit
 
 SOURCES = {
     "a": np.array([1.0, -9.0, 3.0, 999.0]),
@@ -48,6 +49,10 @@ SIZES = {
     "mg": 9.80665e-3,
     "kn": 1852 / 3600,
     "rpm": np.pi / 30,
+    "Hz": 1.0,
+    "mdeg": np.pi / 180e3,
+    "ug": 9.80665e-6,
+    **dict.fromkeys(["Pa", "dB", "degC", "%", "bytes"], 1.0),
 }
 
 
@@ -66,10 +71,15 @@ def test_units_are_as_large_as_they_are_defined() -> None:
         ("deg/s", "turn_rate_radps", np.pi / 180),
         ("rad", "latitude_deg", 180 / np.pi),
         ("mG", "magnetic_field_ut", 0.1),
-        ("cm", "covariance_m2", 0.01),
+        ("cm^2", "covariance_m2", 1e-4),
+        ("1/min", "clutter_per_s", 1 / 60),
         ("km/h", "velocity_mps", 1 / 3.6),
     ):
         assert conversion(given, field) == pytest.approx(factor), given
+    assert conversion("cm", "covariance_m2", is_root=True) == pytest.approx(0.01)
+    for name, field in (("cm", "covariance_m2"), ("%", "clutter_share"), ("Hz", "turn_rate_radps")):
+        with pytest.raises(BadInput, match=f"'{name}' does not fit: {field}"):
+            conversion(name, field)
 
 
 def test_factors_come_before_offsets_and_these_before_units() -> None:

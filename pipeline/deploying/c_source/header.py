@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
-from fuselog.recorders.parameters import meanings, unit_of
+from fuselog.recorders.parameters import meanings
+from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.inference.formulas import reference_names
 from fuselog.replay.inference.model.model import Sensor

@@ -1,6 +1,6 @@
 """Tries faults of the numbers read of a topic: factors, signs, biases, axes, conventions."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
 
@@ -18,9 +18,9 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     supposed,
     value_of,
 )
-from fuselog.recorders.importers.units import unit_of
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.units import mistaken, unit_of
 from fuselog.replay.engine.replaying.estimator import Reading
 
 FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
@@ -28,14 +28,6 @@ ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)
 TURNS_RAD = (0.5 * np.pi, -0.5 * np.pi, np.pi)
 SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # of how much what is read varies
 LARGEST_FACTOR = 12.0  # its logarithm
-# By the unit of a field, what may be in it instead: how many of it make the field's own.
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "m/s": {"km/h": 3.6, "ft/s": 1.0 / 0.3048, "mph": 1.0 / 0.44704, "kn": 1.0 / 0.514444},
-    "m": {"ft": 1.0 / 0.3048},
-    "rad/s": {"deg/s": 180.0 / np.pi},
-    "rad": {"deg": 180.0 / np.pi},
-    "m/s^2": {"g": 1.0 / 9.80665},
-}
 
 
 def of_components(
@@ -97,7 +89,7 @@ class _Own(NamedTuple):
 
 
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
-    units = UNITS.get(unit_of(entry.name), {})
+    units = mistaken(unit_of(entry.name))
     specials = {float(np.log(size)): f"{name} are" for name, size in units.items()}
     specials |= {-at: f"{meaning} that are converted twice" for at, meaning in specials.items()}
 

@@ -1,7 +1,7 @@
 """Tries faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
-from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,19 +23,19 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from fuselog.pipeline.diagnosing.likelihood import Trial
 from fuselog.pipeline.tuning.objective import with_values
-from fuselog.recorders.importers.units import unit_of
+from fuselog.pipeline.tuning.tuning import value_at_start
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import (
-    Described,
+    Parameter,
     Parameters,
-    bounds_of,
-    describe,
     field_of,
     in_few_words,
-    roles_of,
+    number_of,
+    numbers_of,
 )
-from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
-from fuselog.replay.engine.streams.channels import stated
+from fuselog.recorders.units import unit_of
+from fuselog.replay.engine.replaying.estimator import Bound, Reading
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.foreign.programs import ProgramParameters
 
@@ -51,12 +51,14 @@ def of_noises(
 ) -> Iterator[Hypothesis]:
     """Yield the noise that the estimator's parameters state, channels for them, or that is assumed."""
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
-    told = _described(bound)
+    parameters = bound[0].parameters
+    if parameters is None:
+        return
     for name, topic in noises.items():
         value = _value_of(bound, source, name)
         if value > 0.0:
             kind: Kind = "measurement noise" if topic else "process noise"
-            yield _scaled(name, told[field_of(name)].meaning, value, kind)
+            yield _scaled(number_of(type(parameters), name), value, kind)
 
 
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
@@ -68,28 +70,21 @@ def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypoth
     parameters = bound[0].parameters
     if parameters is None:
         return
-    kind, told = type(parameters), _described(bound)
-    for name, role in roles_of(kind).items():
-        value = _value_of(bound, source, name)
-        if role == "setting" or name == "gate_probability" or np.isnan(value):
+    for name, each in numbers_of(type(parameters)).items():
+        value, role = _value_of(bound, source, name), each.role
+        if not role or role == "setting" or name == "gate_probability" or np.isnan(value):
             continue
         is_scaled = role != "parameter" or isinstance(parameters, ProgramParameters)
-        if value > 0.0 and (is_scaled or bounds_of(kind, name)[0] >= 0.0):
-            yield _scaled(name, told[name].meaning, value, role)
+        if value > 0.0 and (is_scaled or each.low >= 0.0):
+            yield _scaled(each, value, role)
         elif role == "parameter":
-            step = STEPS.get(told[name].unit, STEPS[""])
+            step = STEPS.get(each.unit, STEPS[""])
             yield _parameters([name], (value,), step, (), is_angle=False)
 
 
-def _described(bound: Sequence[Bound]) -> dict[str, Described]:
-    """Describe the parameters by name."""
-    parameters = bound[0].parameters
-    return {} if parameters is None else {each.name: each for each in describe(type(parameters))}
-
-
-def _scaled(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
+def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
     """Suppose that a number above zero is stated too small or too large by a factor."""
-    what = in_few_words(meaning)
+    name, what = of.name, in_few_words(of.meaning)
     named = f"{name} ({what})" if what else name
     letter = {"measurement noise": "R", "process noise": "Q"}.get(kind)
 
@@ -109,24 +104,12 @@ def _scaled(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
     """Return the value of a number: given, stated by a channel, or assumed; NaN where it has none."""
-    parameters = bound[0].parameters
-    value = getattr(parameters, field_of(name), None)
-    if value is None and parameters is not None:
-        read = [
-            source.topics[topic]
-            for each in bound
-            for topic in (*each.streams, *each.static)
-            if topic in source.topics
-        ]
-        topic, _, own = name.rpartition(".")
-        first = [each for each in read if each.name == topic]
-        value = stated([*first, *read], own, type(parameters), needed=False)
-        if np.isnan(value):
-            assumed = ChainMap(*(dict(each.assumed) for each in bound if isinstance(each, Recursive)))
-            value = assumed.get(field_of(name), np.nan)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return np.nan
-    return float(value) if np.isfinite(value) else np.nan
+    for each in bound:
+        with suppress(BadInput):
+            value, _ = value_at_start(name, source, each)
+            if np.isfinite(value):
+                return float(value)
+    return np.nan
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:

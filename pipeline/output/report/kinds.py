@@ -36,7 +36,7 @@ from fuselog.pipeline.output.words import (
     quantity,
     scale,
 )
-from fuselog.recorders.parameters import unit_of
+from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
@@ -198,7 +198,7 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
-        unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
+        unit = f" {sign}" if (sign := written(unit_of(row["parameter"]))) else ""
         sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{interval}{begun}.")
     return replace(base, verdict=[*sentences, *base.verdict])
 

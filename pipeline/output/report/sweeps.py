@@ -23,7 +23,7 @@ from fuselog.pipeline.output.report.evidence import (
 from fuselog.pipeline.output.report.story import Card, Story, story
 from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.words import count, is_error, listed, quantity, scale, stated
-from fuselog.recorders.parameters import unit_of
+from fuselog.recorders.units import unit_of, written
 
 MOST_POINTS = 4  # more are counted
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point
@@ -125,7 +125,7 @@ class Sweep:
         """Return the values at a point in words: with what they are of, or `brief`."""
         parts = []
         for key, value in self.points[point].items():
-            text = f"{_value(value)} {unit_of(key) if _is_number(value) else ''}".rstrip()
+            text = f"{_value(value)} {written(unit_of(key)) if _is_number(value) else ''}".rstrip()
             parts.append(text if brief else f"{self.name(key)} = {text}")
         return f"({', '.join(parts)})" if brief and len(parts) > 1 else ", ".join(parts)
 
@@ -167,7 +167,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
     """Say over which values, with how many runs, of whom."""
     over = []
     for key in sweep.points[0]:
-        unit = unit_of(key)
+        unit = written(unit_of(key))
         ends = _ends([point[key] for point in sweep.points])
         over.append(f"{sweep.name(key, with_key=True)} from {ends} {unit}".rstrip())
     source = sweep.result.settings.get("record", {}).get("scenario")

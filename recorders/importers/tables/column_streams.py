@@ -34,8 +34,8 @@ from fuselog.recorders.importers.tables.guessed_places import (
     places_of,
     speed_unit_of,
 )
-from fuselog.recorders.importers.units import unit
 from fuselog.recorders.models.geodesy import local_metres
+from fuselog.recorders.units import unit
 
 # What vectors are called.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.importers.units import unit
+from fuselog.recorders.units import unit
 
 # What stands for a unit in names of columns with times of the day, hhmmss.
 TIME_OF_DAY = "hhmmss"

@@ -20,8 +20,8 @@ from fuselog.recorders.importers.tables.columns import (
     parted,
     stated_unit,
 )
-from fuselog.recorders.importers.units import unit
 from fuselog.recorders.models.geodesy import local_metres
+from fuselog.recorders.units import MISTAKEN, unit
 
 # Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
 _AIS = {
@@ -54,8 +54,7 @@ ALTITUDE = (
 # What latitudes may be in, and the largest latitude so.
 _SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
 _MINUTES = "ddmm.mmmm"
-_SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "kn": 1852 / 3600, "mi/h": 0.44704, "ft/s": 0.3048}
-_SPEEDS |= {"cm/s": 0.01, "mm/s": 0.001}
+_SPEEDS = {name: unit(name).size for name in ("m/s", *MISTAKEN["m/s"], "cm/s", "mm/s")}
 _NEAR = 0.03  # of a ratio of the path to the speed
 _HIGHEST_M = 12_000.0  # that anything with a receiver mostly is
 # What columns of hemispheres are called, if they have a name.

@@ -42,9 +42,9 @@ from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Orig
 from fuselog.recorders.importers.tables.order import Order, is_reversed
 from fuselog.recorders.importers.tables.plane import Plane
 from fuselog.recorders.importers.tables.times import MEND, Reading, TimeMapping, read_counter, stamps_ns
-from fuselog.recorders.importers.units import conversion
 from fuselog.recorders.log import Stream, make_stream
 from fuselog.recorders.log.planes import FRAME, is_planar
+from fuselog.recorders.units import conversion
 
 PLACE = ("east_m", "north_m", "up_m")
 QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")

@@ -17,11 +17,11 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.models.inertial import EARTH_RATE_RADPS, into_body, into_plane, product, rotation
 from fuselog.recorders.models.planar import Components, wrap_angle
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.measurements import SPACE, read_fixes
 from fuselog.replay.estimators.navigation.samples import (
     NS,
-    STANDARD_GRAVITY_MPS2,
     USUAL_SIGMA_M,
     GnssMotion,
     ImuSamples,

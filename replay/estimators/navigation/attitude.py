@@ -18,11 +18,11 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.inertial import into_body, into_plane, product, rotation, triad
 from fuselog.recorders.models.planar import Components
 from fuselog.recorders.models.states import ORIENTATION
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 from fuselog.replay.engine.arrays import Booleans, Floats
 from fuselog.replay.engine.vectors.components import components_of
 from fuselog.replay.engine.vectors.tangent import Kind
 from fuselog.replay.estimators.navigation.navigation import UNIT as CARRIED
-from fuselog.replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started

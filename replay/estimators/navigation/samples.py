@@ -9,11 +9,11 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.models.inertial import from_mounting
 from fuselog.recorders.models.states import NAVIGATION
+from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.measurements import read_fixes
 from fuselog.replay.engine.vectors.components import components_of
 
-STANDARD_GRAVITY_MPS2 = 9.80665
 USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
 VELOCITY = components_of(NAVIGATION[3:6])
 NS = 1e-9

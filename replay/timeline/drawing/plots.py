@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.recorders.log import schemas
+from fuselog.recorders.units import parted, written
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, chi_square_interval, innovations_of
 from fuselog.replay.timeline.drawing.canvas import (
@@ -435,34 +436,9 @@ def shown_unit(component: str) -> tuple[str, str, float]:
 
     A name that does not end in a unit, as `pressure_a`, is all quantity.
     """
-    quantity, _, unit = component.rpartition("_")
-    if not quantity or unit not in _SHOWN:
-        return component.replace("_", " "), "-", 1.0
-    return quantity.replace("_", " "), *_SHOWN[unit]
-
-
-_SHOWN = {
-    "rad": ("deg", 180 / np.pi),
-    "rad2": ("rad²", 1.0),
-    "radps": ("deg/s", 180 / np.pi),
-    "deg": ("deg", 1.0),
-    "m": ("m", 1.0),
-    "m2": ("m²", 1.0),
-    "mps": ("m/s", 1.0),
-    "mps2": ("m/s²", 1.0),
-    "m2ps2": ("m²/s²", 1.0),
-    "s": ("s", 1.0),
-    "s2": ("s²", 1.0),
-    "ut": ("µT", 1.0),
-    "ut2": ("µT²", 1.0),
-    "mm": ("mm", 1.0),
-    "km": ("km", 1.0),
-    "degps": ("deg/s", 1.0),
-    "mrad": ("mrad", 1.0),
-    "hz": ("Hz", 1.0),
-    "db": ("dB", 1.0),
-    "h": ("h", 1.0),
-    "pa": ("Pa", 1.0),
-    "percent": ("%", 1.0),
-    "degC": ("°C", 1.0),
-}
+    quantity, own = parted(component)
+    if own in ("rad", "rad/s"):
+        own, factor = own.replace("rad", "deg"), 180 / np.pi
+    else:
+        factor = 1.0
+    return quantity.replace("_", " "), written(own) or "-", factor

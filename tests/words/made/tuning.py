@@ -9,10 +9,11 @@ import pandas as pd
 
 from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence, doubts
 from fuselog.pipeline.tuning.outcome import Tuning
-from fuselog.pipeline.tuning.search import Coordinates, Free
+from fuselog.pipeline.tuning.search import Coordinates
+from fuselog.recorders.parameters import Parameter
 
 NAMES = ("sigma_range_m", "sigma_bearing_rad", "density")
-FREE = [Free(name, 1.0, 0.01, 100.0, is_positive=True) for name in NAMES]
+FREE = [Parameter(name, 1.0, low=0.01, high=100.0, is_log=True) for name in NAMES]
 SEARCHED = Coordinates(FREE, np.ones(len(FREE)))
 
 
@@ -49,7 +50,7 @@ def search() -> Iterator[str]:
     for value in (0.01, 100.0):
         yield from _notes(f"at {value:g}", optimum=np.array([value, 1.0, 1.0]))
     yield from _notes("assumed", free=[FREE[0]._replace(is_assumed=True), *FREE[1:]])
-    yield from _notes("kept", free=[FREE[0].kept, *FREE[1:]])
+    yield from _notes("kept", free=[FREE[0].fixed, *FREE[1:]])
 
 
 def held_out() -> Iterator[str]:
