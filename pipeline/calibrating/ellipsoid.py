@@ -22,6 +22,7 @@ from fuselog.pipeline.sensing.units import unit_of
 from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.judging.errors.intervals import Interval
 
 Floats = NDArray[np.float64]
 GRAVITY_MPS2 = 9.80665
@@ -163,7 +164,8 @@ class Ellipsoid:
         outcome = Outcome(figures={"lengths": self.chart}, kind="ellipsoid")
         outcome.tables["ellipsoid"] = self.table
         for row in self.table.dropna().to_dict("records"):
-            outcome.measure(f"ellipsoid.{row['parameter']}", row["value"], row["low"], row["high"])
+            number = Interval(row["value"], row["low"], row["high"])
+            outcome.measure(f"ellipsoid.{row['parameter']}", number)
         settings = {
             "title": f"Ellipsoid of {self.topic}.{self.field}",
             "logs": list(self.logs),
