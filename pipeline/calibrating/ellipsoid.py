@@ -22,7 +22,7 @@ from fuselog.pipeline.sensing.units import unit_of
 from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 GRAVITY_MPS2 = 9.80665

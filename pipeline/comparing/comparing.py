@@ -46,7 +46,7 @@ from fuselog.replay.judging.errors.differences import (
     paired_difference,
     target_of,
 )
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS
+from fuselog.replay.judging.intervals import FEWEST_RUNS
 
 MARGIN = 0.02
 # The differences over time have at most so many spans.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from fuselog.pipeline.comparing.groups import runs_of
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.replay.judging.errors.differences import Difference, Target
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, too_few
+from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 
 ALL = "all"
 DECIDED = ("worse", "better", "higher", "lower")

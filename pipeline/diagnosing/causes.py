@@ -26,7 +26,7 @@ from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, 
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out

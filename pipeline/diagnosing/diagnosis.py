@@ -60,7 +60,7 @@ from fuselog.recorders.parameters import merge
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from fuselog.replay.foreign.naming import allowed, name_of, of_file, refuse_programs
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}

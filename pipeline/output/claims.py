@@ -31,7 +31,7 @@ from fuselog.pipeline.output.refutations import refutation
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, Interval
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 
 Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
 # What a claim has in place of one where the data are not those that it is made of.

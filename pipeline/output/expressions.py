@@ -35,7 +35,7 @@ from fuselog.pipeline.output.numbers import (
 )
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 
 class NoMetric(Exception):

@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Any, Literal
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 # True, false, None where an interval leaves it open, or "missing" where a number is NaN.
 Truth = bool | Literal["missing"] | None

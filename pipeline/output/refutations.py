@@ -16,7 +16,7 @@ from fuselog.pipeline.output.expressions import (
     value_of,
 )
 from fuselog.pipeline.output.numbers import COMPARISONS, Truth, by_entry, exactly, flat
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 MOST_ENTRIES = 4  # that a sentence names
 _WORDS: dict[type[ast.cmpop], str] = {

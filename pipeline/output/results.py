@@ -25,7 +25,7 @@ from fuselog.recorders.atomic import whole_file, whole_folder
 from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, Interval, mean_interval
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval, mean_interval
 
 if TYPE_CHECKING:
     import pandas as pd

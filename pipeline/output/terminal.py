@@ -32,7 +32,7 @@ from fuselog.pipeline.output.results import (
 )
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import printable
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, too_few
+from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 
 if TYPE_CHECKING:
     import pandas as pd

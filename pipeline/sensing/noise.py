@@ -19,7 +19,7 @@ from fuselog.pipeline.sensing.preparing import Drift, Grid, block_means, samples
 from fuselog.pipeline.sensing.units import parse_sheet, unit_of
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Stream
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 _DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times

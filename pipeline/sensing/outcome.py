@@ -17,7 +17,7 @@ from fuselog.pipeline.sensing.allan import Curve, interval
 from fuselog.pipeline.sensing.exports import FILES, Densities, Density
 from fuselog.pipeline.sensing.fitting import Fit
 from fuselog.pipeline.sensing.units import unit_of
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 MISFIT = "misfit: "  # what a sentence has that whoever uses the numbers reads first

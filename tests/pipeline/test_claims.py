@@ -21,7 +21,7 @@ from fuselog.pipeline.runs.experiment import Experiment, Stated, load_experiment
 from fuselog.pipeline.runs.inputs import Recording, holding, shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import build
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 from tests.goldens.recipes import DATA, importer_of, unpack
 
 METRICS = {

@@ -28,7 +28,7 @@ from fuselog.pipeline.studies.toolkit.repetitions import (
 )
 from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.judging.errors.intervals import mean_interval, rms_interval
+from fuselog.replay.judging.intervals import mean_interval, rms_interval
 from tests.goldens import keeping
 
 # Two runs of two steps, one of which failed; errors of 5, 13 and 17 m.

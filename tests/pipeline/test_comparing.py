@@ -23,7 +23,7 @@ from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
 from fuselog.pipeline.comparing.renamed import Renamed
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.replay.judging.errors.differences import Difference
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.timeline.side_by_side import _alone
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -22,7 +22,7 @@ from fuselog.pipeline.output.report.story import Story, gauge, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
 from fuselog.replay.judging.errors.differences import dominating
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 
 def _told(

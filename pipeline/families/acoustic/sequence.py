@@ -21,7 +21,7 @@ from fuselog.pipeline.studies.toolkit.repetitions import errors_named, require_s
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.judging.errors.intervals import Interval, mean_interval
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 

@@ -36,7 +36,7 @@ from fuselog.replay.families.biometrics.sequential import (
 )
 from fuselog.replay.families.biometrics.verification import Fused, fused_of
 from fuselog.replay.judging.errors.evaluation import split_topic
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 Share = Annotated[float, Field(gt=0, lt=0.5)]
 RatioOf = Callable[[Integers], Floats]

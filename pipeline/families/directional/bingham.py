@@ -32,7 +32,7 @@ from fuselog.replay.families.directional.bingham import BinghamNoise, make_steps
 from fuselog.replay.families.directional.distributions import bingham
 from fuselog.replay.families.directional.estimators import as_bingham, as_covariance
 from fuselog.replay.families.directional.grid import run_axis_grid_filter
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 Floats = NDArray[np.float64]
 

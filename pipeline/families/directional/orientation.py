@@ -31,7 +31,7 @@ from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.families.directional.disturbances import COMPONENTS, disturbances
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 KINDS = ("undisturbed", "disturbed", "slow", "fast", "rotation", "translation", "combined")
 PARTS = ("total", "heading", "inclination")

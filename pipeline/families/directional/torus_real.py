@@ -44,7 +44,7 @@ from fuselog.replay.families.directional.torus import (
     run_toroidal_filter,
     run_unscented_filter,
 )
-from fuselog.replay.judging.errors.intervals import Interval, mean_interval
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 Filter = Callable[..., tuple[WrappedNormal, WrappedNormal]]
 

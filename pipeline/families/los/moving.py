@@ -30,7 +30,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.inference.observability import OBSERVABILITY
 from fuselog.replay.judging.errors.evaluation import Errors
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 MODEL = "moving-sights"
 ALIGNED_S, LAST_S = 10.0, 10.0

@@ -25,7 +25,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 Booleans = NDArray[np.bool_]
 

@@ -23,7 +23,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.families.networks.estimator import message_bytes
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 CALM, CI, NAIVE = "calm", "ci", "naive"
 INTERVAL, NEWS = "at most once in an interval", "when it has news"

@@ -29,7 +29,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.inference.sampling import Sampler, Samples, parse_sampling
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
 RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others

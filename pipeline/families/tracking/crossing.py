@@ -17,7 +17,7 @@ from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.families.tracking.judging.errors import instants_of
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 
 class CrossingOptions(Parameters):

@@ -29,7 +29,7 @@ from fuselog.replay.families.tracking.judging.errors import (
     tracks_at,
 )
 from fuselog.replay.judging.errors.evaluation import Innovations
-from fuselog.replay.judging.errors.intervals import Interval, mean_interval
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 # The figures whose differences are told.
 COMPARED = (

@@ -23,7 +23,7 @@ from fuselog.replay.judging.errors.differences import (
     paired_difference,
     target_of,
 )
-from fuselog.replay.judging.errors.intervals import (
+from fuselog.replay.judging.intervals import (
     FEWEST_RUNS,
     Interval,
     mean_interval,

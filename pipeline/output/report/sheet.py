@@ -26,7 +26,7 @@ from fuselog.pipeline.output.words import (
     scale,
 )
 from fuselog.replay.judging.errors.differences import target_of
-from fuselog.replay.judging.errors.intervals import mean_interval, rms_interval
+from fuselog.replay.judging.intervals import mean_interval, rms_interval
 
 MOST_ROWS = 12
 GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)

@@ -32,7 +32,7 @@ from fuselog.pipeline.output.words import (
     scale,
 )
 from fuselog.replay.judging.diagnostics import LEAST_SHARE
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, Interval
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long

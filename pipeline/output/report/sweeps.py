@@ -23,7 +23,7 @@ from fuselog.pipeline.output.report.story import Card, Story, story
 from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.words import count, is_error, listed, quantity, scale, stated
 from fuselog.recorders.parameters import unit_of
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 MOST_POINTS = 4  # more are counted
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point

@@ -1,6 +1,6 @@
 """Pairs differences of a metric: what one estimator gave of every run against another's.
 
-Intervals are those of the percentile bootstrap, see `fuselog.replay.judging.errors.intervals`. BCa is no
+Intervals are those of the percentile bootstrap, see `fuselog.replay.judging.intervals`. BCa is no
 better here: paired differences of two alike are symmetric, however skewed the metric, and what BCa
 corrects is chance (over 50 runs it called 9 to 11 % of NEES different where nothing is). Every metric
 has an interval of 95 % of its own: of many without a difference, about one in twenty is called different
@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fuselog.replay.judging.errors.intervals import FEWEST_RUNS, RESAMPLES, Floats, Interval
+from fuselog.replay.judging.intervals import FEWEST_RUNS, RESAMPLES, Floats, Interval
 
 # What a metric should be: small, large, near a value; None where neither is better.
 Target = Literal["low", "high"] | float | None

@@ -10,7 +10,7 @@ from fuselog.pipeline.checking.discrepancies import Discrepancy
 from fuselog.pipeline.comparing.comparing import Paired
 from fuselog.pipeline.comparing.groups import unlike_runs
 from fuselog.replay.judging.errors.differences import Difference, Target, paired_difference
-from fuselog.replay.judging.errors.intervals import Interval
+from fuselog.replay.judging.intervals import Interval
 
 EIGHT = np.array([1.0, 1.2, 0.9, 1.1, 1.05, 0.95, 1.15, 0.85])
 

@@ -10,7 +10,7 @@ from fuselog.pipeline.families.tracking.study import figures_of, measure_changes
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.experiment import load_experiment, run_experiment
 from fuselog.replay.families.tracking.judging.errors import UNREFERENCED_M, TracksAt
-from fuselog.replay.judging.errors.intervals import mean_interval
+from fuselog.replay.judging.intervals import mean_interval
 
 
 def test_figures_of_whole_tracks():

@@ -69,8 +69,8 @@ def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
 
     Args:
         values: of the runs.
-        fewest: of fewer there is no interval. Only a study of recordings that nobody can repeat states
-            another number than the rule's.
+        fewest: of fewer there is no interval. Only a study whose units nobody can multiply, such as the
+            robots of a recording, states another number than the rule's.
     """
     from scipy.special import stdtrit
 
