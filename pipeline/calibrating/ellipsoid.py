@@ -22,6 +22,7 @@ from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2, unit_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 FEWEST, MOST = 30, 20_000  # readings; of more, one in so many is taken
@@ -162,7 +163,8 @@ class Ellipsoid:
         outcome = Outcome(figures={"lengths": self.chart}, kind="ellipsoid")
         outcome.tables["ellipsoid"] = self.table
         for row in self.table.dropna().to_dict("records"):
-            outcome.measure(f"ellipsoid.{row['parameter']}", row["value"], row["low"], row["high"])
+            number = Interval(row["value"], row["low"], row["high"])
+            outcome.measure(f"ellipsoid.{row['parameter']}", number)
         settings = {
             "title": f"Ellipsoid of {self.topic}.{self.field}",
             "logs": list(self.logs),

@@ -50,7 +50,6 @@ from fuselog.recorders.atomic import scratch_folder, whole_file
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Companions, Log, open_log
 from fuselog.replay.engine.streams.sources import LogSource
-from fuselog.replay.judging.errors.differences import FEWEST_RUNS
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
 
@@ -305,8 +304,7 @@ def _print_outcome(
         print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
-    runs = judge.runs_table if judge.runs >= FEWEST_RUNS else None  # of fewer it says nothing
-    print_metrics(values, judge.bounds, runs)
+    print_metrics(values, judge.bounds, judge.runs_table)
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(

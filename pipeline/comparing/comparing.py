@@ -40,13 +40,13 @@ from fuselog.recorders.log import open_log
 from fuselog.replay.engine.replaying.usage import Row
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.differences import (
-    FEWEST_RUNS,
     NATS,
     Difference,
     Target,
     paired_difference,
     target_of,
 )
+from fuselog.replay.judging.intervals import FEWEST_RUNS
 
 MARGIN = 0.02
 # The differences over time have at most so many spans.
@@ -80,15 +80,14 @@ class Differences:
         """Return a row per pair, metric and case."""
         rows = []
         for each in self.paired:
-            found = each.found._asdict()
+            found = each.found.columns
             begin_s, end_s = each.where or (np.nan, np.nan)
             first, second = each.first, each.second
             about = {"quantity": each.quantity, "case": each.case, "aim": _target_text(each.target)}
-            values = {"first_mean": found.pop("first"), "second_mean": found.pop("second")}
             when = {"most_from_s": begin_s, "most_to_s": end_s}
             if each.is_withheld:
                 found["verdict"] = "withheld"
-            rows.append({"first": first, "second": second, **about, **values, **found, **when})
+            rows.append({"first": first, "second": second, **about, **found, **when})
         return pd.DataFrame(rows)
 
     @property
@@ -177,7 +176,7 @@ class Differences:
             outcome.tables["times"] = self.times
         for each in self.paired:
             key = f"{each.second}.{each.quantity}_difference"
-            outcome.metrics[f"{key}.{each.case}" if each.case else key] = each.found.difference
+            outcome.metrics[f"{key}.{each.case}" if each.case else key] = each.found.more.value
         outcome.input_sha256 = hash_files([path for path in inputs if path.is_file()])
         if self.stress is not None:
             outcome.stress = [*verdicts_of(self.stress.stressed).values()]
@@ -376,7 +375,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
             "from_s": (span - 1) * width_s,
             "to_s": span * width_s,
         }
-        kept = {name: getattr(found, name) for name in ("difference", "low", "high", "runs")}
+        kept = {name: found.columns[name] for name in ("difference", "low", "high", "runs")}
         rows.append({**about, **time, **kept})
     return pd.DataFrame(rows)
 
@@ -414,7 +413,7 @@ def _where(
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]
     own = own.sort_values("from_s").reset_index(drop=True)
-    sign = np.sign(found.difference)
+    sign = np.sign(found.more.value)
     beyond = np.where(sign > 0, own["low"] > 0, own["high"] < 0)
     if not beyond.any():
         return None

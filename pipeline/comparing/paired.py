@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from fuselog.pipeline.comparing.groups import runs_of
 from fuselog.pipeline.output.alarms import Stressing
-from fuselog.replay.judging.errors.differences import FEWEST_RUNS, Difference, Target
+from fuselog.replay.judging.errors.differences import Difference, Target
+from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 
 ALL = "all"
 DECIDED = ("worse", "better", "higher", "lower")
@@ -38,7 +37,7 @@ class Paired(NamedTuple):
     @property
     def is_withheld(self) -> bool:
         """Tell whether changes that should not matter move the metric further than the difference."""
-        return self.found.verdict in DECIDED and abs(self.found.difference) < self.stressed
+        return self.found.verdict in DECIDED and abs(self.found.more.value) < self.stressed
 
     @property
     def sentence(self) -> str:
@@ -48,13 +47,11 @@ class Paired(NamedTuple):
         values = f"{found.second:.4g} against {found.first:.4g}"
         if isinstance(self.target, float):
             values += f", where {self.target:g} is right"
-        if found.runs < FEWEST_RUNS and np.isnan(found.low):
-            return (
-                f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
-                f"and this is of {runs_of(found.runs)}"
-            )
-        interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
-        margin = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
+        if found.runs < FEWEST_RUNS:
+            equal = "equal in every run; " if found.verdict == "no difference" else ""
+            return f"{self.quantity}{of}: {values}; {equal}{too_few(found.runs)}"
+        interval = f"difference {found.more}"
+        of_runs = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
         if found.verdict == "unclear":
             verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
@@ -66,7 +63,7 @@ class Paired(NamedTuple):
                 f"matter move it by up to {self.stressed:.3g}"
             )
         when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
-        return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
+        return f"{self.quantity}{of}: {verdict}: {values}; {interval}, {of_runs}{when}"
 
 
 def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) -> list[Paired]:

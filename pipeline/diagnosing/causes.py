@@ -26,6 +26,7 @@ from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, 
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.intervals import Interval
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
@@ -39,15 +40,6 @@ LEADING = 10  # of the likeliest faults: each is tried beside all that gain less
 
 Named = tuple[Peak, Hypothesis]
 Names = list[Named]  # of one cause: what a log does not tell from it
-
-
-class Estimated(NamedTuple):
-    """Holds a number of a cause: the component or parameter it is of, and its 95 % interval."""
-
-    part: str
-    value: float
-    low: float
-    high: float
 
 
 class Cause(NamedTuple):
@@ -84,13 +76,14 @@ class Cause(NamedTuple):
         return f"{without} (no interval: the fit of all causes together did not converge)"
 
     @property
-    def numbers(self) -> "list[Estimated]":
-        """Return the numbers with intervals as they are reported: factors, not their logarithms."""
+    def numbers(self) -> list[Interval]:
+        """Return the numbers as they are reported, by component: factors, not their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
-            return [Estimated(of.part, *(of.reported(each) for each in (self.value, low, high)))]
+            return [Interval(self.value, low, high, name=of.part).rising(of.reported)]
         names = [of.topic, *of.part.split(", ")][-of.size :]
-        return [Estimated(*each) for each in zip(names, self.value, low, high, strict=True)]
+        numbers = zip(self.value, low, high, names, strict=True)
+        return [Interval(value, low, high, name=name) for value, low, high, name in numbers]
 
     @property
     def words(self) -> str:

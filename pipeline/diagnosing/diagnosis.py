@@ -21,7 +21,7 @@ from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
 from fuselog.pipeline.api.replays import Replay, replay
 from fuselog.pipeline.diagnosing.advice import Advice, Trying
-from fuselog.pipeline.diagnosing.causes import Estimated, Sought, least_gain, seek, tried_table
+from fuselog.pipeline.diagnosing.causes import Sought, least_gain, seek, tried_table
 from fuselog.pipeline.diagnosing.consistency import (
     judged_by_itself,
     nis_charts,
@@ -60,6 +60,7 @@ from fuselog.recorders.parameters import merge
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from fuselog.replay.foreign.naming import allowed, name_of, of_file, refuse_programs
+from fuselog.replay.judging.intervals import Interval
 
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
@@ -117,7 +118,7 @@ class Diagnosis:
         rows = []
         for order, each in enumerate(self.sentences, start=1):
             shared = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
-            nothing = [Estimated("", np.nan, np.nan, np.nan)]
+            nothing = [Interval(np.nan)]
             alike = (each.cause, *each.cause.others) if each.cause else ()
             for cause in alike or (None,):
                 about = cause.hypothesis if cause else None
@@ -127,7 +128,8 @@ class Diagnosis:
                         {
                             **shared,
                             **own,
-                            **part._asdict(),
+                            "part": part.name,
+                            **{name: getattr(part, name) for name in ("value", "low", "high")},
                             "gain": cause.gain if cause else np.nan,
                             "setting": each.setting if cause is each.cause else "",
                             "sentence": each.words,

@@ -103,7 +103,7 @@ def first_part(
             f"{MOST_MESSAGES} of {count} messages, and tried on the rest; for another part: fuselog cut"
         )
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    # What no sensor can give was left out above; no alteration of a trial leaves out more, or it would gain.
+    # Impossible values were left out above: no trial leaves out more, or it would gain by that.
     part = MemorySource(streams, run, source.name, is_raw=True)
     return Portion(part, end_ns, note)
 

@@ -21,15 +21,17 @@ from fuselog.pipeline.output.expressions import (
     expressions_in,
     formatted,
     keys_of,
+    lacks_interval,
     names_in,
     needs_runs,
     truth,
 )
-from fuselog.pipeline.output.numbers import Number, Value, exactly
+from fuselog.pipeline.output.numbers import Value, exactly
 from fuselog.pipeline.output.refutations import refutation
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 
 Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
 # What a claim has in place of one where the data are not those that it is made of.
@@ -80,8 +82,8 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 
 def known(claim: Claim) -> Claim:
     """Return the claim, neither confirmed nor refuted where a number of ours is missing."""
-    has_none = claim.verdict in ("not reproducible", NO_VERDICT)
-    if has_none or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
+    is_decided = claim.verdict in ("confirmed", "refuted")
+    if not is_decided or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
         return claim
     why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
     return replace(claim, verdict="not reproducible", why=why)
@@ -286,7 +288,7 @@ def _as_far_as_known(text: str, values: Values) -> str:
 def _few_runs(claim: StatedClaim, values: Values) -> str:
     """Explain that a claim is of too few runs to be decided without an interval; empty if it is not."""
     runs, least = values.names.get("runs"), claim.least_runs
-    if not isinstance(runs, Number) or least is None or runs.value >= least:
+    if not isinstance(runs, Interval) or least is None or runs.value >= least:
         return ""
     stated = _stated(claim)
     if not any(needs_runs(each, stated, values) for each in (claim.holds, claim.reproducible) if each):
@@ -311,6 +313,9 @@ def _verdict(claim: StatedClaim, values: Values) -> Claim:
     )
     verdict: Verdict = "not reproducible"
     holds = truth(claim.holds, values) if claim.holds else False
+    if holds == "missing" and lacks_interval(claim.holds, _stated(claim), values):
+        few = f"too few runs for a 95 % interval, which takes {FEWEST_RUNS}"
+        return Claim(sentence, paper, ours, "not shown", few)
     if holds == "missing":
         unless = "; ".join(filter(None, [unless, "estimates are missing"]))
     elif claim.holds and (not claim.reproducible or truth(claim.reproducible, values) is True):

@@ -23,7 +23,6 @@ from fuselog.pipeline.output.numbers import (
     COMPARISONS,
     FUNCTIONS,
     OPERATIONS,
-    Number,
     Truth,
     Value,
     all_hold,
@@ -36,6 +35,7 @@ from fuselog.pipeline.output.numbers import (
 )
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
+from fuselog.replay.judging.intervals import Interval
 
 
 class NoMetric(Exception):
@@ -72,7 +72,7 @@ def evaluate(expression: str, values: Values) -> Value:
 def truth(expression: str, values: Values) -> Truth:
     """Tell whether an expression holds, a list in all entries; raises as `evaluate` does."""
     found = evaluate(expression, values)
-    if isinstance(found, Number):
+    if isinstance(found, Interval):
         raise BadInput(f"'{expression}' is a number, no comparison; compare it with a limit")
     return all_hold(found if isinstance(found, list) else [found])
 
@@ -107,7 +107,7 @@ def in_words(value: Value, form: str, *, named: bool = False) -> str:
     """Write a value, with its interval if it has one, and with the names of numbers if `named`."""
     if isinstance(value, list):
         return ", ".join(in_words(each, form, named=named) for each in value)
-    if not isinstance(value, Number):
+    if not isinstance(value, Interval):
         return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
     text, low, high = (format(each, form) if math.isfinite(each) else MISSING for each in value[:3])
     if value.low != value.high and value.is_known:
@@ -164,7 +164,7 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
         stated: expressions by the names that it has for them.
         values: what it may name.
     """
-    tree = _Expanded(stated).visit(deepcopy(parse(expression)))
+    tree = _expanded(expression, stated)
     for node in ast.walk(tree):
         match node:
             case ast.Call(func=ast.Name(id="value" | "low" | "high"), args=[of]) if metrics_of(of):
@@ -173,8 +173,33 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
                 within = [each for op, each in zip(ops, others, strict=True) if isinstance(op, ast.In)]
                 if any(map(metrics_of, within)):
                     return True
-    found = [key for each in metrics_of(tree) for key in keys_of(*each, values.metrics)]
-    return not values.intervals.keys() >= set(found)
+    return not values.intervals.keys() >= {*_keys_in(tree, values)}
+
+
+def lacks_interval(expression: str, stated: Mapping[str, str], values: Values) -> bool:
+    """Tell whether an expression reads a metric whose interval too few runs leave unknown.
+
+    The arguments are those of `needs_runs`.
+    """
+    return any(
+        values.metrics[key] is not None and None in map(_known, values.intervals.get(key, ()))
+        for key in _keys_in(_expanded(expression, stated), values)
+    )
+
+
+def _known(end: float | None) -> float | None:
+    return None if end is None or math.isnan(end) else end
+
+
+def _keys_in(tree: ast.expr, values: Values) -> list[str]:
+    """Return the keys of the metrics that an expression reads."""
+    return [key for each in metrics_of(tree) for key in keys_of(*each, values.metrics)]
+
+
+def _expanded(expression: str, stated: Mapping[str, str]) -> ast.expr:
+    """Return the tree of an expression, with the expressions in it that names stand for."""
+    tree: ast.expr = _Expanded(stated).visit(deepcopy(parse(expression)))
+    return tree
 
 
 class _Expanded(ast.NodeTransformer):
@@ -224,7 +249,7 @@ def value_of(node: ast.expr, values: Values) -> Value:
             return metric(quantity, of, values)
         case ast.Subscript(value=of_list, slice=index):
             entries, place = value_of(of_list, values), value_of(index, values)
-            if not isinstance(entries, list) or not isinstance(place, Number):
+            if not isinstance(entries, list) or not isinstance(place, Interval):
                 raise BadInput(f"'{ast.unparse(node)}': only a list has entries")
             if not -len(entries) <= place.value < len(entries):
                 raise NoMetric(ast.unparse(node))
@@ -306,7 +331,7 @@ def _of_key(key: str, name: str, values: Values) -> Value:
         return [exactly(each, name) for each in value]
     if key in values.intervals:
         low, high = (exactly(end).value for end in values.intervals[key])
-        return Number(exactly(value).value, low, high, name)
+        return Interval(exactly(value).value, low, high, name=name)
     return exactly(value, name)
 
 

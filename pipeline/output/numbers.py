@@ -1,4 +1,4 @@
-"""Computes with numbers and their 95 % intervals, as expressions need it.
+"""Computes with intervals, as expressions need it.
 
 What an interval leaves open is neither true nor false. Operations and comparisons on lists are entry by
 entry.
@@ -9,35 +9,20 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from fuselog.recorders.errors import BadInput
-
-
-class Number(NamedTuple):
-    """Holds a number and where it lies with 95 %; without interval both ends are the number itself."""
-
-    value: float
-    low: float
-    high: float
-    name: str = ""
-    """What `*` and `|` stood for in it."""
-
-    @property
-    def is_known(self) -> bool:
-        """Tell whether neither it nor an end is NaN."""
-        return not any(map(math.isnan, self[:3]))
-
+from fuselog.replay.judging.intervals import Interval
 
 # True, false, None where an interval leaves it open, or "missing" where a number is NaN.
 Truth = bool | Literal["missing"] | None
-Value = Number | Truth | list[Any]
+Value = Interval | Truth | list[Any]
 
 
-def exactly(value: float | None, name: str = "") -> Number:
-    """Return a number without an interval; NaN for None."""
+def exactly(value: float | None, name: str = "") -> Interval:
+    """Return a number that is exact; NaN for None."""
     value = math.nan if value is None else float(value)
-    return Number(value, value, value, name)
+    return Interval(value, value, value, name=name)
 
 
 def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
@@ -52,7 +37,7 @@ def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
     return [by_entry(function, *each) for each in zip(*columns, strict=True)]
 
 
-def combined(operation: Callable[[float, float], float]) -> Callable[[Number, Number], Number]:
+def combined(operation: Callable[[float, float], float]) -> Callable[[Interval, Interval], Interval]:
     """Return an operation on numbers with intervals: its ends are among those of its arguments' ends."""
 
     def of(one: float, other: float) -> float:
@@ -61,31 +46,29 @@ def combined(operation: Callable[[float, float], float]) -> Callable[[Number, Nu
         except ZeroDivisionError:
             return math.copysign(math.inf, one) if one else math.nan
 
-    def combine(one: Number, other: Number) -> Number:
+    def combine(one: Interval, other: Interval) -> Interval:
         ends = [of(first, second) for first in one[1:3] for second in other[1:3]]
-        name = one.name or other.name
-        if any(map(math.isnan, ends)):
-            return Number(of(one.value, other.value), math.nan, math.nan, name)
-        return Number(of(one.value, other.value), min(ends), max(ends), name)
+        known = (min(ends), max(ends)) if not any(map(math.isnan, ends)) else (math.nan, math.nan)
+        return Interval(of(one.value, other.value), *known, name=one.name or other.name)
 
     return combine
 
 
-def _of_known(compare: Callable[[Number, Number], Truth]) -> Callable[[Number, Number], Truth]:
+def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Interval, Interval], Truth]:
     """Make a comparison that is missing where one of its numbers is."""
 
-    def found(one: Number, other: Number) -> Truth:
-        if not (isinstance(one, Number) and isinstance(other, Number)):
+    def found(one: Interval, other: Interval) -> Truth:
+        if not (isinstance(one, Interval) and isinstance(other, Interval)):
             raise BadInput("a comparison is of numbers; join comparisons by and, or")
         return compare(one, other) if one.is_known and other.is_known else "missing"
 
     return found
 
 
-def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Number, Number], Truth]:
+def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Interval], Truth]:
     """Make the test whether a number is on one side of another, with all of both intervals."""
 
-    def compare(one: Number, other: Number) -> Truth:
+    def compare(one: Interval, other: Interval) -> Truth:
         if one.low == one.high and other.low == other.high:
             return holds(one.value, other.value)
         rising = holds(0.0, 1.0)
@@ -98,14 +81,14 @@ def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Number, Number]
     return _of_known(compare)
 
 
-def _within(one: Number, other: Number) -> Truth:
+def _within(one: Interval, other: Interval) -> Truth:
     """Tell whether a number, with all of its interval, lies within another's interval."""
     if other.low <= one.low and one.high <= other.high:
         return True
     return False if one.high < other.low or one.low > other.high else None
 
 
-def _equal(one: Number, other: Number) -> Truth:
+def _equal(one: Interval, other: Interval) -> Truth:
     if one.low == one.high and other.low == other.high:
         return one.value == other.value
     return False if one.high < other.low or one.low > other.high else None
@@ -137,15 +120,16 @@ def flat(values: Sequence[Any]) -> list[Any]:
     return [one for each in values for one in (flat(each) if isinstance(each, list) else [each])]
 
 
-def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Number]:
+def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Interval]:
     """Make a function of numbers or lists of them, such as the least one, end by end."""
 
-    def found(*arguments: Value) -> Number:
+    def found(*arguments: Value) -> Interval:
         numbers = flat(arguments)
         if not numbers or not all(each.is_known for each in numbers):
             return exactly(None)
         value, low, high = (function([each[place] for each in numbers]) for place in range(3))
-        return Number(value, low, high, next((each.name for each in numbers if each.value == value), ""))
+        name = next((each.name for each in numbers if each.value == value), "")
+        return Interval(value, low, high, name=name)
 
     return found
 
@@ -159,20 +143,18 @@ def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
         except (ValueError, OverflowError):
             return math.nan
 
-    return lambda values: by_entry(
-        lambda each: Number(of(each.value), of(each.low), of(each.high), each.name), values
-    )
+    return lambda values: by_entry(lambda each: each.rising(of), values)
 
 
-def negative(number: Number) -> Number:
+def negative(number: Interval) -> Interval:
     """Return the number with its sign changed."""
-    return Number(-number.value, -number.high, -number.low, number.name)
+    return Interval(-number.value, -number.high, -number.low, name=number.name)
 
 
-def _absolute(number: Number) -> Number:
+def _absolute(number: Interval) -> Interval:
     ends = abs(number.low), abs(number.high)
     least = 0.0 if number.low <= 0.0 <= number.high else min(ends)
-    return Number(abs(number.value), least, max(ends), number.name)
+    return Interval(abs(number.value), least, max(ends), name=number.name)
 
 
 def _mean(numbers: Sequence[float]) -> float:
@@ -191,31 +173,32 @@ def _deviation(numbers: Sequence[float]) -> float:
     return math.sqrt(squares / (len(numbers) - 1)) if len(numbers) > 1 else math.nan
 
 
-def _plus_minus(number: Number, spread: Number) -> Number:
+def _plus_minus(number: Interval, spread: Interval) -> Interval:
     """Return a number that is no surer than a spread."""
-    return Number(number.value, number.value - spread.value, number.value + spread.value, number.name)
+    low, high = number.value - spread.value, number.value + spread.value
+    return Interval(number.value, low, high, name=number.name)
 
 
-def _chi_square(share: Number, size: Number) -> Number:
+def _chi_square(share: Interval, size: Interval) -> Interval:
     """Find below what a share of chi-square numbers of so many degrees lies; NaN without any degree."""
     from fuselog.replay.engine import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
 
 
-def _count(values: list[Any]) -> Number:
+def _count(values: list[Any]) -> Interval:
     """Count the comparisons that are true; with one missing, how many are is not known."""
     known = flat(values)
     count = float(sum(each is True for each in known))
-    return Number(count, math.nan, math.nan) if "missing" in known else exactly(count)
+    return Interval(count) if "missing" in known else exactly(count)
 
 
-def _falls(values: list[Number]) -> Truth:
+def _falls(values: list[Interval]) -> Truth:
     """Tell whether each entry is below the one before it."""
     return all_hold([COMPARISONS[ast.Lt](later, one) for one, later in pairwise(values)])
 
 
-def _consistent(size: Number, count: Number) -> Number:
+def _consistent(size: Interval, count: Interval) -> Interval:
     """Return the interval of a mean NEES of so many components, over independent estimates.
 
     NaN where one of these is missing.
@@ -225,7 +208,7 @@ def _consistent(size: Number, count: Number) -> Number:
     if not (size.is_known and count.is_known):
         return exactly(None)
     low, high = chi_square_interval(int(size.value), int(count.value))
-    return Number(size.value, float(low), float(high))
+    return Interval(size.value, float(low), float(high))
 
 
 OPERATIONS: dict[type[ast.operator], Callable[[float, float], float]] = {
@@ -235,7 +218,7 @@ OPERATIONS: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Div: operator.truediv,
     ast.Pow: operator.pow,
 }
-COMPARISONS: dict[type[ast.cmpop], Callable[[Number, Number], Truth]] = {
+COMPARISONS: dict[type[ast.cmpop], Callable[[Interval, Interval], Truth]] = {
     ast.Lt: _ordered(operator.lt),
     ast.LtE: _ordered(operator.le),
     ast.Gt: _ordered(operator.gt),

@@ -15,7 +15,8 @@ from fuselog.pipeline.output.expressions import (
     parse,
     value_of,
 )
-from fuselog.pipeline.output.numbers import COMPARISONS, Number, Truth, by_entry, exactly, flat
+from fuselog.pipeline.output.numbers import COMPARISONS, Truth, by_entry, exactly, flat
+from fuselog.replay.judging.intervals import Interval
 
 MOST_ENTRIES = 4  # that a sentence names
 _WORDS: dict[type[ast.cmpop], str] = {
@@ -38,8 +39,8 @@ _MIRRORED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 class _Entry(NamedTuple):
     """Holds one comparison of two numbers, and whether it is true."""
 
-    number: Number
-    limit: Number
+    number: Interval
+    limit: Interval
     truth: Truth
 
 
@@ -89,7 +90,7 @@ class _Reader(NamedTuple):
                 return [_Comparison(ast.Lt, wanted, self._name(of), "the one before", entries)]
             case ast.Subscript(value=of, slice=index):
                 place = value_of(index, self.values)
-                assert isinstance(place, Number)
+                assert isinstance(place, Interval)
                 found = self.read(of, wanted=wanted)
                 return [each._replace(entries=[each.entries[int(place.value)]]) for each in found]
             case ast.BoolOp(values=parts):
@@ -137,7 +138,7 @@ class _Reader(NamedTuple):
         return re.sub(r"\bvalue\b(?!\()", lambda _: self._name(ast.Name("value")), text)
 
 
-def _compared(op: type[ast.cmpop], number: Number, limit: Number) -> _Entry:
+def _compared(op: type[ast.cmpop], number: Interval, limit: Interval) -> _Entry:
     return _Entry(number, limit, COMPARISONS[op](number, limit))
 
 
@@ -195,6 +196,6 @@ def _written(entry: _Entry, op: type[ast.cmpop]) -> tuple[str, str]:
     return own, " to ".join(texts)
 
 
-def _digits(number: Number, digits: int) -> int:
+def _digits(number: Interval, digits: int) -> int:
     """Return a number of digits that writes no power of ten for what is large."""
     return max(digits, len(f"{max(map(abs, number[:3])):.0f}"))

@@ -25,6 +25,7 @@ from fuselog.recorders.atomic import whole_file, whole_folder
 from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval, mean_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,9 +79,9 @@ class Outcome:
     timings: dict[str, dict[str, float]] = field(default_factory=dict)
     kind: Kind = "run"
 
-    def measure(self, key: str, value: float, low: float, high: float) -> None:
-        """Keep the metric `key`: its `value`, and its 95 % interval from `low` to `high`."""
-        self.metrics[key], self.intervals[key] = float(value), (float(low), float(high))
+    def measure(self, key: str, number: Interval) -> None:
+        """Keep a number as the metric `key`, with its 95 % interval."""
+        self.metrics[key], self.intervals[key] = float(number.value), (number.low, number.high)
 
 
 class Result(Parameters):
@@ -215,19 +216,14 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
     Fewer than `FEWEST_RUNS` have none. A study may have a table of runs without NEES.
     """
-    from fuselog.replay.judging.errors.differences import FEWEST_RUNS, mean_interval
-
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}
     intervals = {}
     for (estimator, case), rows in runs.groupby(["estimator", "case"]):
         nees = rows["nees"].dropna()
         if len(nees) >= FEWEST_RUNS:
-            low, high = mean_interval(nees.to_numpy())
             components = rows.filter(regex="^rmse_").notna().any().sum()
-            intervals[str(estimator), str(case)] = (
-                f"{nees.mean():.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
-            )
+            intervals[str(estimator), str(case)] = f"{mean_interval(nees)}, aim {components}"
     return intervals
 
 

@@ -32,6 +32,7 @@ from fuselog.pipeline.output.results import (
 )
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import printable
+from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -224,11 +225,13 @@ def print_metrics(
     """Print metrics as tables: one per case, a row per quantity, a column per estimator.
 
     A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
-    of runs there is also the mean NEES over them, see `metric_tables`. Of many cases there is one table
-    of their medians; `details` says where each of them is.
+    of runs there is also the mean NEES over them, see `metric_tables`, or why there is none. Of many
+    cases there is one table of their medians; `details` says where each of them is.
     """
     for title, columns, rows in tables_of(metrics, bounds, runs):
         print_table(columns, rows, title)
+    if runs is not None and {"run", "nees"} <= {*runs} and 1 < runs["run"].nunique() < FEWEST_RUNS:
+        say(f"nees: no interval of its mean over the runs: {too_few(runs['run'].nunique())}")
     if has_many_cases(metrics):
         say(f"each of the {_number_of_cases(metrics)} cases by itself: {details}")
 

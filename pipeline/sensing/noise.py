@@ -17,12 +17,13 @@ from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.sensing import preparing
 from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom, interval, multiples_of
 from fuselog.pipeline.sensing.fitting import choose, profile_interval, walk_below
-from fuselog.pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
+from fuselog.pipeline.sensing.outcome import MISFIT, ColumnNoise, SensorNoise
 from fuselog.pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
 from fuselog.recorders import units
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Stream
 from fuselog.recorders.units import unit_of
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 _DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times
@@ -185,15 +186,15 @@ def _analysed(
         )
     fitted = choose(samples)
     numbers = {
-        each: Number(getattr(fitted.terms, each), *profile_interval(samples, fitted, each))
+        each: Interval(getattr(fitted.terms, each), *profile_interval(samples, fitted, each))
         for each in fitted.free
     }
     if not {"walk", "markov"} & set(fitted.free):
-        numbers["walk"] = Number(0.0, 0.0, walk_below(samples, fitted))
+        numbers["walk"] = Interval(0.0, 0.0, walk_below(samples, fitted))
         notes.append(f"no walk found; K < {numbers['walk'].high:.2g} {unit}/sqrt(s)")
     if drift is not None and not drift.offset:
         reach = 1.96 * drift.rate_sigma
-        numbers["ramp"] = Number(drift.rate, drift.rate - reach, drift.rate + reach)
+        numbers["ramp"] = Interval(drift.rate, drift.rate - reach, drift.rate + reach)
     multiples = multiples_of(len(values))
     measured = allan_deviation(values, step_s, multiples)
     degrees = np.array(
@@ -268,11 +269,11 @@ def _least(found: ColumnNoise, unit: str) -> str:
     )
 
 
-def _against(stated: tuple[str, str, float], numbers: Mapping[str, Number], unit: str) -> str:
+def _against(stated: tuple[str, str, float], numbers: Mapping[str, Interval], unit: str) -> str:
     text, term, value = stated
     if term not in numbers:
         return f"the sheet states {text}; no {term} was found to compare"
-    yours = Number(*(each / value for each in numbers[term]))
+    yours = numbers[term].rising(lambda each: each / value)
     ends = f"{yours.low:.3g} to {yours.high:.3g}"
     kind = "sqrt(Hz)" if term == "white" else "sqrt(s)"
     return f"stated {text} ({value:.4g} {unit}/{kind}), yours {yours.value:.3g} ({ends}) times that"

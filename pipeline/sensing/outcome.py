@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,6 +17,7 @@ from fuselog.pipeline.sensing.allan import Curve, interval
 from fuselog.pipeline.sensing.exports import FILES, Densities, Density
 from fuselog.pipeline.sensing.fitting import Fit
 from fuselog.recorders.units import unit_of
+from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 MISFIT = "misfit: "  # what a sentence has that whoever uses the numbers reads first
@@ -31,14 +31,6 @@ _TERMS = {  # what a table says of each number: the name of its field, and its u
 }
 
 
-class Number(NamedTuple):
-    """Holds a number of a noise model and its 95 % interval; 0 for a walk that was not found."""
-
-    value: float
-    low: float
-    high: float
-
-
 @dataclass(frozen=True, eq=False)
 class ColumnNoise:
     """Holds the noise of one column.
@@ -47,7 +39,7 @@ class ColumnNoise:
         topic, field, component: where it stands; no component of a scalar.
         step_s: the mean time between samples.
         block: over how many samples it was averaged before the likelihood.
-        numbers: by the names of `Terms`, and `ramp`.
+        numbers: by the names of `Terms`, and `ramp`; 0 for a walk that was not found.
         fitted: the model that was chosen.
         curve: the Allan deviation that was measured.
         degrees: (n,) its degrees of freedom.
@@ -59,7 +51,7 @@ class ColumnNoise:
     component: str
     step_s: float
     block: int
-    numbers: Mapping[str, Number]
+    numbers: Mapping[str, Interval]
     fitted: Fit
     curve: Curve
     degrees: Floats
@@ -95,7 +87,7 @@ class SensorNoise:
     def table(self) -> pd.DataFrame:
         """Return a row per number: column, term with its unit, value, 95 % interval."""
         rows = [
-            (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number)
+            (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number[:3])
             for column in self.columns
             for name, number in column.numbers.items()
         ]
@@ -206,7 +198,7 @@ class SensorNoise:
         outcome.figures["allan"] = self.chart
         for column in self.columns:
             for name, number in column.numbers.items():
-                outcome.measure(f"noise.{name}.{column.name.replace('.', '_')}", *number)
+                outcome.measure(f"noise.{name}.{column.name.replace('.', '_')}", number)
         settings = {"title": f"Noise of {self.name}", "logs": [self.name], "notes": self.notes}
         with result_folder(place) as part:
             self.draw(part / "timeline.rrd")

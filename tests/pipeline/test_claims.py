@@ -16,11 +16,12 @@ from fuselog.pipeline.output.claims import (
     require_recordings,
 )
 from fuselog.pipeline.output.expressions import Values, evaluate, formatted, truth
-from fuselog.pipeline.output.numbers import Number, exactly
+from fuselog.pipeline.output.numbers import exactly
 from fuselog.pipeline.runs.experiment import Experiment, Stated, load_experiment
 from fuselog.pipeline.runs.inputs import Recording, holding, shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import build
+from fuselog.replay.judging.intervals import Interval
 from tests.goldens.recipes import DATA, importer_of, unpack
 
 METRICS = {
@@ -29,10 +30,15 @@ METRICS = {
     "smoother:ekf.nees.robot1": 2.5,
     "ekf.rmse_m": 0.5,
     "ekf.gain.ukf": 0.3,
+    "ekf.gain.few": 0.3,  # of fewer runs than an interval takes
     "ekf.by_noise.1": [1.0, 2.0, 4.0],
     "lost.rmse_m": None,
 }
-INTERVALS = {"ekf.gain.ukf": (0.1, 0.5), "ekf.nees.robot1": (1.5, 2.5)}
+INTERVALS: dict[str, tuple[float | None, float | None]] = {
+    "ekf.gain.ukf": (0.1, 0.5),
+    "ekf.gain.few": (None, None),
+    "ekf.nees.robot1": (1.5, 2.5),
+}
 VALUES = Values(METRICS, INTERVALS, {"runs": exactly(100)})
 
 
@@ -66,7 +72,7 @@ VALUES = Values(METRICS, INTERVALS, {"runs": exactly(100)})
 )
 def test_expressions_carry_intervals(expression: str, value: tuple[float, ...]) -> None:
     found = evaluate(expression, VALUES)
-    assert isinstance(found, Number)
+    assert isinstance(found, Interval)
     assert found[:3] == pytest.approx(value)
 
 
@@ -115,6 +121,7 @@ def claim(**values: object) -> StatedClaim:
         ("gain[ekf, ukf]", "confirmed"),
         ("gain[ekf, ukf] - 0.3", "not shown"),
         ("gain[ekf, ukf] - 1", "refuted"),
+        ("gain[ekf, few]", "not shown"),
         ("rmse_m[lost]", "not reproducible"),
         ("rmse_m[ekf | nobody][0]", "not reproducible"),
         ("rmse_m[nobody]", "not reproducible"),
@@ -123,6 +130,7 @@ def claim(**values: object) -> StatedClaim:
 def test_what_chance_may_have_made_is_not_shown(value: str, verdict: str) -> None:
     [found] = decide([claim(value=value, holds="value > 0")], METRICS, INTERVALS, {})
     assert found.verdict == verdict
+    assert ("which takes 5" in found.why) == ("few" in value)
     left = decide([claim(value=value, holds="value > 0", optional=True)], METRICS, INTERVALS, {})
     assert len(left) == ("nobody" not in value)
 

@@ -21,7 +21,6 @@ from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.studies.navigation import imu_grades
 from fuselog.pipeline.studies.toolkit.repetitions import (
     by_repetition,
-    mean_interval,
     rms_length,
     rmse_of_runs,
     root_mean_square,
@@ -29,6 +28,7 @@ from fuselog.pipeline.studies.toolkit.repetitions import (
 )
 from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.intervals import mean_interval, rms_interval
 from tests.goldens import keeping
 
 # Two runs of two steps, one of which failed; errors of 5, 13 and 17 m.
@@ -52,10 +52,14 @@ def test_growth_is_the_slope_of_the_greater_half() -> None:
 
 
 def test_means_and_their_intervals() -> None:
-    found = mean_interval([1.0, 2.0, 3.0, 6.0])
+    few = [1.0, 2.0, 3.0, 6.0]
     half = t.ppf(0.975, 3) * np.sqrt(14.0 / 3.0) / 2.0
-    assert found == pytest.approx((3.0, 3.0 - half, 3.0 + half))
-    assert str(mean_interval([2.0])) == "+2.00, 95 % +nan to +nan"
+    assert mean_interval(few, fewest=4)[:3] == pytest.approx((3.0, 3.0 - half, 3.0 + half))
+    assert str(mean_interval(few)) == str(rms_interval([3.0] * 4)) == "3"
+    assert not mean_interval(few).is_known
+    found = mean_interval([*few, 3.0])
+    assert found.is_bounded
+    assert str(found._replace(unit="m")) == f"3 m (95 % {found.low:.3g} to {found.high:.3g})"
     assert root_mean_square(np.array([[3.0, np.nan], [4.0, 5.0]]), 0) == pytest.approx([12.5**0.5, 5.0])
 
 

@@ -23,6 +23,7 @@ from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
 from fuselog.pipeline.comparing.renamed import Renamed
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.replay.judging.errors.differences import Difference
+from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.timeline.side_by_side import _alone
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -260,7 +261,7 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
 
 def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() -> None:
     """Each number of a pair in its column; of the candidates the one counts that is moved more."""
-    found = Difference(1.0, 3.0, 2.0, 1.5, 2.75, 0.02, "worse", 0.99, 8)
+    found = Difference(1.0, 3.0, Interval(2.0, 1.5, 2.75), 0.02, "worse", 0.99, 8)
     pair = Paired("ekf", "ukf", "position_rmse_m", "robot1", "low", found, (4.0, 6.0))
     both = [pair, pair._replace(case=ALL, target=3.0, where=None)]
     moved = {"position_rmse_m": 2.5, "position_rmse_m.robot1": 1.0}
@@ -294,10 +295,8 @@ def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() ->
     }
     assert table[["aim", "verdict"]].iloc[1].tolist() == ["3", "withheld"]
     assert table[["most_from_s", "most_to_s"]].iloc[1].isna().all()
-    said = (
-        "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2, 95 % from 1.5 to "
-    )
-    assert stressed[0].sentence == f"{said}2.75 (8 runs, margin 0.02); most from 4.0 to 6.0 s"
+    said = "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2 (95 % 1.5 to "
+    assert stressed[0].sentence == f"{said}2.75), 8 runs, margin 0.02; most from 4.0 to 6.0 s"
 
 
 def test_estimates_under_another_label_are_the_same_but_for_their_names() -> None:

@@ -515,12 +515,17 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
         assert expected in printed
     fuselog("report", out, "-o", tmp_path / "five.html")
     of_page = alike([mean, low, high], Scale())
-    expected = f"NEES {of_page[0]}, 95 % {of_page[1]} to {of_page[2]}; 3 is right"
+    expected = f"NEES {of_page[0]} (95 % {of_page[1]} to {of_page[2]}); 3 is right"
     assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
     assert printed.splitlines()[-2] == f"{out}: figures, tables, timeline.rrd, {TIMINGS}, result.json"
     names = {"figures", "tables", "timeline.rrd", TIMINGS, "result.json"}
     assert {path.name for path in out.iterdir()} == names
-    assert "nees_mean_over_runs" not in fuselog(*run, "--runs", "4").out
+    four = fuselog(*run, "--runs", "4").out
+    assert "nees_mean_over_runs" not in four
+    assert "nees: no interval of its mean over the runs: an interval takes 5 runs or more" in four
+    fuselog("report", out, "-o", tmp_path / "four.html")
+    page = (tmp_path / "four.html").read_text(encoding="utf-8")
+    assert "No 95 % intervals: an interval takes 5 runs or more, and this is of 4 runs." in page
 
 
 def test_a_parameter_goes_to_all_estimators_that_have_it() -> None:

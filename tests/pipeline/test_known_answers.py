@@ -327,9 +327,9 @@ def test_a_comparison_is_of_the_second_less_the_first_whichever_comes_first(plac
         sentence = next(line for line in said.out.splitlines() if line.startswith("position_rmse_m"))
         assert sentence.startswith(
             f"position_rmse_m of car: {second} is {verdict} than {first}: "
-            f"{means[1]:.4g} against {means[0]:.4g}; difference {difference:.3g}, 95 % from "
+            f"{means[1]:.4g} against {means[0]:.4g}; difference {difference:.3g} (95 % "
         )
-        assert f"margin {0.02 * means[0]:.3g})" in sentence
+        assert f"margin {0.02 * means[0]:.3g}" in sentence
         page = page_of(place, f"{first}-{second}")
         [percent] = [
             panel for panel in _panels(page) if panel["x"]["label"] == f"{second} less {first} (%)"

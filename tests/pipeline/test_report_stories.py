@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps
-from fuselog.pipeline.output.report.evidence import Consistency, Spread, findings
+from fuselog.pipeline.output.report.evidence import Consistency, findings
 from fuselog.pipeline.output.report.kinds import how_many_differ, opening
 from fuselog.pipeline.output.report.naming import title_of
 from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
@@ -22,6 +22,7 @@ from fuselog.pipeline.output.report.story import Story, gauge, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
 from fuselog.replay.judging.errors.differences import dominating
+from fuselog.replay.judging.intervals import Interval
 
 
 def _told(
@@ -621,13 +622,13 @@ def test_a_gauge_goes_by_the_logarithm_and_a_state_by_chance(
     value: float, place: float, state: str, factor: float
 ) -> None:
     """The scale goes from a third of what is right to ten times it; the grey box holds 10 % at least."""
-    by = Consistency("NEES", Spread(value, 0.9 * value, 1.1 * value), 2.0, (1.9, 2.4))
+    by = Consistency("NEES", Interval(value, 0.9 * value, 1.1 * value), 2.0, (1.9, 2.4))
     drawn = gauge(by)
     assert (drawn.aim, drawn.value) == pytest.approx((32.3, place), abs=0.01)
     assert drawn.honest == pytest.approx((29.2, 37.66), abs=0.01)
     if value == 6.0:
         assert drawn.spread == pytest.approx((61.5, 67.4), abs=0.01)
-        assert drawn.words.startswith("NEES 6.00, 95 % 5.40 to 6.60; 2 is right")
+        assert drawn.words.startswith("NEES 6.00 (95 % 5.40 to 6.60); 2 is right")
     assert drawn.is_beyond == (value == 0.2)
     assert by.state == state
     assert by.factor == pytest.approx(factor)

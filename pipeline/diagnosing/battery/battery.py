@@ -204,7 +204,7 @@ def named_by(cause: Cause) -> Iterator[Right]:
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for estimate in each.numbers:
             value = np.log(estimate.value) if kind.endswith(" noise") else estimate.value
-            yield Right(kind, topic, estimate.part, value)
+            yield Right(kind, topic, estimate.name, value)
 
 
 def results(

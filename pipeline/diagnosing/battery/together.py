@@ -13,13 +13,14 @@ from pydantic import Field
 
 from fuselog.pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
 from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
-from fuselog.pipeline.diagnosing.causes import Cause, Estimated, seek
+from fuselog.pipeline.diagnosing.causes import Cause, seek
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import NOISES
 from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.parameters import Parameters
+from fuselog.replay.judging.intervals import Interval
 
 PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"
@@ -106,14 +107,14 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
     }
 
 
-def _estimate(causes: Sequence[Cause], right: Right) -> Estimated | None:
+def _estimate(causes: Sequence[Cause], right: Right) -> Interval | None:
     """Return the number of a planted fault, by any name that causes have for it; of noise logarithms."""
     for cause in causes:
         for each in (cause, *cause.others):
             for number in each.numbers:
-                if (each.hypothesis.kind, each.hypothesis.topic, number.part) == right[:3]:
+                if (each.hypothesis.kind, each.hypothesis.topic, number.name) == right[:3]:
                     is_noise = each.hypothesis.kind in NOISES
-                    return Estimated(number.part, *np.log(number[1:])) if is_noise else number
+                    return number.rising(np.log) if is_noise else number
     return None
 
 

@@ -17,15 +17,11 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import (
-    Interval,
-    errors_named,
-    mean_interval,
-    require_spread,
-)
+from fuselog.pipeline.studies.toolkit.repetitions import errors_named, require_spread
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
@@ -57,12 +53,12 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             f"{label}.median_error_m.{name}": _median(shots, name, label),
             f"{label}.located_share.{name}": float(rows["located"].mean()),
         }
-        nees = mean_interval(rows["nees"].dropna().tolist())
-        outcome.measure(f"{label}.nees_per_component.{name}", *nees)
+        nees = mean_interval(rows["nees"].dropna())
+        outcome.measure(f"{label}.nees_per_component.{name}", nees)
         for other in (SINGLE, PLAIN, ROBUST):
             if other != label and other in experiment.estimators:
-                ratio = np.exp(log_ratio(runs, str(name), str(label), other))
-                outcome.measure(f"{label}.position_ratio.{other}-{name}", *ratio)
+                ratio = log_ratio(runs, str(name), str(label), other).rising(np.exp)
+                outcome.measure(f"{label}.position_ratio.{other}-{name}", ratio)
     outcome.tables |= {"shots": shots, "runs": runs}
     outcome.figures["shots"] = _chart(shots)
     outcome.input_sha256 = hash_streams(sources)
@@ -127,7 +123,7 @@ def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
 def log_ratio(runs: pd.DataFrame, case: str, label: str, other: str) -> Interval:
     """Average the logarithm of the ratio of two estimators' RMSE, over runs that both located."""
     rmse: Any = runs[runs["case"] == case].pivot_table("rmse_m", "run", "estimator")
-    return mean_interval(np.log(rmse[label] / rmse[other]).dropna().tolist())
+    return mean_interval(np.log(rmse[label] / rmse[other]).dropna())
 
 
 def _median(shots: pd.DataFrame, case: Any, label: Any) -> float:

@@ -36,6 +36,7 @@ from fuselog.replay.families.biometrics.sequential import (
 )
 from fuselog.replay.families.biometrics.verification import Fused, fused_of
 from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.intervals import Interval
 
 Share = Annotated[float, Field(gt=0, lt=0.5)]
 RatioOf = Callable[[Integers], Floats]
@@ -343,7 +344,7 @@ def _tell_watches(table: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def _measure(row: Mapping[str, Any], key: str, scale: float, outcome: Outcome) -> None:
-    outcome.measure(key, *(scale * row[name] for name in ("value", "low", "high")))
+    outcome.measure(key, Interval(*(scale * row[name] for name in ("value", "low", "high"))))
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval, require_spread, rmse_of_runs
+from fuselog.pipeline.studies.toolkit.repetitions import require_spread, rmse_of_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.families.directional.orientation import AxisParameters
 from fuselog.recorders.models.orientation import axis_angle_between
@@ -32,6 +32,7 @@ from fuselog.replay.families.directional.bingham import BinghamNoise, make_steps
 from fuselog.replay.families.directional.distributions import bingham
 from fuselog.replay.families.directional.estimators import as_bingham, as_covariance
 from fuselog.replay.families.directional.grid import run_axis_grid_filter
+from fuselog.replay.judging.intervals import mean_interval
 
 Floats = NDArray[np.float64]
 
@@ -70,8 +71,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics[f"{name}.failed_runs.{case}"] = float(np.isnan(error).sum())
             more = error - found[options.estimator]
             if name != options.estimator:
-                excess = mean_interval(more[np.isfinite(more)].tolist())
-                outcome.measure(f"{name}.excess_deg.{case}", *excess)
+                excess = mean_interval(more[np.isfinite(more)])
+                outcome.measure(f"{name}.excess_deg.{case}", excess)
     outcome.tables["runs"] = pd.concat(
         [pd.DataFrame({"case": case, **found}) for case, found in errors_deg.items()]
     )

@@ -23,7 +23,6 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.models.orientation import compose, conjugate
@@ -32,10 +31,12 @@ from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.families.directional.disturbances import COMPONENTS, disturbances
+from fuselog.replay.judging.intervals import mean_interval
 
 KINDS = ("undisturbed", "disturbed", "slow", "fast", "rotation", "translation", "combined")
 PARTS = ("total", "heading", "inclination")
 AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
+FEWEST_TRIALS = 3  # whose mean has an interval: as many of BROAD as the experiment's recording has
 
 
 class OrientationOptions(Parameters):
@@ -237,9 +238,9 @@ def _compare(table: pd.DataFrame, own: str, outcome: Outcome) -> None:
     for case in (AS_RECORDED, WITH_MAGNET):
         for other in totals[case].columns.drop(own):
             more = totals[case, other] - totals[case, own]
-            outcome.measure(f"{other}.excess_deg.{case}", *mean_interval(more.tolist()))
+            outcome.measure(f"{other}.excess_deg.{case}", mean_interval(more, FEWEST_TRIALS))
     more = totals[WITH_MAGNET, own] - totals[AS_RECORDED, own]
-    outcome.measure(f"{own}.cost_deg.{WITH_MAGNET}", *mean_interval(more.tolist()))
+    outcome.measure(f"{own}.cost_deg.{WITH_MAGNET}", mean_interval(more, FEWEST_TRIALS))
 
 
 def _measure_disturbances(

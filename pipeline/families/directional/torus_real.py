@@ -21,7 +21,6 @@ from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.families.directional.headings import turn_on
 from fuselog.recorders.models.planar import wrap_angle
@@ -45,6 +44,7 @@ from fuselog.replay.families.directional.torus import (
     run_toroidal_filter,
     run_unscented_filter,
 )
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 Filter = Callable[..., tuple[WrappedNormal, WrappedNormal]]
 
@@ -163,7 +163,7 @@ def _judge_fits(table: pd.DataFrame, options: Options, outcome: Outcome) -> None
     outcome.tables["dihedrals"] = table.rename_axis("residue").reset_index()
     for name, simpler in SIMPLER.items():
         gain = interval(table[name] - table[simpler], options.block_residues)
-        outcome.measure(f"{name}.log_density_gain.{simpler}", *gain)
+        outcome.measure(f"{name}.log_density_gain.{simpler}", gain)
 
 
 def _judge_predictions(
@@ -194,9 +194,9 @@ def _judge_predictions(
     own = later["torus"]
     for name in ("persistence", "persistence-with-jumps", "ukf", "grid"):
         gain = interval(own.log_density - later[name].log_density, options.block_hours)
-        outcome.measure(f"torus.log_density_gain.{name}", *gain)
+        outcome.measure(f"torus.log_density_gain.{name}", gain)
     nearer = interval(later["persistence"].error_rad - own.error_rad, options.block_hours)
-    outcome.measure("torus.error_gain_rad.persistence", *nearer)
+    outcome.measure("torus.error_gain_rad.persistence", nearer)
 
 
 def interval(values: Floats | pd.Series, block: int) -> Interval:
@@ -207,7 +207,7 @@ def interval(values: Floats | pd.Series, block: int) -> Interval:
         block: how many make a block; a last one that is not whole is left out.
     """
     whole = np.asarray(values)[: len(values) // block * block]
-    return mean_interval(whole.reshape(-1, block).mean(axis=1).tolist())
+    return mean_interval(whole.reshape(-1, block).mean(axis=1))
 
 
 FILTERS: dict[str, Filter] = {

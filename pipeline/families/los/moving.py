@@ -18,7 +18,6 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.families.los.models import (
     TARGETS,
     bias_components,
@@ -31,6 +30,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.inference.observability import OBSERVABILITY
 from fuselog.replay.judging.errors.evaluation import Errors
+from fuselog.replay.judging.intervals import mean_interval
 
 MODEL = "moving-sights"
 ALIGNED_S, LAST_S = 10.0, 10.0
@@ -165,21 +165,21 @@ def _measure(
     found, labels = outcome.metrics, set(table["estimator"])
     logs = np.log10(weakest_of["least_eigenvalue"])
     found[f"observability.least_eigenvalue.{case}"] = float(10.0 ** logs.mean())
-    least = mean_interval(logs.tolist())
-    outcome.measure(f"observability.log10_least_eigenvalue.{case}", *least)
+    least = mean_interval(logs)
+    outcome.measure(f"observability.log10_least_eigenvalue.{case}", least)
     if "smoother" in labels:
         rolls = [sigma for name, sigma in sigmas.items() if name.endswith("roll_bias_rad")]
         prior = float(np.sum(np.square(rolls))) / len(rolls) ** 2
-        left = mean_interval((_last(table, "smoother", "common_roll_rad2") / prior).tolist())
-        outcome.measure(f"smoother.common_roll_left.{case}", *left)
+        left = mean_interval(_last(table, "smoother", "common_roll_rad2") / prior)
+        outcome.measure(f"smoother.common_roll_left.{case}", left)
     if {"ekf", "bound"} <= labels:
         bound = _last(table, "bound", "bias_rad2").mean()
-        ratio = mean_interval((_last(table, "ekf", "bias_rad2") / bound).tolist())
-        outcome.measure(f"ekf.bias_by_bound.{case}", *ratio)
+        ratio = mean_interval(_last(table, "ekf", "bias_rad2") / bound)
+        outcome.measure(f"ekf.bias_by_bound.{case}", ratio)
     if {"ekf", "unaware"} <= labels:
         squares = (_last(table, label, "target_m2") for label in ("unaware", "ekf"))
-        worse = mean_interval((0.5 * np.log(np.divide(*squares))).tolist())
-        outcome.measure(f"unaware.target_ratio_to_ekf.{case}", *np.exp(worse))
+        worse = mean_interval(0.5 * np.log(np.divide(*squares)))
+        outcome.measure(f"unaware.target_ratio_to_ekf.{case}", worse.rising(np.exp))
     units = {"target_m2": ("target_m", 1.0), "bias_rad2": ("bias_mrad", 1e3)}
     units |= {"clock_s2": ("clock_ms", 1e3), "common_roll_rad2": ("common_roll_mrad", 1e3)}
     for label in table["estimator"].unique():
@@ -193,7 +193,7 @@ def _measure(
                 found[f"{label}.{name.removesuffix('rad')}mrad.{case}"] = value
         nees = _aligned_nees(table, label)
         if np.isfinite(nees).all():
-            outcome.measure(f"{label}.nees_per_component.{case}", *mean_interval(nees.tolist()))
+            outcome.measure(f"{label}.nees_per_component.{case}", mean_interval(nees))
 
 
 def _aligned_nees(table: pd.DataFrame, label: str) -> Floats:

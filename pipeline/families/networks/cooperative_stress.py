@@ -21,16 +21,17 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.intervals import mean_interval
 
 Booleans = NDArray[np.bool_]
 
 MESSAGE_BYTES = 8 * (1 + 3 + 6)  # stamp, pose, triangle of its covariance
 SEED = 1
+FEWEST_ROBOTS = 4  # of which the mean NEES has an interval: a recording has no more that do not lie
 
 
 class CooperativeStressOptions(Parameters):
@@ -82,7 +83,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     others = table[(table["case"] != "lying") | (table["robot"] != f"robot{options.liar}")]
     for (label, stress), nees in others.groupby(["estimator", "case"], sort=False)["position_nees"]:
         key = f"{label}.mean_position_nees.{stress}".replace(" ", "-")
-        outcome.measure(key, *mean_interval(nees.to_list()))
+        outcome.measure(key, mean_interval(nees, FEWEST_ROBOTS))
     outcome.figures["bandwidth"] = _chart(table)
     outcome.input_sha256 = hash_streams(calm.sources)
     return outcome

@@ -19,11 +19,11 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.recorded import Replayed
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.families.networks.estimator import message_bytes
+from fuselog.replay.judging.intervals import mean_interval
 
 CALM, CI, NAIVE = "calm", "ci", "naive"
 INTERVAL, NEWS = "at most once in an interval", "when it has news"
@@ -92,7 +92,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         case = f"lie-{lie_m:g}m".replace(".", "_")
         _measure(rows, f"{estimator}.{{}}.{case}", outcome)
         for share in ("liar_refused", "honest_refused", "refused"):
-            outcome.measure(f"{estimator}.{share}.{case}", *mean_interval(rows[share].to_list()))
+            outcome.measure(f"{estimator}.{share}.{case}", mean_interval(rows[share]))
     outcome.figures |= {
         "bandwidth": _bandwidth_chart(outcome.tables["sending"]),
         "lies": _lie_chart(outcome.tables["lying"]),
@@ -103,7 +103,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 def _measure(rows: pd.DataFrame, key: str, outcome: Outcome) -> None:
     """Measure the mean NEES and the RMSE of rows by run; `key` has a place for the quantity."""
-    outcome.measure(key.format("nees"), *mean_interval(rows["nees"].to_list()))
+    outcome.measure(key.format("nees"), mean_interval(rows["nees"]))
     outcome.metrics[key.format("position_rmse_m")] = float(np.sqrt(rows["squared_m2"].mean()))
 
 
@@ -117,9 +117,9 @@ def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
             place = np.log(bytes_per_s)
             usual = [np.interp(place, np.log(grid.index), np.log(grid[run])) for run in own["run"]]
             difference = 0.5 * (np.log(own["squared_m2"].to_numpy()) - np.array(usual))
-            ratio = np.exp(mean_interval(difference.tolist()))
+            ratio = mean_interval(difference).rising(np.exp)
             case = f"news-{float(str(limit)):g}".replace(".", "_")
-            outcome.measure(f"{CI}.rmse_ratio_to_intervals.{case}", *ratio)
+            outcome.measure(f"{CI}.rmse_ratio_to_intervals.{case}", ratio)
 
 
 def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> pd.DataFrame:

@@ -22,13 +22,14 @@ from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.inputs import Record
 from fuselog.pipeline.runs.recorded import judge, replay_in_memory
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval, rmse_of_runs
+from fuselog.pipeline.studies.toolkit.repetitions import rmse_of_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.inference.sampling import Sampler, Samples, parse_sampling
+from fuselog.replay.judging.intervals import mean_interval
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
 RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others
@@ -204,11 +205,11 @@ def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
         for quantity in ("mean_error", "covariance_error", "cross_error"):
             wide: Any = rows.pivot_table(quantity, "function", "estimator", sort=False)
             for label in wide:
-                outcome.measure(f"{label}.{quantity}.{case}", *mean_interval(wide[label].tolist()))
+                outcome.measure(f"{label}.{quantity}.{case}", mean_interval(wide[label]))
             if quantity == "mean_error" and RATED in wide:
                 for label in wide.columns.drop(RATED):
-                    ratio = mean_interval(np.log(wide[RATED] / wide[label]).tolist())
-                    outcome.measure(f"{label}.log_ratio.{case}", *ratio)
+                    ratio = mean_interval(np.log(wide[RATED] / wide[label]))
+                    outcome.measure(f"{label}.log_ratio.{case}", ratio)
 
 
 def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
@@ -226,7 +227,7 @@ def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> No
             if {label, other} <= set(rmse_m):
                 change = 100.0 * (rmse_m[label] / rmse_m[other] - 1.0)
                 key = f"{label}.rmse_change_percent.{drive}-{other}"
-                outcome.measure(key, *mean_interval(change.tolist()))
+                outcome.measure(key, mean_interval(change))
 
 
 def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:

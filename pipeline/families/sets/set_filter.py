@@ -16,7 +16,6 @@ from fuselog.pipeline.output.results import MetricValue, Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.replay.engine import chi2
 from fuselog.replay.families.sets.judging.evaluation import JudgedSets, judge_sets
 from fuselog.replay.families.sets.judging.filter_evaluation import JudgedFilter, judge_filter
@@ -28,10 +27,12 @@ from fuselog.replay.families.sets.regions.frames import (
     UNDECIDED,
 )
 from fuselog.replay.judging.errors.evaluation import Errors
+from fuselog.replay.judging.intervals import mean_interval
 
 ELLIPSE = 0.99
 FRAMES, FILTER, L8, EKF, BEARINGS = "frames", "filter", "filter-l8", "ekf", "ekf-bearings"
 KEYS = ["case", "run", "time_ns"]
+FEWEST_ROBOTS = 3  # whose mean share has an interval: as many as `set-filter` has, over all of its runs
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -56,7 +57,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     of_filter = [each for each in filters if each.sets.estimator == FILTER]
     shares = [float(each.guaranteed[each.sets.known].mean()) for each in of_filter]
     if shares:
-        outcome.measure(f"{FILTER}.guaranteed_share", *mean_interval(shares))
+        outcome.measure(f"{FILTER}.guaranteed_share", mean_interval(shares, FEWEST_ROBOTS))
     outcome.metrics |= isolation_metrics(filters)
     outcome.figures["sets"] = _chart(summary)
     outcome.input_sha256 = hash_streams(sources)
@@ -145,10 +146,10 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
     area, inside = wide["area_m2"], wide["inside"]
     for other in (FRAMES, L8, EKF, BEARINGS):
         if {other, FILTER} <= set(area):
-            ratio = mean_interval(np.log(area[FILTER] / area[other]).to_list())
-            outcome.measure(f"{FILTER}.area_ratio.{other}", *np.exp(ratio))
-            more = mean_interval((inside[FILTER] - inside[other]).to_list())
-            outcome.measure(f"{FILTER}.containment_gain.{other}", *more)
+            ratio = mean_interval(np.log(area[FILTER] / area[other]))
+            outcome.measure(f"{FILTER}.area_ratio.{other}", ratio.rising(np.exp))
+            more = mean_interval(inside[FILTER] - inside[other])
+            outcome.measure(f"{FILTER}.containment_gain.{other}", more)
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:

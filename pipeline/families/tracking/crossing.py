@@ -15,9 +15,9 @@ from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.output.summary import summary_table
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.runner import Runner
-from fuselog.pipeline.studies.toolkit.repetitions import mean_interval
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.families.tracking.judging.errors import instants_of
+from fuselog.replay.judging.intervals import mean_interval
 
 
 class CrossingOptions(Parameters):
@@ -73,7 +73,7 @@ def _chart(every: pd.DataFrame) -> Chart:
         )
         for label, rows in of_panel.groupby("estimator", sort=False):
             means = rows.groupby("clutter_per_scan")["gospa_m"].apply(list).map(mean_interval)
-            mean, low, high = zip(*means, strict=True)
+            mean, low, high, *_ = zip(*means, strict=True)
             panel.series.append(curve(str(label), means.index, mean, "line+markers"))
             panel.bands.append(band(str(label), means.index, low, high))
         panels.append(panel)
@@ -88,9 +88,9 @@ def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: 
         for label, other in pairs:
             if {label, other} <= set(rows["estimator"]):
                 apart = by_run[label] - by_run[other]
-                growth = mean_interval((apart[max(apart)] - apart[min(apart)]).tolist())
+                growth = mean_interval(apart[max(apart)] - apart[min(apart)])
                 case = f"{other}-detection-{100 * float(str(probability)):g}"
-                outcome.measure(f"{label}.growth_of_change_m.{case}", *growth)
+                outcome.measure(f"{label}.growth_of_change_m.{case}", growth)
 
 
 CROSSING = Study("associations over clutter and probability of detection", study, CrossingOptions)

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from fuselog.pipeline.output.results import Outcome
-from fuselog.pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.arrays import Floats
@@ -30,6 +29,7 @@ from fuselog.replay.families.tracking.judging.errors import (
     tracks_at,
 )
 from fuselog.replay.judging.errors.evaluation import Innovations
+from fuselog.replay.judging.intervals import Interval, mean_interval
 
 # The figures whose differences are told.
 COMPARED = (
@@ -123,10 +123,10 @@ def measure_changes(
             for quantity in [name for name in COMPARED if name in table]:
                 change = difference(table, quantity, label, other)
                 of = "-".join(filter(None, (other, case)))
-                outcome.measure(f"{label}.change_in_{quantity}.{of}", *change)
+                outcome.measure(f"{label}.change_in_{quantity}.{of}", change)
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
     """Compute by how much a quantity of one estimator is above that of another, over the runs."""
     by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
-    return mean_interval((by_run[label] - by_run[other]).tolist())
+    return mean_interval(by_run[label] - by_run[other])

@@ -20,11 +20,16 @@ from fuselog.pipeline.output.words import is_error, quantity
 from fuselog.replay.judging.errors.differences import (
     Difference,
     Target,
-    mean_interval,
     paired_difference,
+    target_of,
+)
+from fuselog.replay.judging.intervals import (
+    FEWEST_RUNS,
+    Interval,
+    mean_interval,
     rms_interval,
     root_mean_square,
-    target_of,
+    too_few,
 )
 
 Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and the messages it was given
@@ -39,19 +44,6 @@ Relation = Literal["draw", "unclear", "withheld", "beyond chance", "untold"]
 State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
 
 
-class Spread(NamedTuple):
-    """Holds a value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
-
-    value: float
-    low: float = math.nan
-    high: float = math.nan
-
-    @property
-    def is_known(self) -> bool:
-        """Tell whether there is an interval."""
-        return math.isfinite(self.low) and math.isfinite(self.high)
-
-
 @dataclass(frozen=True)
 class Consistency:
     """Holds a mean of normalised squares, NEES or NIS.
@@ -64,7 +56,7 @@ class Consistency:
     """
 
     name: str
-    found: Spread
+    found: Interval
     aim: float
     honest: tuple[float, float]
 
@@ -87,7 +79,7 @@ class Consistency:
     def state(self) -> State:
         """Return what that says of the estimator: by chance over covariances, and over the runs."""
         low, high = self.honest
-        is_excluded = self.found.is_known and not self.found.low <= self.aim <= self.found.high
+        is_excluded = self.found.is_bounded and not self.found.low <= self.aim <= self.found.high
         is_usual = low <= self.found.value <= high and not is_excluded
         if is_usual or abs(self.found.value / self.aim - 1.0) <= MATERIAL:
             return "honest"
@@ -110,7 +102,7 @@ class Evidence:
     """
 
     estimator: str
-    error: Spread | None
+    error: Interval | None
     consistency: Consistency | None
     also: Consistency | None
     failed: int | None
@@ -146,7 +138,7 @@ class Pair(NamedTuple):
     second: str
     quantity: str
     case: str
-    more: Spread
+    more: Interval
 
 
 @dataclass(frozen=True)
@@ -181,6 +173,12 @@ class Findings:
     def error_name(self) -> str:
         """Return what sentences call that quantity, such as "position error"."""
         return quantity(self.main).name.removesuffix(", RMS")
+
+    @property
+    def about_intervals(self) -> str:
+        """Say what the table's intervals are, or why it has none."""
+        few = self.runs < FEWEST_RUNS
+        return f"No 95 % intervals: {too_few(self.runs)}." if few else "Small: 95 % over other runs."
 
     @cached_property
     def of(self) -> Mapping[str, Evidence]:
@@ -264,7 +262,7 @@ class Findings:
             (sum(place != "within" for place in judged), max(len(judged), 1)),
         )
 
-    def _error(self, label: str) -> Spread | None:
+    def _error(self, label: str) -> Interval | None:
         """Return the error over all cases; an estimator that lacks one of them is not compared."""
         values = self.values(label, self.main)
         if not values or len(values) < len(self.cases):
@@ -272,8 +270,7 @@ class Findings:
         squared = "rmse" in self.main
         value = root_mean_square(values) if squared else float(np.mean(values))
         each_run = self.by_run(label, self.main).to_numpy(dtype=float)
-        low, high = (rms_interval if squared else mean_interval)(each_run)
-        return Spread(value, low, high)
+        return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
     def _of_nees(self, label: str) -> Consistency | None:
         for key, name in (("nees", "NEES"), ("position_nees", "NEES of the position")):
@@ -300,7 +297,8 @@ class Findings:
         )
         aim = 1.0 if name == "NIS" else self._size(honest)
         each_run = self.by_run(label, key).to_numpy(dtype=float)
-        return Consistency(name, Spread(float(np.mean(values)), *mean_interval(each_run)), aim, honest)
+        over_cases = mean_interval(each_run)._replace(value=float(np.mean(values)))
+        return Consistency(name, over_cases, aim, honest)
 
     def _size(self, honest: tuple[float, float]) -> float:
         """Return of how many components NEES is: of as many as have this chi-square interval."""
@@ -314,13 +312,13 @@ class Findings:
 def relation(found: Findings, first: str, second: str) -> Relation:
     """Say whether two estimators' errors differ: by the runs, or, of few runs, by the margin."""
     difference = found.difference(first, second, found.main, "low")
-    if difference is not None and math.isfinite(difference.low):
-        if difference.verdict == "no difference":
-            return "draw"
+    if difference is not None and difference.verdict == "no difference":
+        return "draw"
+    if difference is not None and difference.more.is_bounded:
         if difference.verdict == "unclear":
             return "unclear"
         return (
-            "withheld" if is_withheld(found, first, second, difference.difference) else "beyond chance"
+            "withheld" if is_withheld(found, first, second, difference.more.value) else "beyond chance"
         )
     errors = [found.of[label].error for label in (first, second)]
     one, other = (each.value if each else math.nan for each in errors)
@@ -364,7 +362,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
             continue
         second = max(others, key=len)  # of labels that begin alike
         low, high = (math.nan if end is None else end for end in result.intervals.get(key, (None, None)))
-        more = Spread(float(value), low, high)
+        more = Interval(float(value), low, high)
         rest = case.removeprefix(second).removeprefix("-")
         found.setdefault(quantity, []).append(Pair(first, second, quantity, rest, more))
     return [each for of in found.values() if None not in of for each in of if each is not None]

@@ -25,7 +25,8 @@ from fuselog.pipeline.output.words import (
     quantity,
     scale,
 )
-from fuselog.replay.judging.errors.differences import mean_interval, rms_interval, target_of
+from fuselog.replay.judging.errors.differences import target_of
+from fuselog.replay.judging.intervals import mean_interval, rms_interval
 
 MOST_ROWS = 12
 GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
@@ -91,7 +92,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
         own = scale(words.unit, each.more.value)
-        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_known else ""
+        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_bounded else ""
         of = rows.setdefault((each.first, each.second, words.name), {})
         of[each.case or "all"] = f"{own.text(each.more.value)}{ends} {own.sign}".rstrip()
     about = ("estimator", "has more than", "of")
@@ -187,8 +188,8 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
     if quantity(key).group not in (ACCURACY, CONSISTENCY) or column not in found.rows:
         return ""
     values = found.by_run(label, column).to_numpy(dtype=float)
-    low, high = (rms_interval if "rmse" in column else mean_interval)(values)
-    return interval(low, high, own) if math.isfinite(low) else ""
+    found_in = (rms_interval if "rmse" in column else mean_interval)(values)
+    return interval(found_in.low, found_in.high, own) if found_in.is_bounded else ""
 
 
 def _aim(found: Findings, key: str) -> str:

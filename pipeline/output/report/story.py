@@ -16,7 +16,6 @@ from fuselog.pipeline.output.report.evidence import (
     Consistency,
     Evidence,
     Findings,
-    Spread,
     Timings,
     is_withheld,
     relation,
@@ -33,7 +32,7 @@ from fuselog.pipeline.output.words import (
     scale,
 )
 from fuselog.replay.judging.diagnostics import LEAST_SHARE
-from fuselog.replay.judging.errors.differences import FEWEST_RUNS
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
@@ -263,7 +262,7 @@ def _of_innovations(found: Findings) -> str:
     return f"{without}; by the innovations {listed(honest)} {is_are} honest."
 
 
-def _value(error: Spread | None, own: Scale) -> str:
+def _value(error: Interval | None, own: Scale) -> str:
     return own.with_unit(error.value) if error else MISSING
 
 
@@ -312,8 +311,8 @@ def _card(
     card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
         about, value = quantity(found.main).name, own.text(each.error.value)
-        if each.error.is_known:
-            value, low, high = alike(each.error, own)
+        if each.error.is_bounded:
+            value, low, high = alike(each.error[:3], own)
             about += f"; 95 % {low} to {high}"
         card = replace(card, value=value, unit=own.sign, about=about)
     if each.decisive is not None:
@@ -431,11 +430,14 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
     main = found.error_name
     for label in labels if take else ():
         difference = found.difference(take, label, found.main, "low") if label != take else None
-        if difference is None or not math.isfinite(difference.low):
+        if difference is None or not (
+            difference.more.is_bounded or difference.verdict == "no difference"
+        ):
             continue
-        size = abs(difference.difference)
+        more = difference.more
+        size = abs(more.value)
         near = scale(quantity(found.main).unit, size or own.factor)
-        ends = f"95 % {interval(difference.low, difference.high, near)} {near.sign}".rstrip()
+        ends = f"95 % {interval(more.low, more.high, near)} {near.sign}".rstrip()
         if difference.verdict == "no difference":
             exactly = "are equal" if not size else f"differ by {near.with_unit(size)} on average, {ends}"
             draws.append(f"In {main}, {take} and {label} cannot be told apart: they {exactly}.")
@@ -450,8 +452,7 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
                 f"{moved}."
             )
         else:
-            more = "more" if difference.difference > 0 else "less"
-            errs = f"{near.with_unit(size)} {more} than {take}"
+            errs = f"{near.with_unit(size)} {'more' if more.value > 0 else 'less'} than {take}"
             differences.append(f"{label} errs {errs} in the mean over runs ({ends}).")
     return draws, differences
 
@@ -632,10 +633,10 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
 def numbers_of(by: Consistency) -> str:
     """Return the mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
-    if not by.found.is_known:
+    if not by.found.is_bounded:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
-    found, low, high = alike(by.found, Scale())
-    return f"{name} {found}, 95 % {low} to {high}; {number(by.aim)} is right"
+    found, low, high = alike(by.found[:3], Scale())
+    return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is right"
 
 
 def gauge(by: Consistency) -> Gauge:
@@ -648,7 +649,7 @@ def gauge(by: Consistency) -> Gauge:
 
     low, high = by.honest
     found = by.found
-    spread = (found.low, found.high) if found.is_known else (found.value, found.value)
+    spread = (found.low, found.high) if found.is_bounded else (found.value, found.value)
     words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
     is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
     ends = (place(spread[0]), place(spread[1]))

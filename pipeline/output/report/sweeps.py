@@ -15,7 +15,6 @@ import pandas as pd
 from fuselog.pipeline.output.report.evidence import (
     Consistency,
     Findings,
-    Spread,
     findings,
     relation,
     runs_of,
@@ -24,6 +23,7 @@ from fuselog.pipeline.output.report.story import Card, Story, story
 from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.words import count, is_error, listed, quantity, scale, stated
 from fuselog.recorders.units import unit_of, written
+from fuselog.replay.judging.intervals import Interval
 
 MOST_POINTS = 4  # more are counted
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point
@@ -77,7 +77,7 @@ class Sweep:
             return None
         row = own.iloc[0]
         ends = float(row["bound_low"]), float(row["bound_high"])
-        return Consistency("NEES", Spread(float(row["value"])), float(row["aim"]), ends)
+        return Consistency("NEES", Interval(float(row["value"])), float(row["aim"]), ends)
 
     def is_too_sure(self, label: str, point: int) -> bool:
         """Tell whether an estimator is overconfident at a point."""

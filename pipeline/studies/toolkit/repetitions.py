@@ -6,12 +6,11 @@ for its 100 runs can be tried as often.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import ndtri
 
 from fuselog.pipeline.output.charts import Axis, Series, curve
 from fuselog.pipeline.runs.recorded import Replayed
@@ -51,27 +50,6 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
     repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
     repeated[errors.step, errors.run] = values
     return repeated
-
-
-class Interval(NamedTuple):
-    """Holds the mean of independent values, and where it lies with 95 %."""
-
-    mean: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.mean:+.2f}, 95 % {self.low:+.2f} to {self.high:+.2f}"
-
-
-def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
-    """Compute the mean of independent values, and Student's interval; NaN for what they do not tell."""
-    count = len(values)
-    mean = float(np.mean(values)) if count else np.nan
-    if count < 2:
-        return Interval(mean, np.nan, np.nan)
-    half = stdtrit(count - 1, 0.5 + probability / 2) * np.std(values, ddof=1) / np.sqrt(count)
-    return Interval(mean, mean - float(half), mean + float(half))
 
 
 def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:

@@ -1,33 +1,26 @@
 """Pairs differences of a metric: what one estimator gave of every run against another's.
 
-The run is the unit: errors within a run are correlated, runs are independent. Intervals are those of the
-percentile bootstrap over runs. BCa is no better here: paired differences of two alike are symmetric,
-however skewed the metric, and what BCa corrects is chance (over 50 runs it called 9 to 11 % of NEES
-different where nothing is). They are widened for few runs as Student's t is: Hesterberg, "What Teachers
-Should Know About the Bootstrap", The American Statistician 69 (2015). Every metric has an interval of
-95 % of its own: of many without a difference, about one in twenty is called different by chance.
+Intervals are those of the percentile bootstrap, see `fuselog.replay.judging.intervals`. BCa is no
+better here: paired differences of two alike are symmetric, however skewed the metric, and what BCa
+corrects is chance (over 50 runs it called 9 to 11 % of NEES different where nothing is). Every metric
+has an interval of 95 % of its own: of many without a difference, about one in twenty is called different
+by chance.
 """
 
 import math
 from collections.abc import Callable
 from fnmatch import fnmatch
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from fuselog.replay.judging.intervals import FEWEST_RUNS, RESAMPLES, Floats, Interval
+
 # What a metric should be: small, large, near a value; None where neither is better.
 Target = Literal["low", "high"] | float | None
 Verdict = Literal["better", "worse", "higher", "lower", "no difference", "unclear"]
-RESAMPLES = 2000
 # So many numbers of resamples are in memory at once.
 BATCH_NUMBERS = 1 << 22
-# Of more runs the mean square is normal: resamples would take much memory to say the same.
-MANY_RUNS = 500
-# Of fewer runs, resamples say nothing of what others would give.
-FEWEST_RUNS = 5
-LARGE = 1e100  # whose square may be infinite, in sums
 # The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
 NATS = 100.0
 TARGETS: dict[str, Target] = {
@@ -79,8 +72,7 @@ class Difference(NamedTuple):
 
     Attributes:
         first, second: the means over the runs.
-        difference: second - first.
-        low, high: where that lies with 95 %; NaN where there are too few runs to say.
+        more: second - first.
         margin: differences up to this do not matter.
         verdict: on the second: whether the interval lies beyond the margin, or within it.
         sure: the share of the resamples in which the difference has the sign that it has.
@@ -89,13 +81,18 @@ class Difference(NamedTuple):
 
     first: float
     second: float
-    difference: float
-    low: float
-    high: float
+    more: Interval
     margin: float
     verdict: Verdict
     sure: float
     runs: int
+
+    @property
+    def columns(self) -> dict[str, float | str]:
+        """Return its numbers by the names that they have in tables."""
+        about = {"margin": self.margin, "verdict": self.verdict, "sure": self.sure, "runs": self.runs}
+        ends = {"difference": self.more.value, "low": self.more.low, "high": self.more.high}
+        return {"first_mean": self.first, "second_mean": self.second, **ends, **about}
 
 
 def target_of(quantity: str) -> Target:
@@ -119,18 +116,20 @@ def paired_difference(
     if scale is None:
         scale = target if isinstance(target, float) else abs(means[0])
     difference, runs, allowed = means[1] - means[0], len(first), margin * scale
-    low, high, sure = math.nan, math.nan, math.nan
+    more, sure = Interval(difference), math.nan
     verdict: Verdict = "unclear"
     if np.array_equal(first, second):
-        low, high, sure, verdict = 0.0, 0.0, 1.0, "no difference"
+        more = Interval(0.0, 0.0, 0.0) if runs >= FEWEST_RUNS else Interval(0.0)
+        sure, verdict = 1.0, "no difference"
     elif runs >= FEWEST_RUNS:
         low, high, resamples = _interval(first, second, _difference)
+        more = Interval(difference, low, high)
         sure = float(np.mean(np.sign(resamples) == np.sign(difference)))
         if -allowed <= low and high <= allowed:
             verdict = "no difference"
         elif low > allowed or high < -allowed:
             verdict = _direction(first, second, target, difference)
-    return Difference(*means, difference, low, high, allowed, verdict, sure, runs)
+    return Difference(*means, more, allowed, verdict, sure, runs)
 
 
 def _difference(first: Floats, second: Floats, axis: int = -1) -> Floats:
@@ -174,46 +173,3 @@ def _direction(first: Floats, second: Floats, target: Target, difference: float)
         if low > 0 or high < 0:
             return "worse" if low > 0 else "better"
     return "higher" if difference > 0 else "lower"
-
-
-def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Return where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
-    from scipy.special import stdtrit
-
-    runs = len(values)
-    if runs < FEWEST_RUNS:
-        return math.nan, math.nan
-    values, scale = _with_finite_squares(values)
-    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
-    return scale * (float(values.mean()) - half), scale * (float(values.mean()) + half)
-
-
-def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Find where the root mean square of runs (n,) lies with 95 %, by bootstrap; NaN of few runs."""
-    from scipy.special import ndtr, stdtrit
-
-    runs = len(values)
-    if runs < FEWEST_RUNS:
-        return math.nan, math.nan
-    values, scale = _with_finite_squares(values)
-    squares = values**2
-    if runs > MANY_RUNS:
-        low, high = mean_interval(squares)
-        return scale * math.sqrt(max(low, 0.0)), scale * math.sqrt(high)
-    drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
-    tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
-    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
-    return scale * float(low), scale * float(high)
-
-
-def root_mean_square(values: ArrayLike) -> float:
-    """Compute the root mean square of numbers (n,), whose squares may be infinite."""
-    values, scale = _with_finite_squares(np.asarray(values, float))
-    return scale * math.sqrt(np.mean(np.square(values)))
-
-
-def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
-    """Return numbers (n,) as multiples of a number, which is one unless an estimator diverged."""
-    largest = float(np.max(np.abs(values), initial=0.0))
-    scale = largest if LARGE < largest < math.inf else 1.0
-    return values / scale, scale

@@ -40,12 +40,12 @@ def test_a_verdict_says_where_the_interval_lies() -> None:
     second = first + random.normal(1.0, 0.1, 40)
     found = paired_difference(first, second, "low", 0.02)
     assert found.verdict == "worse"
-    assert found.low < found.difference < found.high
-    assert found.difference == pytest.approx(1.0, abs=0.06)
+    assert found.more.low < found.more.value < found.more.high
+    assert found.more.value == pytest.approx(1.0, abs=0.06)
     # Student's interval of the same differences, which are normal
     apart = second - first
     half = 2.0227 * apart.std(ddof=1) / np.sqrt(40)
-    assert [found.low, found.high] == pytest.approx(
+    assert [found.more.low, found.more.high] == pytest.approx(
         [apart.mean() - half, apart.mean() + half], abs=0.006
     )
     assert paired_difference(first, second, "high", 0.02).verdict == "better"
@@ -53,7 +53,7 @@ def test_a_verdict_says_where_the_interval_lies() -> None:
     assert paired_difference(first, second, None, 0.02).verdict == "higher"
     assert paired_difference(first, second, "low", 0.2).verdict == "no difference"
     for one, other in ((first, second), (second, first)):  # about the margin, above and below
-        margin = found.difference / one.mean()
+        margin = found.more.value / one.mean()
         assert paired_difference(one, other, "low", margin).verdict == "unclear"
     assert paired_difference(first, first, "low", 0.0).verdict == "no difference"
 
@@ -71,4 +71,4 @@ def test_what_has_an_aim_is_judged_by_its_distance() -> None:
 def test_few_runs_have_no_interval() -> None:
     found = paired_difference(np.arange(4.0), np.arange(4.0) + 5.0, "low", 0.02)
     assert found.verdict == "unclear"
-    assert np.isnan([found.low, found.high, found.sure]).all()
+    assert np.isnan([found.more.low, found.more.high, found.sure]).all()

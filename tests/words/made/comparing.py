@@ -10,6 +10,7 @@ from fuselog.pipeline.checking.discrepancies import Discrepancy
 from fuselog.pipeline.comparing.comparing import Paired
 from fuselog.pipeline.comparing.groups import unlike_runs
 from fuselog.replay.judging.errors.differences import Difference, Target, paired_difference
+from fuselog.replay.judging.intervals import Interval
 
 EIGHT = np.array([1.0, 1.2, 0.9, 1.1, 1.05, 0.95, 1.15, 0.85])
 
@@ -30,7 +31,7 @@ def few_runs() -> Iterator[str]:
     for runs in (4, 5):
         found = paired_difference(EIGHT[:runs], 2.0 * EIGHT[:runs], "low", 0.02, scale=100.0)
         yield Paired("ekf", "ukf", "log_likelihood", "", "high", found).sentence
-    found = Difference(1.0, 2.0, 1.0, 0.9, 1.1, 0.02, "worse", 1.0, 7)
+    found = Difference(1.0, 2.0, Interval(1.0, 0.9, 1.1), 0.02, "worse", 1.0, 7)
     yield Paired("a", "b", "rmse_m", "x", "low", found, (1.25, 2.5)).sentence
 
 

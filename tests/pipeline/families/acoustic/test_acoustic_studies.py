@@ -80,9 +80,9 @@ def runs_of(**rmse_m: list[float]) -> pd.DataFrame:
 
 def test_a_run_that_is_lost_counts_as_one_run():
     """RMSE half as large in all runs, a thousandth in one: the mean of logarithms."""
-    runs = runs_of(student=[1.0, 2.0, 0.001], not_robust=[2.0, 4.0, 1.0])
-    mean, low, high = log_ratio(runs, "clean", "student", "not-robust")
-    assert mean == pytest.approx(np.log(0.5 * 0.5 * 0.001) / 3)
+    runs = runs_of(student=[1.0, 2.0, 0.5, 3.0, 0.001], not_robust=[2.0, 4.0, 1.0, 6.0, 1.0])
+    mean, low, high, *_ = log_ratio(runs, "clean", "student", "not-robust")
+    assert mean == pytest.approx(np.log(0.5**4 * 0.001) / 5)
     assert low < np.log(0.5) < high
 
 

@@ -23,7 +23,7 @@ def test_no_prediction_knows_what_comes():
 
 
 def test_interval_of_blocks():
-    """Four blocks of means 0, 1, 2, 3; what is left over does not count."""
-    mean, low, high = interval(np.repeat([0.0, 1.0, 2.0, 3.0, 99.0], [5, 5, 5, 5, 3]), 5)
-    half = 3.182446305284263 * np.std([0, 1, 2, 3], ddof=1) / 2
-    assert (mean, low, high) == pytest.approx((1.5, 1.5 - half, 1.5 + half))
+    """Five blocks of means 0, 1, 2, 3, 4; what is left over does not count."""
+    found = interval(np.repeat([0.0, 1.0, 2.0, 3.0, 4.0, 99.0], [5, 5, 5, 5, 5, 3]), 5)
+    half = 2.7764451051977934 * np.std([0, 1, 2, 3, 4], ddof=1) / np.sqrt(5)
+    assert found[:3] == pytest.approx((2.0, 2.0 - half, 2.0 + half))

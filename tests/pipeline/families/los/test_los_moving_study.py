@@ -69,12 +69,12 @@ def test_biases_of_all_sensors_are_unknown_and_every_clock_but_the_first():
 
 
 def verdicts(case: str, least: float, left: float) -> list[str]:
-    """The first two claims of 4 runs with such a least eigenvalue and share of the prior left."""
-    told = pd.DataFrame({"least_eigenvalue": [least * (1 + run / 9) for run in range(4)]})
+    """The first two claims of 5 runs with such a least eigenvalue and share of the prior left."""
+    told = pd.DataFrame({"least_eigenvalue": [least * (1 + run / 9) for run in range(5)]})
     sigma = {f"sensor_{number}_roll_bias_rad": 5e-3 for number in (1, 2, 3)}
     told = told.assign(**sigma)
     square = left * 25e-6 / 3
-    rows = [("smoother", run, 60, square * (1 + run / 9), 1.0) for run in range(4)]
+    rows = [("smoother", run, 60, square * (1 + run / 9), 1.0) for run in range(5)]
     columns = ["estimator", "run", "second", "common_roll_rad2", "nees_per_component"]
     table = pd.DataFrame(rows, columns=columns)
     unjudged = ("target_m2", "bias_rad2", "clock_s2")

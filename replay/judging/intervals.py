@@ -1,0 +1,115 @@
+"""Gives numbers 95 % intervals, by the one rule that docs/judge.md states.
+
+The run is the unit: errors within a run are correlated, runs are independent. The interval of a mean is
+Student's. That of a root mean square is by the percentile bootstrap over runs, widened for few runs as
+Student's t is: Hesterberg, "What Teachers Should Know About the Bootstrap", The American Statistician 69
+(2015).
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+# Fewer runs say nothing of what others would give.
+FEWEST_RUNS = 5
+RESAMPLES = 2000
+# Of more runs the mean square is normal: resamples would take much memory to say the same.
+MANY_RUNS = 500
+LARGE = 1e100  # whose square may be infinite, in sums
+
+
+class Interval(NamedTuple):
+    """Holds a number and where it lies with 95 %.
+
+    Attributes:
+        value: the number.
+        low, high: the ends; NaN where there is no interval, both the number itself where it is exact.
+        unit: of all three; may be empty.
+        name: what it is of, where that is not clear from its place.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    unit: str = ""
+    name: str = ""
+
+    def __str__(self) -> str:
+        with_unit = f"{self.value:.3g} {self.unit}".rstrip()
+        return f"{with_unit} (95 % {self.low:.3g} to {self.high:.3g})" if self.is_known else with_unit
+
+    @property
+    def is_known(self) -> bool:
+        """Tell whether neither it nor an end is NaN."""
+        return not any(map(math.isnan, self[:3]))
+
+    @property
+    def is_bounded(self) -> bool:
+        """Tell whether both ends are finite numbers."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+    def rising(self, function: Callable[[float], float]) -> "Interval":
+        """Return a function of it that rises."""
+        return self._replace(
+            value=function(self.value), low=function(self.low), high=function(self.high)
+        )
+
+
+def too_few(runs: int) -> str:
+    """Say why there is no interval over so few runs."""
+    return f"an interval takes {FEWEST_RUNS} runs or more, and this is of {runs} run{'s' * (runs != 1)}"
+
+
+def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
+    """Compute the mean of runs (n,), and where it lies by Student's distribution.
+
+    Args:
+        values: of the runs.
+        fewest: of fewer there is no interval. Only a study whose units nobody can multiply, such as the
+            robots of a recording, states another number than the rule's.
+    """
+    from scipy.special import stdtrit
+
+    values, scale = _with_finite_squares(np.asarray(values, float))
+    runs = len(values)
+    mean = scale * float(values.mean()) if runs else math.nan
+    if runs < fewest:
+        return Interval(mean)
+    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
+    return Interval(mean, scale * (float(values.mean()) - half), scale * (float(values.mean()) + half))
+
+
+def rms_interval(values: ArrayLike) -> Interval:
+    """Compute the root mean square of runs (n,), and where it lies by bootstrap."""
+    from scipy.special import ndtr, stdtrit
+
+    value = root_mean_square(values)
+    values, scale = _with_finite_squares(np.asarray(values, float))
+    runs = len(values)
+    if runs < FEWEST_RUNS:
+        return Interval(value)
+    squares = values**2
+    if runs > MANY_RUNS:
+        _, low, high, *_ = mean_interval(squares)
+        return Interval(value, scale * math.sqrt(max(low, 0.0)), scale * math.sqrt(high))
+    drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
+    tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
+    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
+    return Interval(value, scale * float(low), scale * float(high))
+
+
+def root_mean_square(values: ArrayLike) -> float:
+    """Compute the root mean square of numbers (n,), whose squares may be infinite."""
+    values, scale = _with_finite_squares(np.asarray(values, float))
+    return scale * math.sqrt(np.mean(np.square(values))) if len(values) else math.nan
+
+
+def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
+    """Return numbers (n,) as multiples of a number, which is one unless an estimator diverged."""
+    largest = float(np.max(np.abs(values), initial=0.0))
+    scale = largest if LARGE < largest < math.inf else 1.0
+    return values / scale, scale
