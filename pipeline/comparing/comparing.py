@@ -110,7 +110,7 @@ class Differences:
         runs = max((each.found.runs for each in judged), default=0)
         if runs < FEWEST_RUNS:
             raise BadInput(
-                f"{runs_of(runs)} cannot show that a side is worse, since an interval takes "
+                f"{runs_of(runs)} cannot show that a side is worse, since an interval needs "
                 f"{FEWEST_RUNS}; give more runs, or leave out --fail-if-worse"
             )
         worse = [each for each in judged if each.found.verdict == "worse" and not each.is_withheld]

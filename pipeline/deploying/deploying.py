@@ -152,7 +152,7 @@ def _without_clash(made: CFilter) -> CFilter:
     """Return the filter under a name that is no other word of its C, such as a variable's."""
     text = source(made._replace(name="fuselog_filter"))
     words = re.findall(r"\w+", re.sub(r'/\*.*?\*/|//[^\n]*|"[^"\n]*"', " ", text, flags=re.DOTALL))
-    return made._replace(name=f"{made.name}_") if made.name in words else made
+    return made._replace(name=f"{made.name}_filter") if made.name in words else made
 
 
 def _check_empty(folder: Path) -> None:

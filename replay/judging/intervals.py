@@ -61,7 +61,7 @@ class Interval(NamedTuple):
 
 def too_few(runs: int) -> str:
     """Say why there is no interval over so few runs."""
-    return f"an interval takes {FEWEST_RUNS} runs or more, and this is of {runs} run{'s' * (runs != 1)}"
+    return f"an interval needs at least {FEWEST_RUNS} runs, and there {'is 1' if runs == 1 else f'are {runs}'}"
 
 
 def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
