@@ -61,7 +61,8 @@ class Interval(NamedTuple):
 
 def too_few(runs: int) -> str:
     """Say why there is no interval over so few runs."""
-    return f"an interval needs at least {FEWEST_RUNS} runs, and there {'is 1' if runs == 1 else f'are {runs}'}"
+    there = "is 1" if runs == 1 else f"are {runs}"
+    return f"an interval needs at least {FEWEST_RUNS} runs, and there {there}"
 
 
 def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
