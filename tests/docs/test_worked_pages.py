@@ -32,6 +32,9 @@ WORKED = [
     "start",
     "inconsistent",
     "judge",
+    "lint",
+    "noise",
+    "calibrate",
     "smooth",
     "contract",
     "from-filterpy",
@@ -86,7 +89,7 @@ def printed_by(words: list[str]) -> str:
         done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, check=True)
         return done.stdout
     said = run_here(*words[1:])
-    assert said.code == 0, (words, said.err)
+    assert said.code == 0 or words[1] == "lint", (words, said.err)  # lint finds something: exit code 1
     return said.out
 
 
