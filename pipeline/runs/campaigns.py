@@ -11,27 +11,25 @@ import logging
 import pickle
 import shutil
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 from fuselog.pipeline.runs.checkpoints import Checkpoints
 from fuselog.pipeline.runs.ensemble import Pass, parts_of
 from fuselog.pipeline.runs.executors import (
     PoolFactory,
-    WorkerPool,
     inline_pool,
     states_of,
     version_of_code,
 )
 from fuselog.pipeline.runs.experiment import Experiment, Setting
-from fuselog.pipeline.runs.inputs import Logs, Record, load_scenario
+from fuselog.pipeline.runs.inputs import Record, load_scenario
 from fuselog.pipeline.runs.recorded import KEPT_BYTES, require_memory
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.recorders.errors import BadInput
@@ -103,45 +101,6 @@ class Cell:
                 f"what a metric keeps cannot be sent to another process ({error}); keep numbers, arrays "
                 "and classes of a module"
             ) from error
-
-
-class Sent(NamedTuple):
-    """Sends a cell to a machine with other files: logs go there, what is written comes back, as bytes.
-
-    Attributes:
-        cell: what there is to do.
-        logs: those of the cell that the machine does not see, by their paths without links.
-    """
-
-    cell: Cell
-    logs: Sequence[tuple[Path, bytes]]
-
-    def packed(self) -> tuple[bytes, dict[str, bytes]]:
-        """Return what `Cell.packed` gives, and the files that it writes, by paths in its folder."""
-        with TemporaryDirectory() as scratch:
-            root, folder = Path(scratch).resolve() / "root", Path(scratch) / "files"
-            try:
-                left = self._unpacked(root).packed(folder)
-            except BadInput as error:
-                raise BadInput(str(error).replace(str(root), "")) from error
-            written = (path for path in folder.rglob("*") if path.is_file())
-            return left, {path.relative_to(folder).as_posix(): path.read_bytes() for path in written}
-
-    def _unpacked(self, root: Path) -> Cell:
-        """Return the cell with its logs, and its result's place, in a folder as if it were the root."""
-        if not self.logs:
-            return self.cell
-
-        def below(path: Path) -> Path:
-            return root / path.relative_to(path.anchor)
-
-        experiment, files = self.cell.experiment, list(map(str, self.cell.experiment.files))
-        for number, (path, content) in enumerate(self.logs, self.cell.first):
-            files[number] = str(below(path))
-            below(path).parent.mkdir(parents=True, exist_ok=True)
-            below(path).write_bytes(content)
-        moved = experiment.model_copy(update={"logs": Logs(files=files)})
-        return replace(self.cell, experiment=moved, place=below(self.cell.place))
 
 
 @dataclass
@@ -216,6 +175,7 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
         parameters = merge(values, experiment.record.parameters)
         record = Record(scenario=recorder, parameters=parameters)
         experiment = experiment.model_copy(update={"record": record})
+    experiment = experiment.with_absolute_files()  # a worker may work in another folder
     cells, place = [], setting.place.resolve()
     for now in parts_of(experiment.runs):
         logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
@@ -245,13 +205,15 @@ def work_off(
     while following < len(cells):
         with open_pool() as pool:
             pace.workers = pool.workers
-            begin = _beginner(pool, [cells[number] for number in waiting], checkpoints)
+            logs = [path for number in waiting for path in cells[number].files]
+            pool.require([*logs, checkpoints.folder.absolute()])
             pending: dict[Future[Any], int] = {}
             lost: BaseException | None = None
             while following < len(cells) and lost is None:
                 while waiting and len(pending) < pool.workers:
                     number = waiting.popleft()
-                    pending[begin(cells[number])] = number
+                    place = checkpoints.place_of(keys[number]).absolute()
+                    pending[pool.executor.submit(cells[number].packed, place)] = number
                 left = checkpoints.read(keys[following])
                 if left is not None:
                     pace.done += cells[following].runs
@@ -277,10 +239,7 @@ def work_off(
                         continue
                     number = pending.pop(future)
                     pace.worked_off += cells[number].runs
-                    if pool.sees is None:
-                        checkpoints.write(keys[number], future.result())
-                    else:
-                        checkpoints.write(keys[number], *future.result())
+                    checkpoints.write(keys[number], future.result())
             if lost is not None:  # and with it all others of some executors
                 died.update(pending.values())
                 waiting.extendleft(sorted(pending.values(), reverse=True))
@@ -291,19 +250,3 @@ def work_off(
                         f"runs {cell.first} to {cell.end - 1}: the process that computed them died "
                         f"{times} times ({lost}); try fewer workers, or --workers 1 to see why"
                     )
-
-
-def _beginner(
-    pool: WorkerPool, cells: Sequence[Cell], checkpoints: Checkpoints
-) -> Callable[[Cell], Future[Any]]:
-    """Return what hands a cell to the pool; logs that its workers do not see go with it."""
-    sees, submit = pool.sees, pool.executor.submit
-    if sees is None:
-        return lambda cell: submit(cell.packed, checkpoints.place_of(cell.key))
-    carries = not sees([file for cell in cells for file in cell.files])
-
-    def send(cell: Cell) -> Future[Any]:
-        paths = [file.resolve() for file in cell.files] if carries else []
-        return submit(Sent(cell, [(path, path.read_bytes()) for path in paths]).packed)
-
-    return send

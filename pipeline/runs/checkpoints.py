@@ -17,7 +17,7 @@ import os
 import pickle
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -87,14 +87,9 @@ class Checkpoints:
         left = self._left(key)
         return None if left is None else pickle.loads(left.pickled)
 
-    def write(self, key: str, left: bytes, written: Mapping[str, bytes] | None = None) -> None:
-        """Keep what a cell left, pickled, and what it wrote where that is not in its place already."""
+    def write(self, key: str, left: bytes) -> None:
+        """Keep what a cell left, pickled, beside the files that it wrote."""
         place = self.place_of(key)
-        if written is not None:
-            shutil.rmtree(place, ignore_errors=True)  # of a driver that was killed
-        for name, content in (written or {}).items():
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
-            (place / name).write_bytes(content)
         files = sorted(path for path in place.rglob("*") if path.is_file())
         hashes = {path.relative_to(place).as_posix(): hash_of(path) for path in files}
         content = key.encode() + pickle.dumps(_Left(left, hashes))

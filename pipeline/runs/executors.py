@@ -39,14 +39,13 @@ class WorkerPool(NamedTuple):
     Attributes:
         executor: hands work to them.
         workers: how many work at once.
-        sees: of workers that may be on other machines, whether all of them see these files as this
-            process does; None on this machine, where they may write files too.
+        require: raises BadInput unless all workers find these absolute paths as this process does.
         lost: what a future raises whose worker died.
     """
 
     executor: Executor
     workers: int
-    sees: Callable[[Sequence[Path]], bool] | None = None
+    require: Callable[[Sequence[Path]], None] = lambda _: None  # as on this machine
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
@@ -211,9 +210,9 @@ def dask(scheduler: str) -> PoolFactory:
             if scheduler.startswith("local:"):
                 client.run(keep_off_settings_here)
             workers = sum(client.nthreads().values())
-            sees = None if scheduler.startswith("local:") else partial(_all_see, client)
             stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
-            yield WorkerPool(DaskExecutor(client), workers, sees, (KilledWorker,))
+            require = partial(_require_paths, scheduler, client)
+            yield WorkerPool(DaskExecutor(client), workers, require, (KilledWorker,))
 
     return begin
 
@@ -252,22 +251,30 @@ def _check_code(scheduler: str, client: Any) -> None:
             )
 
 
-def _all_see(client: Any, files: Sequence[Path]) -> bool:
-    """Tell whether all workers see files as this process does."""
-    own = states_of(files)
-    return not files or all(found == own for found in client.run(states_of, files).values())
+def _require_paths(scheduler: str, client: Any, paths: Sequence[Path]) -> None:
+    """Raise BadInput unless all workers find files and folders as this process does."""
+    for worker, found in client.run(states_of, paths).items():
+        for path, own, there in zip(paths, states_of(paths), found, strict=True):
+            if there != own:
+                how = "cannot read" if there is None else "has another"
+                raise BadInput(
+                    f"--scheduler {scheduler}: worker {worker} {how} {path}; put logs and --out on a "
+                    "disk that all workers share, under the same paths, or leave out --scheduler"
+                )
 
 
-def states_of(files: Sequence[Path]) -> list[tuple[int, int] | None]:
-    """Return size and time of the last change of files; None of one that is not seen."""
+def states_of(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Return size and time of change of files, zeros for folders; None for what cannot be read."""
     found: list[tuple[int, int] | None] = []
-    for file in files:
+    for path in paths:
         try:
-            state = file.stat()
+            state = path.stat()
         except OSError:
             found.append(None)
-        else:
-            found.append((state.st_size, state.st_mtime_ns))
+            continue
+        is_readable = os.access(path, os.R_OK)
+        of_file = (0, 0) if path.is_dir() else (state.st_size, state.st_mtime_ns)
+        found.append(of_file if is_readable else None)
     return found
 
 

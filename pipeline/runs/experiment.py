@@ -115,6 +115,14 @@ class Experiment(Parameters):
         """Return the logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
 
+    def with_absolute_files(self) -> "Experiment":
+        """Return the experiment with paths of logs that hold in any folder."""
+        if not self.logs:
+            return self
+        return self.model_copy(
+            update={"logs": Logs(files=[str(each.absolute()) for each in self.files])}
+        )
+
 
 def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
     """Return an estimator's parameters with those of the one that it is like."""
@@ -279,7 +287,7 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
     return list(files)
 
 
-def _given(experiment: Experiment, data: Path | None) -> list[Path]:
+def given_files(experiment: Experiment, data: Path | None) -> list[Path]:
     """List the files that an experiment imports, those of its folder of data, or the logs it replays."""
     if data is None or experiment.logs is not None:
         return experiment.files
@@ -377,7 +385,7 @@ def run_experiment(
     require_recordings(experiment.claims, experiment.recordings, f"experiment {name}")
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
-    recordings = holding(experiment.recordings, _given(experiment, data), f"experiment {name}")
+    recordings = holding(experiment.recordings, given_files(experiment, data), f"experiment {name}")
     with (
         checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,

@@ -13,7 +13,7 @@ from fuselog.pipeline.output.claims import Claim, decide
 from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.runs.ensemble import Progress, no_progress
 from fuselog.pipeline.runs.executors import WorkerPool, pool_for
-from fuselog.pipeline.runs.experiment import Experiment, Setting, Study, numbers_of
+from fuselog.pipeline.runs.experiment import Experiment, Setting, Study, given_files, numbers_of
 from fuselog.pipeline.runs.initial_states import order_of
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.pipeline.stressing.copies import How
@@ -73,21 +73,16 @@ def stress_result(
     beside = ("data", "parameters")
     values = {name: value for name, value in result.settings.items() if name not in beside}
     values["estimators"] = allowed(values.get("estimators") or {})
-    experiment = build(Experiment, values, f"experiment {result.experiment}")
+    experiment = build(Experiment, values, f"experiment {result.experiment}").with_absolute_files()
     if not experiment.estimators:
         raise BadInput(f"--stress: experiment {result.experiment} names no estimators; leave it out")
-    data = result.settings.get("data")
+    data = Path(result.settings["data"]).absolute() if result.settings.get("data") else None
     runs = len(experiment.files) or experiment.runs
     parts = [
-        _Part(experiment, Path(data) if data else None, first, min(first + TOGETHER, runs))
-        for first in range(0, runs, TOGETHER)
+        _Part(experiment, data, first, min(first + TOGETHER, runs)) for first in range(0, runs, TOGETHER)
     ]
     with pool_for(workers, scheduler, parts[-1].end)() as pool:
-        if pool.sees is not None and not pool.sees([*experiment.files, *filter(None, [parts[0].data])]):
-            raise BadInput(
-                f"--stress --scheduler {scheduler}: its workers do not see the files that are replayed; "
-                "put them where all see them, or leave out --scheduler"
-            )
+        pool.require(given_files(experiment, data))
         return [each.summary for each in _merged(parts, pool, progress).values()]
 
 

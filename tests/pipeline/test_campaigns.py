@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import contextmanager, nullcontext
+from contextlib import chdir, contextmanager, nullcontext
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -268,59 +268,61 @@ def test_a_worker_uses_one_core() -> None:
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 
-@pytest.mark.paper
-def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
-    """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
+def test_workers_in_another_folder_read_logs_and_write_files(tmp_path, monkeypatch):
+    """Relative paths are the driver's; what is required is every log, and the folder of kept cells."""
     monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
-    drives, place = tmp_path / "drives", tmp_path / "result"
-    drives.mkdir()
-    logs = [drives / f"{seed}.mcap" for seed in (1, 2)]
-    for seed, log in enumerate(logs):
+    monkeypatch.chdir(tmp_path)
+    drives, place = [Path(f"{seed}.mcap") for seed in (1, 2)], Path("result")
+    for seed, drive in enumerate(drives):
         recording, run = record_run("landmarks", {"duration_s": 3.0}, seed)
-        write_log(log, recording.streams, run)
+        write_log(drive, recording.streams, run)
 
     def replayed(open_pool=None) -> dict[str, bytes]:
-        experiment = experiment_of_logs(logs, ["ekf"]).with_settings({}, {})
+        experiment = experiment_of_logs(drives, ["ekf"]).with_settings({}, {})
         run_experiment("drives", experiment, place, logs=1, errors=True, open_pool=open_pool)
         return contents(place)
 
     files = replayed()
     shutil.rmtree(place)
-    hidden = [drives, unfinished(place)]
-    asked: list[list[Path]] = []
-
-    def sees(files) -> bool:
-        asked.append(list(files))
-        return False
-
-    @contextmanager
-    def elsewhere():
-        yield WorkerPool(Elsewhere(hidden), 1, sees)
-
-    assert replayed(elsewhere) == files
+    required: list[Path] = []
+    (tmp_path / "elsewhere").mkdir()
+    elsewhere = WorkerPool(Elsewhere(tmp_path / "elsewhere"), 1, required.extend)
+    assert replayed(lambda: nullcontext(elsewhere)) == files
     assert "estimates/run-0000.mcap" in files
-    assert asked == [logs]
-    logs[1].write_bytes(logs[1].read_bytes()[:-100])
-    with pytest.raises(BadInput, match=f"^{re.escape(str(logs[1]))}: .*--recover"):
-        replayed(elsewhere)
+    assert required == [*(tmp_path / drive for drive in drives), tmp_path / unfinished(place)]
 
 
 class Elsewhere(InlineExecutor):
-    """Works as another machine would, where some folders are not."""
+    """Works in another folder; what comes and goes is pickled."""
 
-    def __init__(self, hidden: list[Path]) -> None:
-        self.hidden = hidden
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def submit(self, work, /, *args):
-        """What comes back and forth is pickled."""
-        for folder in self.hidden:
-            folder.rename(folder.with_suffix(".away"))
-        try:
-            done = super().submit(pickle.loads(pickle.dumps(work)), *args)
-        finally:
-            for folder in self.hidden:
-                folder.with_suffix(".away").rename(folder)
-        return done
+        """Work there."""
+        with chdir(self.folder):
+            return super().submit(pickle.loads(pickle.dumps(work)), *args)
+
+
+@pytest.mark.parametrize("fault", ["cannot read", "has another"])
+def test_a_path_that_a_worker_does_not_find_is_named(fault: str, tmp_path: Path) -> None:
+    """With the worker and the mend, whether it is missing there or not the same."""
+    log = tmp_path / "drive.mcap"
+    log.write_bytes(b"a log")
+
+    class Client:
+        """Has a worker with the same files, and one without."""
+
+        def run(self, function, paths):
+            there = function(paths)
+            return {"tcp://one:1": there, "tcp://two:2": [there[0], None if fault[0] == "c" else (1, 1)]}
+
+    with pytest.raises(BadInput) as refused:
+        executors._require_paths("tcp://one:8786", Client(), [tmp_path, log])
+    assert str(refused.value) == (
+        f"--scheduler tcp://one:8786: worker tcp://two:2 {fault} {log}; put logs and --out on a "
+        "disk that all workers share, under the same paths, or leave out --scheduler"
+    )
 
 
 @pytest.mark.paper
