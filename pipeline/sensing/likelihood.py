@@ -148,4 +148,4 @@ def filter_samples(
     return total
 
 
-_filter = compiled(filter_samples, allocates=False)
+_filter = compiled(filter_samples)

@@ -150,5 +150,5 @@ def _solve(
         found[run] = 2.0 * value
 
 
-_tails = compile_over_runs(_tail, allocates=False)
-_quantiles = compile_over_runs(_solve, allocates=False)
+_tails = compile_over_runs(_tail)
+_quantiles = compile_over_runs(_solve)

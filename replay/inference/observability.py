@@ -184,7 +184,7 @@ def _summing(stage: Stage) -> tuple[OverRuns, Steps]:
     steps = gramian_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "observability")
-    return compile_over_runs(recursion(stage, steps, settings_of), allocates=False, title=title), steps
+    return compile_over_runs(recursion(stage, steps, settings_of), title=title), steps
 
 
 class Observability(IteratedSmoother):

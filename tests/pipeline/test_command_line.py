@@ -497,7 +497,7 @@ HEAVY = (
     "scipy",
 )
 # What compiles and loads kernels.
-KERNELS = ("fuselog.replay.engine.compiling.kernel_cache", "fuselog.replay.engine.compiling.inlining")
+KERNELS = ("numba", "fuselog.replay.engine.compiling.kernels.native")
 
 # What a list needs nothing of: what it lists.
 LISTED = (

@@ -115,4 +115,4 @@ def count_intervals(
         last_ns = time_ns[row]
 
 
-_count_intervals = compile_over_runs(count_intervals, allocates=False)
+_count_intervals = compile_over_runs(count_intervals)

@@ -89,4 +89,4 @@ def find_unsound(
         last_ns = time_ns[row]
 
 
-unsound_over_runs = compile_over_runs(find_unsound, allocates=False)
+unsound_over_runs = compile_over_runs(find_unsound)

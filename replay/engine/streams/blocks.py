@@ -316,4 +316,4 @@ def merge_run(
         heads[first] += 1
 
 
-_merge = compile_over_runs(merge_run, allocates=False)
+_merge = compile_over_runs(merge_run)

@@ -95,7 +95,7 @@ class GaussianNoise(NamedTuple):
 
 @cache
 def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(run_once, allocates=False)
+    return compile_over_runs(run_once)
 
 
 def run_bingham_filter(

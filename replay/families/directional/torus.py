@@ -176,7 +176,7 @@ def _run(
 def _over_runs(step: MakeStep, motion: Motion) -> OverRuns:
     """Compile the loop of a filter: what `step` makes processes a row, whose state is written down."""
     loop = over_events(step(motion), _write, fails=False)
-    return compile_over_runs(loop, allocates=False, title="a filter of headings")
+    return compile_over_runs(loop, title="a filter of headings")
 
 
 def _write(

@@ -111,9 +111,7 @@ def memory(states: int) -> RobotMemory:
     )
 
 
-_cooperate = compile_over_runs(
-    over_events(cooperate, write_pose), allocates=False, title="robots that see each other"
-)
+_cooperate = compile_over_runs(over_events(cooperate, write_pose), title="robots that see each other")
 
 
 Cooperating = Given[CooperativeParameters]

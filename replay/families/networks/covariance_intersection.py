@@ -296,7 +296,7 @@ def fuse_run(
     fusions.gap[run] = fuse_by(rule, count, parts, into, tolerance, memory)
 
 
-_fuse_runs = compile_over_runs(fuse_run, allocates=False)
+_fuse_runs = compile_over_runs(fuse_run)
 
 
 def fuse(

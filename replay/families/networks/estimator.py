@@ -81,7 +81,7 @@ class NetworkParameters(Parameters):
     lie_after_s: NonNegativeFloat = 0.0
 
 
-_follow = compile_over_runs(following(), allocates=False, title="the nodes of a network")
+_follow = compile_over_runs(following(), title="the nodes of a network")
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:

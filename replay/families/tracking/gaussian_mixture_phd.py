@@ -82,7 +82,7 @@ class PhdParameters(Parameters):
     most_components: PositiveInt = 100
 
 
-_filter = compile_over_runs(over_events(process, extract), allocates=False, title="a PHD filter")
+_filter = compile_over_runs(over_events(process, extract), title="a PHD filter")
 
 
 Filtering = Given[PhdParameters]

@@ -79,7 +79,7 @@ class ReportTrackerParameters(Parameters):
     forget_s: PositiveFloat = 7200.0
 
 
-_track = compile_over_runs(over_stamps(track), allocates=False, title="tracks of reports")
+_track = compile_over_runs(over_stamps(track), title="tracks of reports")
 
 
 Reporting = Given[ReportTrackerParameters]

@@ -60,7 +60,7 @@ KINDS = {
     "associations": "associations, a Kalman filter each (Rao-Blackwellised)",
 }
 LEAST_EFFECTIVE_SHARE = 0.5
-_choose = compiled(choose_systematically, allocates=False)
+_choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):

@@ -211,7 +211,7 @@ def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made
 
 @lru_cache(maxsize=1)
 def _loop() -> OverRuns:
-    return compile_over_runs(follow, allocates=False, title="filters of a library")
+    return compile_over_runs(follow, title="filters of a library")
 
 
 def reason_of_code(code: int, description: Description) -> str:

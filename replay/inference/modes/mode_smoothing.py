@@ -29,7 +29,7 @@ def smoothing_memory(modes: int) -> SmoothingMemory:
 @lru_cache(maxsize=16)
 def smoothing_over_runs(modes: int) -> OverRuns:
     """Compile `smoothing` over all runs."""
-    return compile_over_runs(smoothing(modes), allocates=False, title="the smoother of modes")
+    return compile_over_runs(smoothing(modes), title="the smoother of modes")
 
 
 def smoothing(modes: int) -> RunOnce:

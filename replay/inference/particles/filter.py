@@ -126,7 +126,7 @@ def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
     )
 
 
-_draw_normals = compiled(fill_normals, allocates=False)
+_draw_normals = compiled(fill_normals)
 
 
 class ParticleFilter(Filter):

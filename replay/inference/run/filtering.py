@@ -109,7 +109,7 @@ def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
     title = title_of(stage.model, method.summary)
-    return compile_over_runs(loop, allocates=False, title=title), steps
+    return compile_over_runs(loop, title=title), steps
 
 
 def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) -> tuple[Sampler, ...]:

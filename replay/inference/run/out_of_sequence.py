@@ -79,7 +79,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverR
     reads = reading_settings(number_fields(stage.model.parameters))
     loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
     title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
-    return compile_over_runs(loop, allocates=False, title=title), steps
+    return compile_over_runs(loop, title=title), steps
 
 
 def reprocessing(

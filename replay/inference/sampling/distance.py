@@ -121,7 +121,7 @@ def _sum_pairs(coordinates: Array, weights: Array, gradient: Array, work: Array)
     return B_MAX**2 * total
 
 
-_pair_sum = compiled(_sum_pairs, allocates=False)
+_pair_sum = compiled(_sum_pairs)
 
 
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:

@@ -219,9 +219,7 @@ class BackMemory(NamedTuple):
 @lru_cache(maxsize=64)
 def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> OverRuns:
     """Compile the same over all runs; see `backward_pass`."""
-    return compile_over_runs(
-        backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
-    )
+    return compile_over_runs(backward_pass(kinds, correct), title="a smoother's way back")
 
 
 class GoBack(Protocol):

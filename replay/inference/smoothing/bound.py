@@ -67,7 +67,7 @@ def back_memory(t: int) -> BackMemory:
 @lru_cache(maxsize=1)
 def smooth_over_runs() -> OverRuns:
     """Compile `smooth` over all runs."""
-    return compile_over_runs(smooth, allocates=False, title="the bound of smoothers")
+    return compile_over_runs(smooth, title="the bound of smoothers")
 
 
 def smooth(

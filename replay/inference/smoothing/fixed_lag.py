@@ -35,7 +35,7 @@ class Window(NamedTuple):
 @lru_cache(maxsize=64)
 def sliding_over_runs(kinds: tuple[str, ...]) -> OverRuns:
     """Compile the same over all runs; see `sliding`."""
-    return compile_over_runs(sliding(kinds), allocates=False, title="a smoother with a fixed lag")
+    return compile_over_runs(sliding(kinds), title="a smoother with a fixed lag")
 
 
 def sliding(kinds: tuple[str, ...]) -> RunOnce:

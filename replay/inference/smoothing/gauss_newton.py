@@ -96,7 +96,7 @@ def searching(stage: Stage) -> tuple[OverRuns, Steps]:
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "iterated smoother")
-    return compile_over_runs(search(stage, steps, settings_of), allocates=False, title=title), steps
+    return compile_over_runs(search(stage, steps, settings_of), title=title), steps
 
 
 def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:

@@ -171,7 +171,7 @@ def compiled() -> Function:
 
     Its arguments are runs, offsets, time_ns, measured, noise, gate, carried, results, and `scratch`.
     """
-    return compile_over_runs(stepwise(Steps(predict_sampled, innovate)), allocates=False)
+    return compile_over_runs(stepwise(Steps(predict_sampled, innovate)))
 
 
 def scratch(sets: SampleSets) -> tuple[Innovation, SampleMemory]:

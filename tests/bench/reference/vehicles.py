@@ -148,4 +148,4 @@ def follow(run: int, motion: Motion, messages: Messages, state: State, results: 
 @cache
 def compiled() -> Function:
     """The loop over the runs: (runs, motion, messages, state, results), which fills the last two."""
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(follow)

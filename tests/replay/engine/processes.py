@@ -20,7 +20,7 @@ _CONTEXT: Any = get_context("forkserver" if "forkserver" in get_all_start_method
 _CONTEXT.set_forkserver_preload(
     [
         "fuselog.replay.engine.compiling.compile",
-        "fuselog.replay.engine.compiling.through_numba",
+        "fuselog.replay.engine.through_numba",
         "numba.core.typing.npydecl",
         __name__,
     ]

@@ -270,7 +270,7 @@ def test_what_has_not_changed_is_the_same_object_again(monkeypatch: pytest.Monke
 def test_functions_of_one_name_are_two_in_a_kernel():
     functions = tuple(TracedFunction(lambda given, k=k: (given[0] + k,), (1,)) for k in range(3))
     out = np.zeros((1, 3, 1))
-    compile_over_runs(over_points(functions, 1), allocates=False)(1, np.array([[0.5]]), out)
+    compile_over_runs(over_points(functions, 1))(1, np.array([[0.5]]), out)
     assert out.ravel().tolist() == [0.5, 1.5, 2.5]
 
 

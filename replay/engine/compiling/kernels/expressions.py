@@ -346,7 +346,7 @@ class Expressions(Scope, ABC):
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
-        if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
+        if isinstance(function, FunctionType) and not str(function.__module__).startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
         name = getattr(function, "__name__", function)
         raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")

@@ -354,7 +354,7 @@ def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vecto
 
 @cache
 def _over_all(function: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(function, allocates=False)
+    return compile_over_runs(function)
 
 
 def _predict_one(

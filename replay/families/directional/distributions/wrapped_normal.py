@@ -18,7 +18,7 @@ from fuselog.replay.families.directional.distributions import wrapped_normal_ker
 from fuselog.replay.families.directional.distributions.batches import flatten
 from fuselog.replay.families.directional.distributions.wrapped_normal_kernels import Mixture
 
-_product_mixture = compiled(kernels.product_mixture, allocates=False)
+_product_mixture = compiled(kernels.product_mixture)
 
 
 class WrappedNormal(NamedTuple):

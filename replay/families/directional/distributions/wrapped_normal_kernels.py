@@ -321,7 +321,7 @@ def density(x1: float, x2: float, covariance: NDArray) -> float:
 
 @cache
 def _over_all(function: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(function, allocates=False)
+    return compile_over_runs(function)
 
 
 def _density_one(n: int, deviation: NDArray, covariance: NDArray, out: NDArray) -> None:

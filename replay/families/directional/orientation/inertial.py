@@ -137,7 +137,7 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 @cache
 def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     """Return the loop over runs of what takes one run through its samples, compiled."""
-    return compile_over_runs(run_once, allocates=False)
+    return compile_over_runs(run_once)
 
 
 def run_inertial_filter(

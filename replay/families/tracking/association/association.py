@@ -188,4 +188,4 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
 
 @cache
 def _compiled(association: str) -> Associate:
-    return compiled(ASSOCIATIONS[association], allocates=False)
+    return compiled(ASSOCIATIONS[association])

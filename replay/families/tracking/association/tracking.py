@@ -246,7 +246,7 @@ BATCH = 1000
 @lru_cache(maxsize=16)
 def _compiled(tracker: Tracker) -> OverRuns:
     follow = tracking(tracker, reading_settings(tracker.names))
-    return compile_over_runs(follow, allocates=False, title="a tracker")
+    return compile_over_runs(follow, title="a tracker")
 
 
 def track_scans(
