@@ -10,12 +10,12 @@ from fuselog.pipeline.api.replays import replay
 from fuselog.pipeline.output.terminal import print_json, print_table, say
 from fuselog.pipeline.runs.executors import inline_pool, processes
 from fuselog.pipeline.runs.inputs import load_scenario, shipped
+from fuselog.recorders.compiling.cache import cache_folder, is_private, kept_files
+from fuselog.recorders.compiling.compile import core_count, is_uncompiled
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.recording import Importer, Recorder, record_run
 from fuselog.recorders.registry import available, load
 from fuselog.replay.engine import chi2
-from fuselog.replay.engine.compiling.cache import cache_folder, is_private, kept_files
-from fuselog.replay.engine.compiling.compile import core_count, is_uncompiled
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.inference.all_methods import METHODS, modelled
 from fuselog.replay.inference.estimators import registered_models

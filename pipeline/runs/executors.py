@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
+from fuselog.recorders.compiling.compile import use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
-from fuselog.replay.engine.compiling.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
 PAYING_RUNS = 1000

@@ -19,13 +19,13 @@ from typing import cast
 import numpy as np
 
 from fuselog.recorders import environment
-from fuselog.replay.engine.compiling.cache import say_once
-from fuselog.replay.engine.compiling.compile import OverRuns
-from fuselog.replay.engine.compiling.identity import OF_PYTHON, identity
-from fuselog.replay.engine.compiling.kernels.program import DoesNotCompile
-from fuselog.replay.engine.compiling.kinds import KernelFunction, RunOnce, Value
-from fuselog.replay.engine.compiling.notices import compiling
-from fuselog.replay.engine.compiling.scratch import Memory
+from fuselog.recorders.compiling.cache import say_once
+from fuselog.recorders.compiling.compile import OverRuns
+from fuselog.recorders.compiling.identity import OF_PYTHON, identity
+from fuselog.recorders.compiling.kernels.program import DoesNotCompile
+from fuselog.recorders.compiling.kinds import KernelFunction, RunOnce, Value
+from fuselog.recorders.compiling.notices import compiling
+from fuselog.recorders.compiling.scratch import Memory
 
 # One step of Python's byte code.
 Step = dis.Instruction  # type: ignore[explicit-any]

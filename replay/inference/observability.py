@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.replaying.estimator import AnyEstimator
 from fuselog.replay.engine.streams.blocks import Ragged, copied, run_of_rows
 from fuselog.replay.engine.vectors.tangent import named_now, tangent_components

@@ -497,7 +497,7 @@ HEAVY = (
     "scipy",
 )
 # What compiles and loads kernels.
-KERNELS = ("numba", "fuselog.replay.engine.compiling.kernels.native")
+KERNELS = ("numba", "fuselog.recorders.compiling.kernels.native")
 
 # What a list needs nothing of: what it lists.
 LISTED = (

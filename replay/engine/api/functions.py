@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Schema
 from fuselog.recorders.parameters import Parameters, ParametersType
@@ -37,8 +39,6 @@ from fuselog.replay.engine.api.inputs import (
 )
 from fuselog.replay.engine.api.outputs import Estimates, Outputs, Solved
 from fuselog.replay.engine.arrays import AnyArgument
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.engine.renamed import renamed
 from fuselog.replay.engine.replaying.estimator import Batch, Bound, Carried, Estimator, Recursive
 from fuselog.replay.engine.streams.blocks import Block, Ragged
@@ -121,7 +121,7 @@ def recursive(
         compiled: whether `follow` is compiled; plain Python is a hundred times slower.
         allocates: whether `follow` may make arrays, and call all that numba knows: numba, an extra,
             compiles it. One that makes no arrays is compiled without numba, in a twentieth of the time,
-            see `fuselog.replay.engine.compiling.compile.compile_over_runs`.
+            see `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     Returns:
         The estimator, which `replay` takes.

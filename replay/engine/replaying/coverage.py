@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged
 
 Floats = NDArray[np.float64]

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.vectors.covariances import ROUNDING
 
 Floats = NDArray[np.float64]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats, Integers, varying
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import copied, filled_rows
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.foreign.description import Description

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.inference.modes.mixing import transition_matrix
 
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Columns, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of
 from fuselog.replay.inference.kalman.methods import Method

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compiled
 
 Array = NDArray[np.float64]
 

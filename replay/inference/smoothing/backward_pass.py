@@ -18,8 +18,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.inference.kalman.steps import (
     CoreMemory,
     InnovationRecord,

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import Gaussian, Steps
 from fuselog.replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat

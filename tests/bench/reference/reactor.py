@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from tests.bench.reference import c
 from tests.bench.reference.gaussian import (
     ALL_WELL,

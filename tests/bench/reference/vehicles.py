@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from tests.bench.reference.gaussian import Floats, Function
 
 

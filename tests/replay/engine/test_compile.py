@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from fuselog.recorders.compiling.cache import cache_folder, in_turn
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled, core_count
+from fuselog.recorders.compiling.kernels import native
+from fuselog.recorders.compiling.kernels.native import Kernel
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.cache import cache_folder, in_turn
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled, core_count
-from fuselog.replay.engine.compiling.kernels import native
-from fuselog.replay.engine.compiling.kernels.native import Kernel
 from fuselog.replay.engine.through_numba import numba_over_runs
 from tests.replay.engine.processes import printed
 
@@ -53,7 +53,7 @@ BY_NUMBA = f"""{MODULE}
     print(*columns.found, "cached" if made.stats.cache_hits else "compiled")
 """
 OURS = f"""{MODULE}
-    from fuselog.replay.engine.compiling.kernels import native
+    from fuselog.recorders.compiling.kernels import native
 
     made, make = [], native._made
     native._made = lambda *given: made.append(given) or make(*given)
@@ -83,7 +83,7 @@ def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp
 HOLDER = """
     import sys
     from pathlib import Path
-    from fuselog.replay.engine.compiling.cache import cache_folder, in_turn
+    from fuselog.recorders.compiling.cache import cache_folder, in_turn
 
     with in_turn(Path(sys.argv[1])):
         print("held", flush=True)
@@ -118,7 +118,7 @@ def test_nobody_waits_long_for_a_kernel_and_not_at_all_for_the_killed(
     path = kernels / "kernel.bin"
     holder = started(HOLDER, path)
     assert holder.stdout.readline() == "held\n"
-    monkeypatch.setattr("fuselog.replay.engine.compiling.cache._TURN_S", 0.1)
+    monkeypatch.setattr("fuselog.recorders.compiling.cache._TURN_S", 0.1)
     with in_turn(path) as waited:
         assert waited
     holder.kill()
@@ -435,7 +435,7 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
 FORKED = """
     import os
     import numpy as np
-    from fuselog.replay.engine.compiling.compile import compile_over_runs
+    from fuselog.recorders.compiling.compile import compile_over_runs
 
     def one(run, found, memory):
         memory[0] = run

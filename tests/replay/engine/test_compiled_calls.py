@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
 from fuselog.replay.families.tracking.association.association import marginals
 
 

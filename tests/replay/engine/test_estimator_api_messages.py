@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling import notices
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
 from fuselog.recorders.parameters import Parameters
@@ -17,8 +19,6 @@ from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.api.functions import batch, each_run, recursive
 from fuselog.replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
 from fuselog.replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
-from fuselog.replay.engine.compiling import notices
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
 from fuselog.replay.engine.replaying.estimator import Estimator
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
@@ -394,7 +394,7 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("fuselog.replay.engine.compiling.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("fuselog.recorders.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     for _ in range(2):
         compile_over_runs(halve)(2, np.ones(2))

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.tracing.functions import Derivative, TracedFunction
 from fuselog.replay.tracing.graph import Node
 from fuselog.replay.tracing.traced import Trace

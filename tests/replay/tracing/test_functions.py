@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.inference.model.checking import check_model
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.tracing.functions import Shape, TracedFunction, traced

@@ -17,8 +17,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.orientation import SIGNS
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.directional.distributions.gaussian_kernels import solve_in_place
 
 Vector = NDArray | tuple[float, ...]

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.planar import Component, Components, wrap_angle
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.

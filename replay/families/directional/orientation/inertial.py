@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.models.inertial import triad
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.directional.distributions.bingham_kernels import (
     compose,
     integrate,

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.arrays import varying
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
 
 N = 4
 REALS = np.array([[1.5, -2.0, 0.0, 3.25], [-0.5, 7.0, 1e-3, -1.0], [2.0, 2.0, -4.5, 0.25]])

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.identity import identity
+from fuselog.recorders.compiling.kernels import arguments, native
 from fuselog.replay.engine.arrays import varying
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.engine.compiling.identity import identity
-from fuselog.replay.engine.compiling.kernels import arguments, native
 
 # --- the key -----------------------------------------------------------------------------------------
 
@@ -165,10 +165,10 @@ def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, 
 
 ELSEWHERE = """
 import numpy as np
-from fuselog.replay.engine.compiling.kernels import arguments, native
+from fuselog.recorders.compiling.kernels import arguments, native
 native._made = lambda *_: 1 / 0
 from tests.replay.engine.kernels.test_native import doubled, kernel_of
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 out = np.zeros(1)
 compile_over_runs(kernel_of(doubled))(1, np.array([1.5]), out)
 print(out[0])

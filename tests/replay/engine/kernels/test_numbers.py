@@ -12,8 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
+from fuselog.recorders.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.kernels.functions import FUNCTIONS
 
 # Exactly rounded, or made of nothing else: the same in every bit.
 EXACT = [

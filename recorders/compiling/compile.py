@@ -1,7 +1,7 @@
 """Compiles functions of one run into loops over all runs, which the cores share.
 
 A kernel is a plain Python function over numbers and arrays, with all that it calls, that makes no
-arrays; `fuselog.replay.engine.compiling.kernels` writes it in LLVM's text, in milliseconds. With
+arrays; `fuselog.recorders.compiling.kernels` writes it in LLVM's text, in milliseconds. With
 FUSELOG_UNCOMPILED=1 all are plain Python, which a debugger can follow: that is the reference.
 """
 
@@ -17,9 +17,9 @@ from typing import ParamSpec, Protocol, TypeVar, cast
 import numpy as np
 
 from fuselog.recorders import environment
-from fuselog.replay.engine.compiling.kinds import KernelArgument, RunOnce
-from fuselog.replay.engine.compiling.notices import done_once
-from fuselog.replay.engine.compiling.scratch import Memory, Scratch
+from fuselog.recorders.compiling.kinds import KernelArgument, RunOnce
+from fuselog.recorders.compiling.notices import done_once
+from fuselog.recorders.compiling.scratch import Memory, Scratch
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -54,7 +54,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
-        from fuselog.replay.engine.compiling.kernels.native import function_of
+        from fuselog.recorders.compiling.kernels.native import function_of
 
         return function_of(function)
 
@@ -90,7 +90,7 @@ def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
 
     @cache
     def loop() -> Loop:
-        from fuselog.replay.engine.compiling.kernels.native import Kernel
+        from fuselog.recorders.compiling.kernels.native import Kernel
 
         return Kernel(cast(FunctionType, run_once), title)
 

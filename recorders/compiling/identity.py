@@ -13,7 +13,7 @@ from types import CodeType, FunctionType, ModuleType
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import Value
 
 # Whose parts are known by their names alone.
 OF_PYTHON = {"numpy", *sys.stdlib_module_names}
