@@ -91,6 +91,13 @@ def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern)
     return kernel(_agree)(data, offsets, pattern.places, pattern.expected, pattern.mask)
 
 
+def load() -> None:
+    """Compile, or load, the loops that read a log."""
+    record = np.zeros(MESSAGE_HEAD_BYTES, np.uint8)
+    scan(record)
+    agree(record, np.zeros(1, np.int64), pattern_of(record, record))
+
+
 @cache
 def kernel(loop: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Return a loop compiled, even if FUSELOG_UNCOMPILED keeps filters from being so."""
@@ -100,7 +107,12 @@ def kernel(loop: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
 
 
 def word(data: NDArray[np.uint8], place: int) -> int:
-    """Return the number that eight bytes from a place on are, the lowest first; in a kernel signed."""
+    """Return the number that eight bytes from a place on are, the lowest first; in a kernel signed.
+
+    Args:
+        data: bytes.
+        place: where the number begins.
+    """
     part, number = data[place : place + 8], 0
     for k in (7, 6, 5, 4, 3, 2, 1, 0):
         number = number << 8 | int(part[k])

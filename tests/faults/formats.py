@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from fuselog.pipeline.command_line import main
-from fuselog.recorders.log.loops import scan
+from fuselog.recorders.log.loops import load
 from tests.conftest import without_drawing
 from tests.faults import Tally
 from tests.faults.children import how, in_child, in_children
@@ -116,7 +116,7 @@ def _sample(place: Path, each: Format) -> str:
         return wrong
     for module in json.loads((read / "modules.json").read_text()):
         importlib.import_module(module)
-    scan(np.zeros(0, np.uint8))  # loads its loops
+    load()
     codes = _codes(read)
     return f"codes {codes}" if any(codes) else ""
 

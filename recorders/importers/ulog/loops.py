@@ -104,7 +104,8 @@ def sort(
         times: in us: a stamp lies between the first two, and not at them; the third is the latest so
             far.
     """
-    whose, stamps, is_timed = (np.empty(len(at), kind) for kind in (np.int64, np.int64, np.bool_))
+    whose, stamps = np.empty((2, len(at)), np.int64)
+    is_timed = np.empty(len(at), np.bool_)
     reached, counts = np.empty(len(at) + 1, np.int64), np.zeros(NUMBERS + 1, np.int64)
     size = kernel(_examine)(data, at, place, known, times, whose, stamps, is_timed, reached, counts)
     order, places = np.empty(size, np.int64), np.cumsum(counts) - counts
