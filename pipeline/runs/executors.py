@@ -286,7 +286,8 @@ def version_of_code() -> str:
             _add_sources(digest, Path(place))
         if spec.origin and not spec.submodule_search_locations:
             digest.update(Path(spec.origin).read_bytes())
-    digest.update(" ".join(version(name) for name in ("numpy", "scipy", "llvmlite", "numba")).encode())
+    libraries = filter(find_spec, ("numpy", "scipy", "llvmlite", "numba"))
+    digest.update(" ".join(map(version, libraries)).encode())
     return digest.hexdigest()
 
 

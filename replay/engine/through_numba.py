@@ -27,8 +27,8 @@ from fuselog.recorders.compiling.kinds import KernelFunction, RunOnce, Value
 from fuselog.recorders.compiling.notices import compiling
 from fuselog.recorders.compiling.scratch import Memory
 
-# One step of Python's byte code.
-Step = dis.Instruction  # type: ignore[explicit-any]
+# One step of Python's byte code: its name, what it is about, its line.
+_Step = tuple[str, Value, int | None]
 # How functions are compiled that only kernels call.
 _INNER: dict[str, Value] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -52,7 +52,7 @@ class _Loop:
         except ImportError as error:
             raise DoesNotCompile(
                 f"{run_once.__qualname__} is compiled by numba, which cannot be imported ({error}); "
-                "pip install 'fuselog[numba]', or set compiled=False"
+                "pip install 'fuselog[numba]', or set allocates=False if it makes no arrays"
             ) from error
         bounds = environment.is_on(environment.BOUNDSCHECK)
         # a division by zero gives infinity, which is a failure of its run, and no exception
@@ -114,9 +114,9 @@ class _Loop:
             return self._known[function]
         code, scope = function.__code__, dict(function.__globals__)
         cells = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
-        steps = list(_instructions(code))
-        named = {step.argval for step in steps if step.opname == "LOAD_GLOBAL"}
-        outside = {name: scope[name] for name in named if name in scope}
+        steps = list(_steps(code))
+        named = {name for operation, name, _ in steps if operation == "LOAD_GLOBAL"}
+        outside = {name: scope[name] for name in named & scope.keys()}
         outside |= {name: cell.cell_contents for name, cell in cells.items()}
         _refuse_random(function, steps, outside)
         closure = tuple(CellType() for _ in cells)
@@ -174,21 +174,21 @@ def _put_together(value: Value, places: Iterator[int], scope: dict[str, Value]) 
     return f"{name}({parts})"
 
 
-def _instructions(code: CodeType) -> Iterator[Step]:
+def _steps(code: CodeType) -> Iterator[_Step]:
     """Yield the steps of a function, and then those of the functions inside it."""
-    yield from dis.get_instructions(code)
-    for each in code.co_consts:
-        if isinstance(each, CodeType):
-            yield from _instructions(each)
+    for each in dis.get_instructions(code):
+        yield each.opname, each.argval, each.positions.lineno if each.positions else None
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _steps(constant)
 
 
-def _refuse_random(function: FunctionType, steps: Sequence[Step], outside: Mapping[str, Value]) -> None:
+def _refuse_random(function: FunctionType, steps: Sequence[_Step], outside: Mapping[str, Value]) -> None:
     """Raise DoesNotCompile if a function draws from NumPy's generator, which is shared by all runs."""
-    for before, step in pairwise(steps):
-        used = outside.get(step.argval)
-        is_module = step.argval == "random" and outside.get(before.argval) is np
+    for (_, before, _), (_, name, line) in pairwise(steps):
+        used = outside.get(name)
+        is_module = name == "random" and outside.get(before) is np
         if is_module or used is np.random or getattr(used, "__self__", None) is np.random.mtrand._rand:
-            line = step.positions.lineno if step.positions else "?"
             place = f"{function.__code__.co_filename}, line {line}"
             raise DoesNotCompile(
                 f"{function.__qualname__} uses np.random ({place}): its numbers would depend on how "

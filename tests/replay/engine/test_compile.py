@@ -282,7 +282,7 @@ def test_only_a_folder_of_this_user_alone_is_used(
 @pytest.mark.paper
 def test_numba_is_imported_in_one_place_when_it_is_needed():
     """It is an extra, and a raw `njit(cache=True)` would not notice a change in another file."""
-    rooms = ("fuselog", "pipeline", "replay")
+    rooms = ("fuselog", "pipeline", "recorders", "replay")
     users = {
         path.name
         for room in rooms
