@@ -52,6 +52,7 @@ from fuselog.pipeline.stressing.stressing import stress as stress
 from fuselog.pipeline.stressing.verdicts import Stress as Stress
 from fuselog.pipeline.tuning.outcome import Tuning as Tuning
 from fuselog.pipeline.tuning.tuning import tune as tune
+from fuselog.recorders.compiling.compile import compiled as compiled
 from fuselog.recorders.errors import BadInput as BadInput
 from fuselog.recorders.errors import UnknownName as UnknownName
 from fuselog.recorders.log import Field as Field
@@ -89,7 +90,6 @@ from fuselog.replay.engine.api.outputs import Measured as Measured
 from fuselog.replay.engine.api.outputs import Results as Results
 from fuselog.replay.engine.api.outputs import Solution as Solution
 from fuselog.replay.engine.api.outputs import Solved as Solved
-from fuselog.replay.engine.compiling.compile import compiled as compiled
 from fuselog.replay.engine.replaying.estimator import Batch as Batch
 from fuselog.replay.engine.replaying.estimator import Estimator as Estimator
 from fuselog.replay.engine.replaying.estimator import Recursive as Recursive

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from fuselog.recorders.compiling.compile import core_count, use_cores
 from fuselog.recorders.environment import CORES
 from fuselog.recorders.recording import import_run
-from fuselog.replay.engine.compiling.compile import core_count, use_cores
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 pytest_plugins = ["tests.goldens.keeping"]

@@ -10,12 +10,13 @@ from fuselog.pipeline.api.replays import replay
 from fuselog.pipeline.output.terminal import print_json, print_table, say
 from fuselog.pipeline.runs.executors import inline_pool, processes
 from fuselog.pipeline.runs.inputs import load_scenario, shipped
+from fuselog.recorders.compiling.cache import cache_folder, is_private, kept_files
+from fuselog.recorders.compiling.compile import core_count, is_uncompiled
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.log import loops
 from fuselog.recorders.recording import Importer, Recorder, record_run
 from fuselog.recorders.registry import available, load
 from fuselog.replay.engine import chi2
-from fuselog.replay.engine.compiling.cache import cache_folder, is_private, kept_files
-from fuselog.replay.engine.compiling.compile import core_count, is_uncompiled
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.inference.all_methods import METHODS, modelled
 from fuselog.replay.inference.estimators import registered_models
@@ -52,7 +53,7 @@ def precompile(
     *,
     workers: int | None = None,
 ) -> list[Precompiled]:
-    """Compile and keep what the first replay of models by methods would compile.
+    """Compile and keep what the first replay of models by methods would compile, and what reads its log.
 
     A kernel is made for the sensors that a log has. So the registered scenarios that a model fits are
     recorded, for seconds, and replayed. A log with other sensors compiles its own kernels when it is
@@ -88,6 +89,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
     for model, method in pairs:
         modelled(load("models", model, Model), method)
     _check_cache()
+    loops.load()
     open_pool = inline_pool if (workers or core_count()) == 1 else processes(workers or core_count())
     with open_pool() as pool:
         names = sorted({model for model, _ in pairs})

@@ -21,9 +21,9 @@ import click
 
 from fuselog.pipeline.command_line.group import fuselog
 from fuselog.recorders import environment
+from fuselog.recorders.compiling.trial import require_processor
 from fuselog.recorders.errors import BadInput, printable, without_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here
-from fuselog.replay.engine.compiling.trial import require_processor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
+from fuselog.recorders.compiling.cache import cache_folder, kept_files
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
@@ -18,7 +19,6 @@ from fuselog.recorders.parameters import build, describe
 from fuselog.recorders.plausibility.finding import Finding
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
-from fuselog.replay.engine.compiling.cache import cache_folder, kept_files
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
 from fuselog.replay.engine.replaying.truth import truths_among
 from fuselog.replay.engine.streams.sources import LogSource

@@ -27,8 +27,8 @@ from filelock import FileLock, Timeout
 from fuselog.pipeline.output.results import hash_of
 from fuselog.pipeline.runs.estimates import ERRORS, join_tables
 from fuselog.recorders.atomic import parents_of, settled
+from fuselog.recorders.compiling.cache import is_own, read_own, write_checked
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.cache import is_own, read_own, write_checked
 
 _LOCK, _SUFFIX = "fuselog.lock", ".bin"
 _KEY = re.compile(r"[0-9a-f]{64}")

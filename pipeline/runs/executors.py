@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
+from fuselog.recorders.compiling.compile import use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
-from fuselog.replay.engine.compiling.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
 PAYING_RUNS = 1000
@@ -293,7 +293,8 @@ def version_of_code() -> str:
             _add_sources(digest, Path(place))
         if spec.origin and not spec.submodule_search_locations:
             digest.update(Path(spec.origin).read_bytes())
-    digest.update(" ".join(version(name) for name in ("numpy", "scipy", "llvmlite", "numba")).encode())
+    libraries = filter(find_spec, ("numpy", "scipy", "llvmlite", "numba"))
+    digest.update(" ".join(map(version, libraries)).encode())
     return digest.hexdigest()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.pipeline.sensing.terms import Terms
-from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.recorders.compiling.compile import compiled
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -148,4 +148,4 @@ def filter_samples(
     return total
 
 
-_filter = compiled(filter_samples, allocates=False)
+_filter = compiled(filter_samples)

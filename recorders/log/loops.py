@@ -1,27 +1,24 @@
 """Loops over the bytes of a chunk: finds its records, and compares messages with a layout.
 
-The loops see the bytes as 64-bit words, one of which starts at every byte, so that they compare eight
-bytes at a time. numba compiles them, and takes longer to import than plain Python to go through twenty
-megabytes: the first sixteen are gone through so, in a process that has no other use for numba.
+The loops are kernels (`fuselog.recorders.compiling`), and compiled even if filters are not. They read
+eight bytes at a time as a word, of which LLVM makes one instruction.
 Source: the MCAP specification (mcap.dev/spec), records Message, Schema and Channel.
 """
 
-import sys
-from collections import Counter
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
 # Opcode and length of a record; then channel, sequence and two clocks of a message.
 HEAD_BYTES = 9
 MESSAGE_HEAD_BYTES = HEAD_BYTES + 22
-
-# Bytes that are gone through without numba.
-_left = Counter(plain=16 << 20)
 
 _MESSAGE = int(Opcode.MESSAGE)
 _SCHEMA = int(Opcode.SCHEMA)
@@ -48,8 +45,8 @@ class Pattern(NamedTuple):
 
     size: int
     places: NDArray[np.int64]
-    expected: NDArray[np.uint64]
-    mask: NDArray[np.uint64]
+    expected: NDArray[np.int64]
+    mask: NDArray[np.int64]
 
 
 def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
@@ -61,14 +58,24 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
     """
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
-    mask = words_of(is_fixed)[places]
-    places, mask = places[mask != 0], mask[mask != 0]
-    return Pattern(size, places, words_of(record)[places] & mask, mask)
+    eight = places[:, None] + np.arange(8)
+    words, mask = (np.ascontiguousarray(each[eight]).view("<i8")[:, 0] for each in (record, is_fixed))
+    places, words, mask = places[mask != 0], words[mask != 0], mask[mask != 0]
+    return Pattern(size, places, words & mask, mask)
 
 
 def scan(data: NDArray[np.uint8]) -> Scan:
     """Walk the records of a chunk."""
-    return Scan(*loop_for(_scan, len(data))(words_of(data), len(data)))
+    found = np.empty(len(data) // MESSAGE_HEAD_BYTES, np.int64)
+    declarations = np.empty(len(data) // HEAD_BYTES, np.int64)
+    highest = np.iinfo(np.uint64).max
+    times, sizes = np.array([[highest, 0], [highest, 0]], np.uint64), np.empty(3, np.int64)
+    end = kernel(_scan)(data, found, declarations, times, sizes)
+    count, declared, channels = sizes.tolist()
+    messages, counts, places = (np.zeros(size, np.int64) for size in (count, channels, channels + 1))
+    kernel(_sort)(data, found, messages, counts, places)
+    log_ns, publish_ns = map(tuple, times.tolist())
+    return Scan(messages, counts, declarations[:declared].copy(), log_ns, publish_ns, end)
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
@@ -81,81 +88,106 @@ def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern)
     """
     if offsets[-1] + pattern.size > len(data):
         return False
-    agreed = loop_for(_agree, len(offsets) * pattern.size)
-    return bool(agreed(words_of(data), offsets, pattern.places, pattern.expected, pattern.mask))
+    return kernel(_agree)(data, offsets, pattern.places, pattern.expected, pattern.mask)
 
 
-def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Return the words that start at every byte of `data` but the last seven, without a copy."""
-    count = max(len(data) - 7, 0)
-    return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
-
-
-def loop_for(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
-    """Return the loop to go through so many bytes with."""
-    _left["plain"] -= size
-    if _left["plain"] >= 0 and "numba" not in sys.modules:
-        return np.errstate(over="ignore")(loop)
-    return _compiled(loop)
+def load() -> None:
+    """Compile, or load, the loops that read a log."""
+    record = np.zeros(MESSAGE_HEAD_BYTES, np.uint8)
+    scan(record)
+    agree(record, np.zeros(1, np.int64), pattern_of(record, record))
 
 
 @cache
-def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    from numba import njit
+def kernel(loop: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Return a loop compiled, even if FUSELOG_UNCOMPILED keeps filters from being so."""
+    from fuselog.recorders.compiling.kernels.native import function_of
 
-    # The code is kept beside this file, under its time and size, and names this module: if the module
-    # moves, the file has to change, or what was kept fails to load.
-    return njit(cache=True, nogil=True)(loop)
+    return function_of(loop)
 
 
-def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
-    found = np.empty(size // MESSAGE_HEAD_BYTES, np.int64)
-    channel_ids = np.empty(len(found), np.uint16)
-    declarations = np.empty(size // HEAD_BYTES, np.int64)
-    count, declared, position = 0, 0, np.int64(0)
-    highest = np.uint64(0xFFFFFFFFFFFFFFFF)
-    first_log, last_log, first_publish, last_publish = highest, np.uint64(0), highest, np.uint64(0)
+def word(data: NDArray[np.uint8], place: int) -> int:
+    """Return the number that eight bytes from a place on are, the lowest first; in a kernel signed.
+
+    Args:
+        data: bytes.
+        place: where the number begins.
+    """
+    part, number = data[place : place + 8], 0
+    for k in (7, 6, 5, 4, 3, 2, 1, 0):
+        number = number << 8 | int(part[k])
+    return number
+
+
+def _scan(
+    data: NDArray[np.uint8],
+    found: NDArray[np.int64],
+    declarations: NDArray[np.int64],
+    times: NDArray[np.uint64],
+    sizes: NDArray[np.int64],
+) -> int:
+    """Fill where messages and declarations begin, and the first and last times of messages.
+
+    `sizes` says how many messages and declarations there are, and the number after the last channel's.
+    """
+    size, count, declared, channels, position = len(data), 0, 0, 0, 0
     while position + HEAD_BYTES <= size:
-        opcode = words[position] & np.uint64(0xFF)
-        end = position + HEAD_BYTES + np.int64(words[position + 1])
-        if end > size or end <= position:
+        opcode, length = data[position], word(data, position + 1)
+        if length < 0 or length > size - position - HEAD_BYTES:
             break
         if opcode == _MESSAGE:
-            if end - position < MESSAGE_HEAD_BYTES:
+            if length < MESSAGE_HEAD_BYTES - HEAD_BYTES:
                 break
             found[count] = position
-            channel_ids[count] = words[position + 8] >> np.uint64(8) & np.uint64(0xFFFF)
+            channels = max(channels, _channel(data, position) + 1)
             count += 1
-            log, publish = words[position + 15], words[position + 23]
-            first_log, last_log = min(first_log, log), max(last_log, log)
-            first_publish, last_publish = min(first_publish, publish), max(last_publish, publish)
+            for k in (0, 1):
+                time = np.uint64(word(data, position + 15 + 8 * k))
+                times[k, 0] = min(times[k, 0], time)
+                times[k, 1] = max(times[k, 1], time)
         elif opcode in (_SCHEMA, _CHANNEL):
             declarations[declared] = position
             declared += 1
-        position = end
-    counts = np.zeros(channel_ids[:count].max() + 1 if count else 0, np.int64)
-    for channel_id in channel_ids[:count]:
-        counts[channel_id] += 1
-    messages = np.empty(count, np.int64)
-    places = np.cumsum(counts) - counts
-    for row in range(count):
-        messages[places[channel_ids[row]]] = found[row]
-        places[channel_ids[row]] += 1
-    return (
-        messages,
-        counts,
-        declarations[:declared].copy(),
-        (first_log, last_log),
-        (first_publish, last_publish),
-        position,
-    )
+        position += HEAD_BYTES + length
+    sizes[0], sizes[1], sizes[2] = count, declared, channels
+    return position
 
 
-def _agree(words, offsets, places, expected, mask):  # type: ignore[no-untyped-def]
-    for offset in offsets:
-        wrong = np.uint64(0)
+def _channel(data: NDArray[np.uint8], position: int) -> int:
+    """Return the channel of the message at a place."""
+    return word(data, position + 9) & 0xFFFF
+
+
+def _sort(
+    data: NDArray[np.uint8],
+    found: NDArray[np.int64],
+    messages: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    places: NDArray[np.int64],
+) -> None:
+    """Lay out what was found channel by channel, and count each channel's; `places` is to work in."""
+    for row in range(len(messages)):
+        counts[_channel(data, found[row])] += 1
+    for channel in range(len(counts)):
+        places[channel + 1] = places[channel] + counts[channel]
+    for row in range(len(messages)):
+        channel = _channel(data, found[row])
+        messages[places[channel]] = found[row]
+        places[channel] += 1
+
+
+def _agree(
+    data: NDArray[np.uint8],
+    offsets: NDArray[np.int64],
+    places: NDArray[np.int64],
+    expected: NDArray[np.int64],
+    mask: NDArray[np.int64],
+) -> bool:
+    """Tell whether all records have the expected words where the mask is set."""
+    for row in range(len(offsets)):
+        wrong = 0
         for k in range(len(places)):
-            wrong |= (words[offset + places[k]] ^ expected[k]) & mask[k]
+            wrong |= (word(data, offsets[row] + places[k]) ^ expected[k]) & mask[k]
         if wrong:
             return False
     return True

@@ -27,7 +27,7 @@ def varying(axes: int, **of_fields: int) -> Callable[[Kind], Kind]:
     """Mark a NamedTuple of arrays by how many of their first axes vary from log to log.
 
     The sizes of all other axes are part of a kernel that gets them; see
-    `fuselog.replay.engine.compiling.kernels.native`. Of what is not marked these are the first axis, the
+    `fuselog.recorders.compiling.kernels.native`. Of what is not marked these are the first axis, the
     runs or messages, and none of a core's scratch.
     """
 

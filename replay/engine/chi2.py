@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 
 # One number, or an array of them, as what is given.
 Numbers = Any  # type: ignore[explicit-any]
@@ -150,5 +150,5 @@ def _solve(
         found[run] = 2.0 * value
 
 
-_tails = compile_over_runs(_tail, allocates=False)
-_quantiles = compile_over_runs(_solve, allocates=False)
+_tails = compile_over_runs(_tail)
+_quantiles = compile_over_runs(_solve)

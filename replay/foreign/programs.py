@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import Field, create_model
 
 from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import RunMetadata, Stream, Topic, schemas, write_log
 from fuselog.recorders.parameters import build, has_role
-from fuselog.replay.engine.compiling.compile import core_count
 from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from fuselog.replay.engine.replaying.truth import TRUTH, truths_among
 from fuselog.replay.engine.streams.blocks import Ragged, gather

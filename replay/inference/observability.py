@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.replaying.estimator import AnyEstimator
 from fuselog.replay.engine.streams.blocks import Ragged, copied, run_of_rows
 from fuselog.replay.engine.vectors.tangent import named_now, tangent_components
@@ -184,7 +184,7 @@ def _summing(stage: Stage) -> tuple[OverRuns, Steps]:
     steps = gramian_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "observability")
-    return compile_over_runs(recursion(stage, steps, settings_of), allocates=False, title=title), steps
+    return compile_over_runs(recursion(stage, steps, settings_of), title=title), steps
 
 
 class Observability(IteratedSmoother):

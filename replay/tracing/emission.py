@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.functions import FUNCTIONS
+from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
     Emitter,
     Number,

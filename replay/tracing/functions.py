@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.identity import digest_of
+from fuselog.recorders.compiling.kernels.numbers import REAL, Emitter, Number, constant
+from fuselog.recorders.compiling.kernels.program import Instance, Program, called
+from fuselog.recorders.compiling.kernels.values import Array, Record, entries, load, part_of, store
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.identity import digest_of
-from fuselog.replay.engine.compiling.kernels.numbers import REAL, Emitter, Number, constant
-from fuselog.replay.engine.compiling.kernels.program import Instance, Program, called
-from fuselog.replay.engine.compiling.kernels.values import Array, Record, entries, load, part_of, store
 from fuselog.replay.tracing.derivatives import slopes_of
 from fuselog.replay.tracing.emission import emit, python_of
 from fuselog.replay.tracing.graph import INPUT, Graph, Node, described, needed
@@ -101,7 +101,7 @@ class TracedFunction:
         )
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
-        """Write a call of it; see `fuselog.replay.engine.compiling.kernels.expressions`."""
+        """Write a call of it; see `fuselog.recorders.compiling.kernels.expressions`."""
         numbers = _called(program, emitter, self, self.outputs, arguments)
         count = len(self.result.returned)
         for (argument, place, _), number in zip(self.result.written, numbers[count:], strict=True):

@@ -230,7 +230,7 @@ def test_processes_are_started_in_known_places() -> None:
         ("replay/foreign/processes/isolation.py", "start_module"),
         ("replay/foreign/processes/orphans.py", "start_module"),
         ("replay/foreign/processes/process.py", "Popen"),  # a program that the user names
-        ("replay/engine/compiling/trial.py", "start_module"),
+        ("recorders/compiling/trial.py", "start_module"),
         ("replay/timeline/viewer.py", "start_module"),
     }
     python = {path.as_posix() for path in PATHS if "sys.executable" in text_of(path)}
@@ -245,8 +245,8 @@ def test_environment_variables_are_read_in_one_place() -> None:
         "pipeline/output/terminal.py",
         "recorders/environment.py",
         "recorders/processes.py",
-        "replay/engine/compiling/compile.py",
-        "replay/engine/compiling/kernels/native.py",
+        "recorders/compiling/compile.py",
+        "recorders/compiling/kernels/native.py",
         "replay/timeline/viewer.py",
     }
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import fuselog as fl
-from fuselog.replay.engine.compiling.cache import kept_files, write_checked
+from fuselog.recorders.compiling.cache import kept_files, write_checked
 
 
 @pytest.fixture

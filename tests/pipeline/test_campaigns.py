@@ -258,7 +258,7 @@ class Dying(InlineExecutor):
 CORES_THERE = (
     "(__import__('scipy.linalg'), "
     "{each['num_threads'] for each in __import__('threadpoolctl').threadpool_info()}, "
-    "__import__('fuselog.replay.engine.compiling.compile', fromlist=['']).core_count())[1:]"
+    "__import__('fuselog.recorders.compiling.compile', fromlist=['']).core_count())[1:]"
 )
 
 

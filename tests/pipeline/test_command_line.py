@@ -496,8 +496,8 @@ HEAVY = (
     *("matplotlib", "rerun", "pandas", "pyarrow", "sklearn", "h5py", "rosbags.typesys", "rich.progress"),
     "scipy",
 )
-# What compiles and loads kernels.
-KERNELS = ("fuselog.replay.engine.compiling.kernel_cache", "fuselog.replay.engine.compiling.inlining")
+# What compiles and loads kernels; logs are read by kernels, too, but never by numba's.
+KERNELS = ("numba", "fuselog.recorders.compiling.kernels.native")
 
 # What a list needs nothing of: what it lists.
 LISTED = (
@@ -516,7 +516,7 @@ LISTED = (
         # in one process, one after the other: each may import what those before it may not
         {
             **dict.fromkeys(["scenarios", "estimators", "models", "metrics", "experiments"], LISTED),
-            "info log.mcap": (*HEAVY, *KERNELS, "concurrent.futures.process"),
+            "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process"),
             "scenarios landmarks": HEAVY,
             "estimators ekf": (),
         },

@@ -69,14 +69,16 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stated = tomllib.loads(project)["project"]
     code = "\n\n".join(_blocks("python"))
     (folder / "radio.py").write_text(code)
-    in_python = code.replace("follow=follow,\n", "follow=follow,\n    compiled=False,\n")
-    assert in_python != code
-    (folder / "plain.py").write_text(in_python.replace('"nearest"', '"plain"'))
+    for name, option in (("plain", "compiled=False"), ("arrays", "allocates=True")):
+        changed = code.replace("    allocates=False,\n", f"    {option},\n")
+        assert changed != code
+        (folder / f"{name}.py").write_text(changed)
     (folder / "radio.toml").write_text("\n".join(experiment))
     (folder / "broken.py").write_text(BROKEN)
     groups = stated["entry-points"]
     groups["fuselog.estimators"] |= {
         "plain": "plain:NEAREST",
+        "arrays": "arrays:NEAREST",
         "divide": "broken:DIVIDE",
         "choosy": "broken:CHOOSY",
         "number": "broken:NUMBER",
@@ -147,13 +149,14 @@ def test_ours_are_made_as_those_of_others() -> None:
     }
 
 
-def _run(package: Path, commands: list[str]) -> list[dict[str, Any]]:
+def _run(package: Path, commands: list[str], *, without: str = "") -> list[dict[str, Any]]:
     """Run commands in one process that has the package: exit code, output and errors of each.
 
-    Figures are written without being drawn, as by `blank_figures`.
+    Figures are written without being drawn, as by `blank_figures`; a library may be missing.
     """
     code = (
         "import sys, json, io, shlex; from contextlib import *\n"
+        f"sys.modules |= dict.fromkeys({without.split()})\n"
         "from fuselog.pipeline.command_line import main\n"
         "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "for line in json.load(sys.stdin):\n"
@@ -248,6 +251,32 @@ def test_what_the_page_compiles_is_what_it_says(package: Path, said: dict[str, d
         one, two = (read_streams(log, [each])[each] for each in topics)
         for name, column in one.columns.items():
             np.testing.assert_allclose(column, two[name], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.paper
+def test_only_a_recursion_that_makes_arrays_needs_numba(package: Path) -> None:
+    """Without numba all else works, also reading a long log; what needs it says so in one sentence."""
+    commands = [
+        "fuselog record landmarks --set duration_s=600 --set robots=5 --compression none -o long.mcap",
+        "fuselog info long.mcap",
+        "fuselog replay long.mcap -e dead-reckoning",
+        "fuselog record landmarks --set duration_s=10 --out robot.mcap",
+        "fuselog replay robot.mcap -e ekf -e ukf",
+        "fuselog diagnose robot.mcap -e ekf",
+        "fuselog record beacons --set duration_s=5 --out heard.mcap",
+        "fuselog replay heard.mcap -e nearest",
+        "fuselog replay heard.mcap -e arrays --out arrays.mcap",
+    ]
+    *others, last = _run(package, commands, without="numba")
+    assert (package / "long.mcap").stat().st_size > 20e6
+    assert [each["code"] for each in others] == [0] * 8, others
+    assert last["code"] == 2
+    assert re.fullmatch(
+        r"fuselog: estimator arrays/walker: follow is compiled by numba, which cannot be imported "
+        r"\(.*\); pip install 'fuselog\[numba\]', or set .*\n",
+        last["err"],
+    )
+    assert not (package / "arrays.mcap").exists()
 
 
 @pytest.mark.paper

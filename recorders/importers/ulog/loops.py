@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.log.loops import loop_for, words_of
+from fuselog.recorders.log.loops import kernel, word
 
 HEAD_BYTES = 3
 # So many rows after one another, whose lengths are those of their topics, are no chance.
@@ -65,8 +65,10 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
         data: the piece, and at least `BEYOND_BYTES` more.
         size: how many bytes the piece has.
     """
-    found, others, end, is_broken = loop_for(_walk, size)(words_of(data), size)
-    return Walk(found, others, int(end), bool(is_broken))
+    found, others, sizes = (np.empty(count, np.int64) for count in (size // 5 + 1, size // 3 + 1, 3))
+    is_broken = kernel(_walk)(data, size, found, others, sizes)
+    count, other, end = sizes.tolist()
+    return Walk(found[:count].copy(), others[:other].copy(), end, is_broken)
 
 
 def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
@@ -82,7 +84,7 @@ def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Kn
     Returns:
         The byte of the piece; -1 where there is none.
     """
-    return int(loop_for(_resume, size)(words_of(data), begin, size, place, known))
+    return kernel(_resume)(data, begin, size, place, known)
 
 
 def sort(
@@ -102,88 +104,112 @@ def sort(
         times: in us: a stamp lies between the first two, and not at them; the third is the latest so
             far.
     """
-    words = words_of(data)
-    return Sorted(*loop_for(_sort, 64 * len(at))(words, words.view("<i8"), at, place, known, times))
+    whose, stamps = np.empty((2, len(at)), np.int64)
+    is_timed = np.empty(len(at), np.bool_)
+    reached, counts = np.empty(len(at) + 1, np.int64), np.zeros(NUMBERS + 1, np.int64)
+    size = kernel(_examine)(data, at, place, known, times, whose, stamps, is_timed, reached, counts)
+    order, places = np.empty(size, np.int64), np.cumsum(counts) - counts
+    kernel(_sort)(whose[:size], places, order)
+    return Sorted(order, counts, stamps[:size], is_timed[:size], reached[: size + 1])
 
 
-def _sort(words, numbers, at, place, known, times):  # type: ignore[no-untyped-def]
-    least, most, stamp_at, since, until = known
+def _length(data: NDArray[np.uint8], position: int) -> int:
+    """Return how many bytes follow the head of the message at a place."""
+    return word(data, position) & 0xFFFF
+
+
+def _kind(data: NDArray[np.uint8], position: int) -> int:
+    """Return which kind of message is at a place: a letter."""
+    return word(data, position) >> 16 & 0xFF
+
+
+def _number(data: NDArray[np.uint8], position: int) -> int:
+    """Return the number that a row at a place has its topic by."""
+    return word(data, position) >> 24 & 0xFFFF
+
+
+def _examine(
+    data: NDArray[np.uint8],
+    at: NDArray[np.int64],
+    place: int,
+    known: Known,
+    times: tuple[int, int, int],
+    whose: NDArray[np.int64],
+    stamps: NDArray[np.int64],
+    is_timed: NDArray[np.bool_],
+    reached: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> int:
+    """Fill whose the rows are, and their stamps, up to the first of a wrong length; count them."""
     low, high, latest = times
-    size = len(at)
-    whose = np.empty(size, np.int64)
-    stamps = np.zeros(size, np.int64)
-    is_timed = np.zeros(size, np.bool_)
-    reached = np.empty(size + 1, np.int64)
-    counts = np.zeros(NUMBERS + 1, np.int64)
-    for row in range(size):
+    for row in range(len(at)):
         position = at[row]
-        head = words[position]
-        number = np.int64(head >> np.uint64(24) & np.uint64(0xFFFF))
-        length = np.int64(head & np.uint64(0xFFFF)) - 2
-        if length < least[number] or length > most[number]:
-            size = row
-            break
         reached[row] = latest
-        if since[number] <= place + position < until[number]:
-            stamp = numbers[position + 5 + stamp_at[number]]
-            stamps[row] = stamp
-            if stamp != 0 and low < stamp < high:
+        number, length = _number(data, position), _length(data, position) - 2
+        if length < known.least[number] or length > known.most[number]:
+            return row
+        stamps[row], is_timed[row] = 0, False
+        if known.since[number] <= place + position < known.until[number]:
+            stamps[row] = word(data, position + 5 + known.stamp[number])
+            if stamps[row] != 0 and low < stamps[row] < high:
                 is_timed[row] = True
-                latest = max(latest, stamp)
+                latest = max(latest, stamps[row])
         else:
-            number = np.int64(NUMBERS)
+            number = NUMBERS
         whose[row] = number
         counts[number] += 1
-    reached[size] = latest
-    order = np.empty(size, np.int64)
-    places = np.cumsum(counts) - counts
-    for row in range(size):
+    reached[len(at)] = latest
+    return len(at)
+
+
+def _sort(whose: NDArray[np.int64], places: NDArray[np.int64], order: NDArray[np.int64]) -> None:
+    """Fill which rows come after one another, number by number; `places` has where each begins."""
+    for row in range(len(whose)):
         order[places[whose[row]]] = row
         places[whose[row]] += 1
-    return order, counts, stamps[:size], is_timed[:size], reached[: size + 1]
 
 
-def _walk(words, size):  # type: ignore[no-untyped-def] # numba infers the types
-    data = np.empty(size // 5 + 1, np.int64)
-    others = np.empty(size // 3 + 1, np.int64)
-    count, other, position = 0, 0, np.int64(0)
-    is_broken = False
+def _walk(
+    data: NDArray[np.uint8],
+    size: int,
+    found: NDArray[np.int64],
+    others: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+) -> bool:
+    """Fill where messages begin, their counts and where they end; tell whether the next can be none."""
+    count, other, position, is_broken = 0, 0, 0, False
     while position + 3 <= size:
-        word = words[position]
-        length = np.int64(word & np.uint64(0xFFFF))
-        kind = np.int64(word >> np.uint64(16) & np.uint64(0xFF))
+        length, kind = _length(data, position), _kind(data, position)
         if length == 0 or kind < 65 or kind > 90:
             is_broken = True
             break
-        end = position + 3 + length
-        if end > size:
+        if position + 3 + length > size:
             break
         if kind == 68:
             if length < 2:
                 is_broken = True
                 break
-            data[count] = position
+            found[count] = position
             count += 1
         else:
             others[other] = position
             other += 1
-        position = end
-    return data[:count].copy(), others[:other].copy(), position, is_broken
+        position += 3 + length
+    sizes[0], sizes[1], sizes[2] = count, other, position
+    return is_broken
 
 
-def _resume(words, begin, size, place, known):  # type: ignore[no-untyped-def]
-    least, most, _, since, until = known
+def _resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
+    """Find the first byte from which several rows of known lengths follow one another."""
     for first in range(begin, size - 5):
-        position, count = np.int64(first), 0
+        position, count = first, 0
         while count < CHAIN and position + 5 <= size:
-            head = words[position]
-            number = np.int64(head >> np.uint64(24) & np.uint64(0xFFFF))
-            length = np.int64(head & np.uint64(0xFFFF)) - 2
-            if np.int64(head >> np.uint64(16) & np.uint64(0xFF)) != 68:
+            number, length = _number(data, position), _length(data, position) - 2
+            if _kind(data, position) != 68:
                 break
-            if not since[number] <= place + position < until[number]:
+            if not known.since[number] <= place + position < known.until[number]:
                 break
-            if length < least[number] or length > most[number]:
+            if length < known.least[number] or length > known.most[number]:
                 break
             position += length + 5
             count += 1

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged
 
 Floats = NDArray[np.float64]
@@ -115,4 +115,4 @@ def count_intervals(
         last_ns = time_ns[row]
 
 
-_count_intervals = compile_over_runs(count_intervals, allocates=False)
+_count_intervals = compile_over_runs(count_intervals)

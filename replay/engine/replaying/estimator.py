@@ -16,11 +16,11 @@ from typing import Any, Generic, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.kernels.program import DoesNotCompile
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, Stream, Topic
 from fuselog.recorders.parameters import Parameters, ParametersType, build, merge, nested
 from fuselog.recorders.registry import foreign_code, load
-from fuselog.replay.engine.compiling.kernel_source import DoesNotCompile
 from fuselog.replay.engine.renamed import renamed
 from fuselog.replay.engine.replaying.truth import refuse_truths, truths_among
 from fuselog.replay.engine.streams.blocks import Block, Ragged

@@ -16,11 +16,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.notices import seconds_done_once
+from fuselog.recorders.compiling.scratch import Scratch
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, make_stream, schemas
 from fuselog.recorders.log.planes import Origin, in_plane
-from fuselog.replay.engine.compiling.notices import seconds_done_once
-from fuselog.replay.engine.compiling.scratch import Scratch
 from fuselog.replay.engine.replaying.coverage import Coverage
 from fuselog.replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from fuselog.replay.engine.replaying.usage import Usage

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.vectors.covariances import ROUNDING
 
 Floats = NDArray[np.float64]
@@ -89,4 +89,4 @@ def find_unsound(
         last_ns = time_ns[row]
 
 
-unsound_over_runs = compile_over_runs(find_unsound, allocates=False)
+unsound_over_runs = compile_over_runs(find_unsound)

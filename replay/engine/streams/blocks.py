@@ -9,9 +9,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.log import Clock, Stream
 from fuselog.replay.engine.arrays import AnyArray, Columns, RowSlice
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.failures import join_streams
 
 Found = TypeVar("Found")
@@ -316,4 +316,4 @@ def merge_run(
         heads[first] += 1
 
 
-_merge = compile_over_runs(merge_run, allocates=False)
+_merge = compile_over_runs(merge_run)

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.models.orientation import require_unit
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.directional.distributions import bingham
 from fuselog.replay.families.directional.distributions.bingham import Bingham
 from fuselog.replay.families.directional.distributions.bingham_kernels import (
@@ -95,7 +95,7 @@ class GaussianNoise(NamedTuple):
 
 @cache
 def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(run_once, allocates=False)
+    return compile_over_runs(run_once)
 
 
 def run_bingham_filter(

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.families.directional.headings import turn_together
 from fuselog.recorders.models.planar import Component, wrap_angle
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.families.directional.distributions.gaussian_kernels import condition
 from fuselog.replay.families.directional.distributions.wrapped_normal import (
@@ -176,7 +176,7 @@ def _run(
 def _over_runs(step: MakeStep, motion: Motion) -> OverRuns:
     """Compile the loop of a filter: what `step` makes processes a row, whose state is written down."""
     loop = over_events(step(motion), _write, fails=False)
-    return compile_over_runs(loop, allocates=False, title="a filter of headings")
+    return compile_over_runs(loop, title="a filter of headings")
 
 
 def _write(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, schemas
 from fuselog.recorders.parameters import Parameters
@@ -23,7 +24,6 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.api.functions import recursive
 from fuselog.replay.engine.api.inputs import Binding, Given
 from fuselog.replay.engine.arrays import Booleans, Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged, run_of_rows
 from fuselog.replay.engine.streams.channels import given_or_stated, numbered
 from fuselog.replay.engine.streams.failures import Failure
@@ -111,9 +111,7 @@ def memory(states: int) -> RobotMemory:
     )
 
 
-_cooperate = compile_over_runs(
-    over_events(cooperate, write_pose), allocates=False, title="robots that see each other"
-)
+_cooperate = compile_over_runs(over_events(cooperate, write_pose), title="robots that see each other")
 
 
 Cooperating = Given[CooperativeParameters]

@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.networks.estimates import (
     Estimate,
     Fused,
@@ -296,7 +296,7 @@ def fuse_run(
     fusions.gap[run] = fuse_by(rule, count, parts, into, tolerance, memory)
 
 
-_fuse_runs = compile_over_runs(fuse_run, allocates=False)
+_fuse_runs = compile_over_runs(fuse_run)
 
 
 def fuse(

@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, schemas
 from fuselog.recorders.parameters import Parameters
@@ -21,7 +22,6 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.api.functions import batch
 from fuselog.replay.engine.api.inputs import Binding, Given
 from fuselog.replay.engine.arrays import Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 from fuselog.replay.engine.streams.channels import numbered
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, states_in
@@ -81,7 +81,7 @@ class NetworkParameters(Parameters):
     lie_after_s: NonNegativeFloat = 0.0
 
 
-_follow = compile_over_runs(following(), allocates=False, title="the nodes of a network")
+_follow = compile_over_runs(following(), title="the nodes of a network")
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:

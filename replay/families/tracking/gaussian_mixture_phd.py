@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, make_stream, schemas
 from fuselog.recorders.log.planes import frame_of, in_frame
@@ -23,7 +24,6 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.api.functions import recursive
 from fuselog.replay.engine.api.inputs import Binding, Given
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged
 from fuselog.replay.engine.streams.channels import bindings, given_or_stated
 from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
@@ -82,7 +82,7 @@ class PhdParameters(Parameters):
     most_components: PositiveInt = 100
 
 
-_filter = compile_over_runs(over_events(process, extract), allocates=False, title="a PHD filter")
+_filter = compile_over_runs(over_events(process, extract), title="a PHD filter")
 
 
 Filtering = Given[PhdParameters]

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, make_stream, schemas
 from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
@@ -28,7 +29,6 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.api.functions import recursive
 from fuselog.replay.engine.api.inputs import Binding, Given
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged
 from fuselog.replay.engine.streams.measurements import PLANE, read_vectors
 from fuselog.replay.families.tracking.association.clusters import Weights, memory_for
@@ -79,7 +79,7 @@ class ReportTrackerParameters(Parameters):
     forget_s: PositiveFloat = 7200.0
 
 
-_track = compile_over_runs(over_stamps(track), allocates=False, title="tracks of reports")
+_track = compile_over_runs(over_stamps(track), title="tracks of reports")
 
 
 Reporting = Given[ReportTrackerParameters]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeInt
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.families.vehicles.models import turn
 from fuselog.recorders.log import Topic
@@ -22,7 +23,6 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.api.functions import recursive
 from fuselog.replay.engine.api.inputs import Binding, Given
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.engine.streams.blocks import Block, Ragged
 from fuselog.replay.families.vehicles.association import (
     all_maps,
@@ -60,7 +60,7 @@ KINDS = {
     "associations": "associations, a Kalman filter each (Rao-Blackwellised)",
 }
 LEAST_EFFECTIVE_SHARE = 0.5
-_choose = compiled(choose_systematically, allocates=False)
+_choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):

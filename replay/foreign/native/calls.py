@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.numbers import REAL, WHOLE, Emitter, Number
-from fuselog.replay.engine.compiling.kernels.program import Program
-from fuselog.replay.engine.compiling.kernels.values import Array
+from fuselog.recorders.compiling.kernels.numbers import REAL, WHOLE, Emitter, Number
+from fuselog.recorders.compiling.kernels.program import Program
+from fuselog.recorders.compiling.kernels.values import Array
 
 _LLVM = {"i32": "i32", "i64": "i64", "pointer": "ptr", "void": "void"}
 _C: dict[str, Any] = {
@@ -45,7 +45,7 @@ class Call:
         return f"call of {self.__name__}: {' '.join(self._kinds)} -> {self._returns}"
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Number:  # noqa: ARG002
-        """Write a call; see `fuselog.replay.engine.compiling.kernels.expressions`."""
+        """Write a call; see `fuselog.recorders.compiling.kernels.expressions`."""
         address, *others = arguments
         given = ", ".join(
             f"{_LLVM[kind]} {_passed(emitter, each, kind)}"

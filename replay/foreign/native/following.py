@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats, Integers, varying
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import copied, filled_rows
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.foreign.description import Description
@@ -211,7 +211,7 @@ def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made
 
 @lru_cache(maxsize=1)
 def _loop() -> OverRuns:
-    return compile_over_runs(follow, allocates=False, title="filters of a library")
+    return compile_over_runs(follow, title="filters of a library")
 
 
 def reason_of_code(code: int, description: Description) -> str:

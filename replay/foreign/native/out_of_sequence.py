@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Integers, varying
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged, join
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.foreign.description import Description
@@ -132,7 +132,7 @@ def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
 @lru_cache(maxsize=1)
 def _loop() -> OverRuns:
     title = "filters of a library, which go back for late messages"
-    return compile_over_runs(follow_as_arrived, allocates=False, title=title)
+    return compile_over_runs(follow_as_arrived, title=title)
 
 
 def follow_all_as_arrived(

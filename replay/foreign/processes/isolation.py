@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, TypeVar
 import psutil
 
 from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.processes import start_module
-from fuselog.replay.engine.compiling.compile import core_count
 from fuselog.replay.engine.streams.blocks import copied
 from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.foreign.description import Description, ForeignParameters

@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
+from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput, printable
-from fuselog.replay.engine.compiling.compile import core_count
 from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.foreign.description import Description, read_description
 from fuselog.replay.foreign.native.following import (

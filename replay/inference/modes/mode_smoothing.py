@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.inference.modes.mixing import transition_matrix
 
 
@@ -29,7 +29,7 @@ def smoothing_memory(modes: int) -> SmoothingMemory:
 @lru_cache(maxsize=16)
 def smoothing_over_runs(modes: int) -> OverRuns:
     """Compile `smoothing` over all runs."""
-    return compile_over_runs(smoothing(modes), allocates=False, title="the smoother of modes")
+    return compile_over_runs(smoothing(modes), title="the smoother of modes")
 
 
 def smoothing(modes: int) -> RunOnce:

@@ -7,9 +7,9 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, NonNegativeInt, model_validator
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Columns, Integers
-from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.engine.philox import WORDS, fill_normals, run_key
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import reason_stream
@@ -126,7 +126,7 @@ def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
     )
 
 
-_draw_normals = compiled(fill_normals, allocates=False)
+_draw_normals = compiled(fill_normals)
 
 
 class ParticleFilter(Filter):

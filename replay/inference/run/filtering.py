@@ -7,14 +7,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.notices import done_once
+from fuselog.recorders.compiling.scratch import Scratch
 from fuselog.recorders.log import Topic, schemas
 from fuselog.recorders.log.planes import in_frame
 from fuselog.recorders.log.streams import computed_stream
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Integers, RowSlice
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.notices import done_once
-from fuselog.replay.engine.compiling.scratch import Scratch
 from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.priors import gaussians
@@ -114,7 +114,7 @@ def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
     title = title_of(stage.model, method.summary)
-    return compile_over_runs(loop, allocates=False, title=title), steps
+    return compile_over_runs(loop, title=title), steps
 
 
 def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) -> tuple[Sampler, ...]:

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.log import make_stream, schemas
 from fuselog.replay.engine.arrays import Columns, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of
 from fuselog.replay.inference.kalman.methods import Method
@@ -79,7 +79,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverR
     reads = reading_settings(number_fields(stage.model.parameters))
     loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
     title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
-    return compile_over_runs(loop, allocates=False, title=title), steps
+    return compile_over_runs(loop, title=title), steps
 
 
 def reprocessing(

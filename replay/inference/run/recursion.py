@@ -336,7 +336,7 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
-    """Make the loop over events, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over events, for `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
 

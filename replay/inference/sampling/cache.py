@@ -1,6 +1,6 @@
 """Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
 
-A file (see `fuselog.replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named
+A file (see `fuselog.recorders.compiling.cache`) holds a NumPy npz archive whose members are named
 after their sets. Common sets ship with the package (see `sampling.ship`); others are kept
 in the user's cache.
 """
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fuselog.recorders.compiling.cache import cache_folder, is_private, read_checked, write_checked
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.cache import cache_folder, is_private, read_checked, write_checked
 from fuselog.replay.inference.sampling.distance import Array
 from fuselog.replay.inference.sampling.lcd import (
     Report,

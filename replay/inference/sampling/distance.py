@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compiled
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def _sum_pairs(coordinates: Array, weights: Array, gradient: Array, work: Array)
     return B_MAX**2 * total
 
 
-_pair_sum = compiled(_sum_pairs, allocates=False)
+_pair_sum = compiled(_sum_pairs)
 
 
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:

@@ -18,8 +18,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.inference.kalman.steps import (
     CoreMemory,
     InnovationRecord,
@@ -219,9 +219,7 @@ class BackMemory(NamedTuple):
 @lru_cache(maxsize=64)
 def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> OverRuns:
     """Compile the same over all runs; see `backward_pass`."""
-    return compile_over_runs(
-        backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
-    )
+    return compile_over_runs(backward_pass(kinds, correct), title="a smoother's way back")
 
 
 class GoBack(Protocol):

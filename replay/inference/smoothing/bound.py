@@ -17,10 +17,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Topic, make_stream, schemas
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers, RowSlice
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.results import named
 from fuselog.replay.engine.vectors.components import match_components
@@ -67,7 +67,7 @@ def back_memory(t: int) -> BackMemory:
 @lru_cache(maxsize=1)
 def smooth_over_runs() -> OverRuns:
     """Compile `smooth` over all runs."""
-    return compile_over_runs(smooth, allocates=False, title="the bound of smoothers")
+    return compile_over_runs(smooth, title="the bound of smoothers")
 
 
 def smooth(

@@ -8,9 +8,9 @@ lag has. Where the means of a manifold have a part in the steps they do not comp
 from functools import lru_cache
 from typing import NamedTuple
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
 from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
 from fuselog.replay.inference.smoothing.backward_pass import BackMemory, Nodes, Piece, Smoothed, compose
@@ -35,7 +35,7 @@ class Window(NamedTuple):
 @lru_cache(maxsize=64)
 def sliding_over_runs(kinds: tuple[str, ...]) -> OverRuns:
     """Compile the same over all runs; see `sliding`."""
-    return compile_over_runs(sliding(kinds), allocates=False, title="a smoother with a fixed lag")
+    return compile_over_runs(sliding(kinds), title="a smoother with a fixed lag")
 
 
 def sliding(kinds: tuple[str, ...]) -> RunOnce:

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
+from fuselog.recorders.compiling.kinds import RunOnce
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
-from fuselog.replay.engine.compiling.kinds import RunOnce
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import Gaussian, Steps
 from fuselog.replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
@@ -96,7 +96,7 @@ def searching(stage: Stage) -> tuple[OverRuns, Steps]:
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "iterated smoother")
-    return compile_over_runs(search(stage, steps, settings_of), allocates=False, title=title), steps
+    return compile_over_runs(search(stage, steps, settings_of), title=title), steps
 
 
 def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.through_numba import numba_over_runs
 from fuselog.replay.families.directional.distributions.bingham import Bingham
 from fuselog.replay.families.directional.distributions.bingham_kernels import (
     predict,
@@ -53,7 +53,7 @@ def filter_runs(
 @cache
 def compiled() -> Callable[..., None]:
     """The loop over the runs."""
-    return compile_over_runs(filter_run)
+    return numba_over_runs(filter_run)
 
 
 def filter_run(

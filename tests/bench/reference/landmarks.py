@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from tests.bench.reference.gaussian import (
     ALL_WELL,
     NOT_FINITE,
@@ -272,7 +272,7 @@ def compiled(kind: str, kappa: float = 0.0) -> Function:
     Its arguments are runs, events, positions, settings, carried, poses, looks.
     """
     steps = {"ekf": linearised, "ukf": sampled}[kind](MODELS)
-    loop = compile_over_runs(localization(steps), allocates=False)
+    loop = compile_over_runs(localization(steps))
     scratch = partial(_scratch, steps.memory, unscented(3, kappa))
     return partial(loop, scratch=scratch)
 

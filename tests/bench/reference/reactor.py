@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from tests.bench.reference import c
 from tests.bench.reference.gaussian import (
     ALL_WELL,
@@ -171,7 +171,7 @@ def compiled() -> Function:
 
     Its arguments are runs, offsets, time_ns, measured, noise, gate, carried, results, and `scratch`.
     """
-    return compile_over_runs(stepwise(Steps(predict_sampled, innovate)), allocates=False)
+    return compile_over_runs(stepwise(Steps(predict_sampled, innovate)))
 
 
 def scratch(sets: SampleSets) -> tuple[Innovation, SampleMemory]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.replay.engine.through_numba import numba_over_runs
 from fuselog.replay.families.directional.distributions.gaussian_kernels import condition
 from fuselog.replay.families.directional.distributions.wrapped_normal import WrappedNormal
 from fuselog.replay.families.directional.distributions.wrapped_normal_kernels import (
@@ -67,7 +67,7 @@ def compiled(step: Callable[..., None]) -> Callable[..., None]:
             estimates.mean[row] = state.mean[run]
             estimates.covariance[row] = state.covariance[run]
 
-    return compile_over_runs(run_once)
+    return numba_over_runs(run_once)
 
 
 def toroidal_step(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 from tests.bench.reference.gaussian import Floats, Function
 
 
@@ -148,4 +148,4 @@ def follow(run: int, motion: Motion, messages: Messages, state: State, results: 
 @cache
 def compiled() -> Function:
     """The loop over the runs: (runs, motion, messages, state, results), which fills the last two."""
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(follow)

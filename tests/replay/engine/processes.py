@@ -19,8 +19,8 @@ from typing import Any
 _CONTEXT: Any = get_context("forkserver" if "forkserver" in get_all_start_methods() else "spawn")
 _CONTEXT.set_forkserver_preload(
     [
-        "fuselog.replay.engine.compiling.compile",
-        "fuselog.replay.engine.compiling.through_numba",
+        "fuselog.recorders.compiling.compile",
+        "fuselog.replay.engine.through_numba",
         "numba.core.typing.npydecl",
         __name__,
     ]

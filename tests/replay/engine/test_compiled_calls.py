@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
 from fuselog.replay.families.tracking.association.association import marginals
 
 
@@ -37,10 +37,10 @@ def double(values: np.ndarray) -> None:
 
 def test_a_call_returns_the_number_that_the_annotation_says():
     values = np.array([1.0, 2.0, 4.0])
-    assert repr(compiled(total, allocates=False)(values, 0.5)) == "3.5"
-    assert repr(compiled(count, allocates=False)(values)) == str(3 + 2**60)
-    assert compiled(is_rising, allocates=False)(values) is True
-    assert compiled(double, allocates=False)(values) is None
+    assert repr(compiled(total)(values, 0.5)) == "3.5"
+    assert repr(compiled(count)(values)) == str(3 + 2**60)
+    assert compiled(is_rising)(values) is True
+    assert compiled(double)(values) is None
     assert_array_equal(values, [2.0, 4.0, 8.0])
 
 
@@ -50,7 +50,7 @@ def without_its_kind(values: np.ndarray):
 
 def test_a_call_that_does_not_say_what_it_returns_is_told_so():
     with pytest.raises(BadInput, match=r"without_its_kind .* '-> float'"):
-        compiled(without_its_kind, allocates=False)(np.ones(3))
+        compiled(without_its_kind)(np.ones(3))
 
 
 def part_of(matrix: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def made(first: int) -> np.ndarray:
 def test_the_language_of_kernels_is_pythons():
     values = np.array([[0.5, 1.0, 2.0], [3.0, 4.0, 3.0]])
     both, found, expected = (values.copy(), values.copy()), np.empty((2, 10)), np.empty((2, 10))
-    compile_over_runs(language, allocates=False)(2, both[0], found)
+    compile_over_runs(language)(2, both[0], found)
     for run in range(2):
         language(run, both[1], expected)
     assert_array_equal(found, expected)
@@ -94,7 +94,7 @@ def test_the_language_of_kernels_is_pythons():
 
 def test_no_array_that_a_function_made_leaves_it_through_another():
     with pytest.raises(BadInput, match="it returns an array that it has made"):
-        compile_over_runs(escaping, allocates=False)(1, np.empty(1))
+        compile_over_runs(escaping)(1, np.empty(1))
 
 
 def test_arrays_without_numbers_are_as_others():

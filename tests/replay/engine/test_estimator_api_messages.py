@@ -10,21 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling import notices
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
-from fuselog.recorders.models.planar import wrap_angle
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.api.functions import batch, each_run, recursive
 from fuselog.replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
 from fuselog.replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
-from fuselog.replay.engine.compiling import notices
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
-from fuselog.replay.engine.compiling.kernel_cache import load
 from fuselog.replay.engine.replaying.estimator import Estimator
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_events
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.through_numba import numba_over_runs
 from fuselog.replay.inference.linear_algebra.small_matrices import predict, solve, update, update_memory
 
 DETOUR = Schema(
@@ -173,7 +172,7 @@ def test_what_cannot_be_compiled_is_named_with_its_line() -> None:
     if os.environ.get("FUSELOG_UNCOMPILED"):
         return
     with pytest.raises(BadInput, match=rf"careless uses np.random \({__file__}, line \d+\)"):
-        compile_over_runs(careless)(1, np.zeros(1))
+        numba_over_runs(careless)(1, np.zeros(1))
     wrong = recursive(
         "wrong",
         parameters=Parameters,
@@ -284,7 +283,7 @@ def test_small_matrices_compile() -> None:
     compiled, plain = (
         (np.ones((2, 2)), np.stack([np.eye(2)] * 2), 0.5 * np.eye(2), np.zeros(2)) for _ in range(2)
     )
-    compile_over_runs(tracked, allocates=True)(2, *compiled)
+    numba_over_runs(tracked)(2, *compiled)
     tracked(0, *plain)
     np.testing.assert_allclose(compiled[0][0], plain[0][0])
     np.testing.assert_allclose(compiled[1][1], plain[1][0])
@@ -384,6 +383,10 @@ def halve(run: int, values: Floats) -> None:
     values[run] *= 0.5
 
 
+def doubled(value: float) -> float:
+    return 2.0 * value
+
+
 @pytest.mark.paper
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
 def test_long_compiling_is_said_once(
@@ -391,10 +394,9 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("fuselog.replay.engine.compiling.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("fuselog.recorders.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     for _ in range(2):
-        load.cache_clear()
         compile_over_runs(halve)(2, np.ones(2))
     said = [record.getMessage() for record in caplog.records]
     name = f"{halve.__module__}.halve"
@@ -415,10 +417,9 @@ def test_python_says_what_it_compiles_once(
         monkeypatch.setattr(logging.getLogger(), "handlers", handlers)
         notices._print_once.cache_clear()
         for value in (1.0, 1):
-            load.cache_clear()
-            compiled(wrap_angle)(value)
+            compiled(doubled)(value)
         said.append(capsys.readouterr().err)
-    name = r"fuselog\.recorders\.models\.planar\.wrap_angle"
+    name = rf"{re.escape(__name__)}\.doubled"
     assert re.match(
         rf"fuselog: compiling {name}, once\nfuselog: compiled {name} in \d+\.\d s\n", said[0]
     )

@@ -12,6 +12,7 @@ from numpy.testing import assert_array_equal
 
 from fuselog.pipeline.runs import ensemble
 from fuselog.pipeline.runs.ensemble import RunGroup
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from fuselog.recorders.parameters import Parameters
@@ -19,7 +20,6 @@ from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.api.functions import batch, each_run, recursive
 from fuselog.replay.engine.api.inputs import Floats, Given, Integers, Messages
 from fuselog.replay.engine.api.outputs import Estimates, Results
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.engine.replaying.estimator import Batch, Estimator, Recursive
 from fuselog.replay.engine.replaying.replaying import Report, collect, replay
 from fuselog.replay.engine.replaying.soundness import find_unsound

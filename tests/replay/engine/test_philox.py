@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fuselog.replay.engine.compiling.compile import compiled
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.engine.philox import fill_normals, philox, run_key
 
-normals = compiled(fill_normals, allocates=False)
+normals = compiled(fill_normals)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def test_a_long_first_use_is_told_with_method_and_model(
 ) -> None:
     """While it happens and when it is done, and not again."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("fuselog.replay.engine.compiling.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("fuselog.recorders.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     log = fl.record("landmarks", duration_s=1.0)
     for _ in range(2):

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.tracing.functions import Derivative, TracedFunction
 from fuselog.replay.tracing.graph import Node
 from fuselog.replay.tracing.traced import Trace
@@ -44,7 +44,7 @@ def by_compiler(functions: Sequence[Derivative], points: Floats) -> list[Floats]
     points = np.array(points, dtype=float)
     kernel = over_points(tuple(functions), points.shape[1])
     out = np.full((len(points), len(functions), max(len(each.outputs) for each in functions)), np.nan)
-    compile_over_runs(kernel, allocates=False)(len(points), points, out)
+    compile_over_runs(kernel)(len(points), points, out)
     return [_dense(each, out[:, k], points.shape[1]) for k, each in enumerate(functions)]
 
 

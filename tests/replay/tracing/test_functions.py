@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.inference.model.checking import check_model
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.tracing.functions import Shape, TracedFunction, traced
@@ -270,7 +270,7 @@ def test_what_has_not_changed_is_the_same_object_again(monkeypatch: pytest.Monke
 def test_functions_of_one_name_are_two_in_a_kernel():
     functions = tuple(TracedFunction(lambda given, k=k: (given[0] + k,), (1,)) for k in range(3))
     out = np.zeros((1, 3, 1))
-    compile_over_runs(over_points(functions, 1), allocates=False)(1, np.array([[0.5]]), out)
+    compile_over_runs(over_points(functions, 1))(1, np.array([[0.5]]), out)
     assert out.ravel().tolist() == [0.5, 1.5, 2.5]
 
 

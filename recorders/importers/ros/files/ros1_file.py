@@ -12,7 +12,6 @@ from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
@@ -20,6 +19,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.ros.files.raw import Batch, Connection
 from fuselog.recorders.log.container.ahead import ahead
+from fuselog.recorders.log.loops import kernel
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
@@ -213,54 +213,54 @@ def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] |
         data = np.frombuffer(_DECOMPRESS[compression](raw), np.uint8)
     except (OSError, EOFError, RuntimeError, ValueError) as error:
         return str(error)
-    return data, _Scanned(*_scan(data))
+    found, ends = np.zeros((6, len(data) // 8 + 1), np.int64), np.empty(1, np.int64)
+    found[1] = -1
+    count = kernel(_scan)(data, *found, ends)
+    return data, _Scanned._make([*found[:, :count], *ends.tolist()])
 
 
-@njit(cache=True, nogil=True)
-def _number(data, place, size):  # type: ignore[no-untyped-def] # numba infers the types
-    value = np.int64(0)
-    for k in range(size):
-        value |= np.int64(data[place + k]) << (8 * k)
-    return value
+def _number(data: NDArray[np.uint8], place: int) -> int:
+    """Return the number that four bytes from a place on are, the lowest first."""
+    part, number = data[place : place + 4], 0
+    for k in (3, 2, 1, 0):
+        number = number << 8 | int(part[k])
+    return number
 
 
-@njit(cache=True, nogil=True)
-def _scan(data):  # type: ignore[no-untyped-def] # numba infers the types
-    size = len(data)
-    most = size // 8 + 1
-    kinds, connections = np.zeros(most, np.int64), np.full(most, -1, np.int64)
-    time_ns, headers = np.zeros(most, np.int64), np.zeros(most, np.int64)
-    begins, lengths = np.zeros(most, np.int64), np.zeros(most, np.int64)
-    count, position = 0, np.int64(0)
+def _scan(
+    data: NDArray[np.uint8],
+    kinds: NDArray[np.int64],
+    connections: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    headers: NDArray[np.int64],
+    begins: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    ends: NDArray[np.int64],
+) -> int:
+    """Fill what the records of a chunk are, and where they end; count them."""
+    size, count, position = len(data), 0, 0
     while position + 4 <= size:
         begin = position + 4
-        end = begin + _number(data, position, 4)
+        end = begin + _number(data, position)
         if end + 4 > size:
             break
-        length = _number(data, end, 4)
+        length = _number(data, end)
         if end + 4 + length > size:
             break
         headers[count], begins[count], lengths[count] = begin, end + 4, length
         while begin + 4 <= end:
-            value_end = begin + 4 + _number(data, begin, 4)
+            value_end = begin + 4 + _number(data, begin)
             if value_end > end:
                 break
             name = data[begin + 4 : value_end]
             if len(name) == 4 and name[0] == 111 and name[1] == 112 and name[2] == 61:  # op=
                 kinds[count] = name[3]
             elif len(name) == 9 and name[0] == 99 and name[4] == 61:  # conn=
-                connections[count] = _number(name, 5, 4)
+                connections[count] = _number(name, 5)
             elif len(name) == 13 and name[0] == 116 and name[4] == 61:  # time=
-                time_ns[count] = _number(name, 5, 4) * 1_000_000_000 + _number(name, 9, 4)
+                time_ns[count] = _number(name, 5) * 1_000_000_000 + _number(name, 9)
             begin = value_end
         count += 1
         position = end + 4 + length
-    return (
-        kinds[:count],
-        connections[:count],
-        time_ns[:count],
-        headers[:count],
-        begins[:count],
-        lengths[:count],
-        position,
-    )
+    ends[0] = position
+    return count

@@ -17,8 +17,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.orientation import SIGNS
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.directional.distributions.gaussian_kernels import solve_in_place
 
 Vector = NDArray | tuple[float, ...]
@@ -354,7 +354,7 @@ def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vecto
 
 @cache
 def _over_all(function: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(function, allocates=False)
+    return compile_over_runs(function)
 
 
 def _predict_one(

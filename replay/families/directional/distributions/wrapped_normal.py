@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.families.directional.distributions import wrapped_normal_kernels as kernels
 from fuselog.replay.families.directional.distributions.batches import flatten
 from fuselog.replay.families.directional.distributions.wrapped_normal_kernels import Mixture
 
-_product_mixture = compiled(kernels.product_mixture, allocates=False)
+_product_mixture = compiled(kernels.product_mixture)
 
 
 class WrappedNormal(NamedTuple):

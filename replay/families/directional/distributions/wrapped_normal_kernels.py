@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.planar import Component, Components, wrap_angle
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.
@@ -321,7 +321,7 @@ def density(x1: float, x2: float, covariance: NDArray) -> float:
 
 @cache
 def _over_all(function: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(function, allocates=False)
+    return compile_over_runs(function)
 
 
 def _density_one(n: int, deviation: NDArray, covariance: NDArray, out: NDArray) -> None:

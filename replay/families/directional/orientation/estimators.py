@@ -106,7 +106,6 @@ def of_inertial_samples(
         start=start,
         follow=follow,
         follow_all=follow_all,
-        allocates=False,
     )
 
 

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.models.inertial import triad
 from fuselog.replay.engine.arrays import Floats, Integers
-from fuselog.replay.engine.compiling.compile import compile_over_runs
 from fuselog.replay.families.directional.distributions.bingham_kernels import (
     compose,
     integrate,
@@ -137,7 +137,7 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 @cache
 def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     """Return the loop over runs of what takes one run through its samples, compiled."""
-    return compile_over_runs(run_once, allocates=False)
+    return compile_over_runs(run_once)
 
 
 def run_inertial_filter(

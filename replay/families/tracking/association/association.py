@@ -20,9 +20,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.compiling.compile import compiled
 from fuselog.replay.families.tracking.association.clusters import (
     NONE,
     AssociationMemory,
@@ -188,4 +188,4 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
 
 @cache
 def _compiled(association: str) -> Associate:
-    return compiled(ASSOCIATIONS[association], allocates=False)
+    return compiled(ASSOCIATIONS[association])

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Columns, Floats, Numbers, Settings
-from fuselog.replay.engine.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.families.tracking.association.association import ASSOCIATIONS
 from fuselog.replay.families.tracking.association.births import beginning, births_of, ending
@@ -59,7 +59,7 @@ class ScanInputs(NamedTuple):
 
 
 def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
-    """Make the loop over scans, for `fuselog.replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over scans, for `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
@@ -246,7 +246,7 @@ BATCH = 1000
 @lru_cache(maxsize=16)
 def _compiled(tracker: Tracker) -> OverRuns:
     follow = tracking(tracker, reading_settings(tracker.names))
-    return compile_over_runs(follow, allocates=False, title="a tracker")
+    return compile_over_runs(follow, title="a tracker")
 
 
 def track_scans(

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.engine.arrays import varying
-from fuselog.replay.engine.compiling.compile import compile_over_runs, compiled
 
 N = 4
 REALS = np.array([[1.5, -2.0, 0.0, 3.25], [-0.5, 7.0, 1e-3, -1.0], [2.0, 2.0, -4.5, 0.25]])
@@ -280,7 +280,7 @@ def test_compiled_gives_every_bit_of_plain_python(
     with np.errstate(all="ignore"):
         for run in range(3):
             kernel(run, plain)
-    compile_over_runs(kernel, allocates=False)(3, found)
+    compile_over_runs(kernel)(3, found)
     for name, expected, got in zip(Given._fields, plain, found, strict=True):
         assert got.tobytes() == expected.tobytes(), (name, got, expected)
 
@@ -304,7 +304,7 @@ def summing(run: int, scene: Scene, scale: Any, flag: Any, out: np.ndarray) -> N
 
 
 def test_arrays_of_any_size_layout_and_kind_are_read_as_they_lie():
-    loop = compile_over_runs(summing, allocates=False)
+    loop = compile_over_runs(summing)
     grid = np.arange(-20, 20).reshape(5, 8)
     for laid in (grid, grid[:, ::2], grid[::-1, ::-1], grid.T[:5], np.asfortranarray(grid)):
         for dtype in ("f8", "i8", "i4", "u4", "i1", "u1", "?"):
@@ -333,7 +333,7 @@ def test_arrays_of_any_size_layout_and_kind_are_read_as_they_lie():
 )
 def test_what_a_kernel_does_not_take_is_refused(wrong: Any):
     """Also where one of the same kind in this machine's order was given before."""
-    loop, out = compile_over_runs(early_of, allocates=False), np.zeros(2)
+    loop, out = compile_over_runs(early_of), np.zeros(2)
     loop(2, np.zeros(2), out)
     with pytest.raises(BadInput, match="a kernel takes numbers"):
         loop(2, wrong, out)
@@ -426,7 +426,7 @@ REFUSED = {
 @pytest.mark.parametrize("kernel", REFUSED, ids=lambda kernel: kernel.__name__)
 def test_what_a_kernel_cannot_say_is_told_with_its_line(kernel: Callable[..., None]):
     with pytest.raises(BadInput, match=REFUSED[kernel]) as refused:
-        compile_over_runs(kernel, allocates=False)(2, np.zeros(2))
+        compile_over_runs(kernel)(2, np.zeros(2))
     said = str(refused.value)
     assert "\n" not in said
     assert "test_language.py, line " in said or "calls itself" in said
@@ -451,7 +451,7 @@ def test_with_the_check_an_index_beyond_an_array_is_an_index_error(
 ):
     """In what a kernel calls and in itself, of an empty array too; nowhere where all are inside."""
     monkeypatch.setenv("FUSELOG_BOUNDSCHECK", "1")
-    loop, out = compile_over_runs(looking, allocates=False), np.zeros(3)
+    loop, out = compile_over_runs(looking), np.zeros(3)
     loop(3, REALS, 2, out)
     assert out.tolist() == (REALS[:, 2] + REALS[:, 3] + REALS[:, 0]).tolist()
     where = "at" if rows == 3 else "looking"

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fuselog.recorders.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.identity import identity
+from fuselog.recorders.compiling.kernels import arguments, native
 from fuselog.replay.engine.arrays import varying
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.engine.compiling.identity import identity
-from fuselog.replay.engine.compiling.kernels import arguments, native
 
 # --- the key -----------------------------------------------------------------------------------------
 
@@ -101,7 +101,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def result_of(function: Callable[[float], float]) -> float:
     out = np.zeros(1)
-    compile_over_runs(kernel_of(function), allocates=False)(1, np.array([1.5]), out)
+    compile_over_runs(kernel_of(function))(1, np.array([1.5]), out)
     return out[0]
 
 
@@ -150,7 +150,7 @@ def looked_at(run: int, scene: Scene, out: np.ndarray) -> None:
 
 
 def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, made: list[Any]):
-    loop = compile_over_runs(looked_at, allocates=False)
+    loop = compile_over_runs(looked_at)
     for count, (runs, columns, width) in enumerate(
         [(1, 3, 5), (2, 4, 5), (2, 64, 5), (2, 65, 5), (1, 3, 7), (9, 100, 70), (3, 64, 1)]
     ):
@@ -165,12 +165,12 @@ def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, 
 
 ELSEWHERE = """
 import numpy as np
-from fuselog.replay.engine.compiling.kernels import arguments, native
+from fuselog.recorders.compiling.kernels import arguments, native
 native._made = lambda *_: 1 / 0
 from tests.replay.engine.kernels.test_native import doubled, kernel_of
-from fuselog.replay.engine.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.compile import compile_over_runs
 out = np.zeros(1)
-compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), out)
+compile_over_runs(kernel_of(doubled))(1, np.array([1.5]), out)
 print(out[0])
 """
 
@@ -188,7 +188,7 @@ def test_another_process_loads_what_is_kept_and_it_holds_no_address(kernels: Pat
     )
     assert done.stdout == "3.0\n", done.stderr
     path.unlink()
-    compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), np.zeros(1))
+    compile_over_runs(kernel_of(doubled))(1, np.array([1.5]), np.zeros(1))
     assert path.read_bytes() == kept  # whatever lies where
     text = native.program_of(kernel_of(doubled), (arguments.KnownArray("d", (None,), True),) * 2).text()
     addresses = [int(number) for number in re.findall(r"(?<![\w%.])\d{9,}", text)]
@@ -214,7 +214,7 @@ def test_another_processor_or_version_of_this_room_is_another_kernel(
 
 def in_a_worker(number: float) -> float:
     out = np.zeros(1)
-    compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([number]), out)
+    compile_over_runs(kernel_of(doubled))(1, np.array([number]), out)
     return out[0]
 
 

@@ -12,8 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from fuselog.replay.engine.compiling.compile import compile_over_runs
-from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
+from fuselog.recorders.compiling.compile import compile_over_runs
+from fuselog.recorders.compiling.kernels.functions import FUNCTIONS
 
 # Exactly rounded, or made of nothing else: the same in every bit.
 EXACT = [
@@ -44,7 +44,7 @@ def kernel_of(functions: tuple[Any, ...], of_one: bool) -> Callable[..., None]:
 
 @cache
 def loop_of(functions: tuple[Any, ...], of_one: bool) -> Callable[..., None]:
-    return compile_over_runs(kernel_of(functions, of_one), allocates=False)
+    return compile_over_runs(kernel_of(functions, of_one))
 
 
 def compiled(functions: list[Any], *arguments: float) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_integers_divide_and_are_compared_as_pythons(signed: bool, data: st.Data
 
 @cache
 def loop_of_integers() -> Callable[..., None]:
-    return compile_over_runs(divided, allocates=False)
+    return compile_over_runs(divided)
 
 
 def divided(run: int, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:

@@ -18,5 +18,3 @@ KernelArgument = Any  # type: ignore[explicit-any]
 Value = Any  # type: ignore[explicit-any]
 # An array that is known while a kernel is made, or that holds what it gives: of any kind.
 AnyArray = NDArray[Any]  # type: ignore[explicit-any]
-# What numba hands to those who extend it: its types are not stated.
-OfNumba = Any  # type: ignore[explicit-any]

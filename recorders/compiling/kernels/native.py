@@ -24,8 +24,7 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
-from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.cache import (
+from fuselog.recorders.compiling.cache import (
     cache_folder,
     in_turn,
     is_private,
@@ -33,14 +32,15 @@ from fuselog.replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
-from fuselog.replay.engine.compiling.identity import digest_of, identity
-from fuselog.replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
-from fuselog.replay.engine.compiling.kernels.lowering import lower
-from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
-from fuselog.replay.engine.compiling.kernels.program import Program
-from fuselog.replay.engine.compiling.kinds import AnyArray, Entry, KernelFunction, RunOnce, Value
-from fuselog.replay.engine.compiling.notices import compiling, done_once
-from fuselog.replay.engine.compiling.scratch import Memory
+from fuselog.recorders.compiling.identity import digest_of, identity
+from fuselog.recorders.compiling.kernels.arguments import describe, letters, value_of, with_types
+from fuselog.recorders.compiling.kernels.lowering import lower
+from fuselog.recorders.compiling.kernels.numbers import WHOLE, Emitter, Number
+from fuselog.recorders.compiling.kernels.program import Program
+from fuselog.recorders.compiling.kinds import AnyArray, Entry, KernelFunction, RunOnce, Value
+from fuselog.recorders.compiling.notices import compiling, done_once
+from fuselog.recorders.compiling.scratch import Memory
+from fuselog.recorders.errors import BadInput
 
 _ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
@@ -261,7 +261,7 @@ def _surroundings() -> str:
     machine = _machine()
     return "\n".join(
         [
-            digest_of("fuselog.replay.engine.compiling.kernels"),
+            digest_of("fuselog.recorders.compiling.kernels"),
             platform.python_version(),
             f"llvmlite {llvmlite.__version__}",
             str(llvm.get_process_triple()),

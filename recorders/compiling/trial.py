@@ -32,7 +32,7 @@ def _try(name: str | None, features: str | None) -> None:
 
 def main() -> None:
     """Compile a function that adds for the processor that is asked for."""
-    from fuselog.replay.engine.compiling.kernels.native import object_code
+    from fuselog.recorders.compiling.kernels.native import object_code
 
     object_code(
         "define double @add(double %a, double %b) {\n %c = fadd double %a, %b\n ret double %c\n}"

@@ -10,9 +10,8 @@ from itertools import count
 from types import FunctionType
 from typing import NamedTuple
 
-from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
-from fuselog.replay.engine.compiling.kernels.values import (
+from fuselog.recorders.compiling.kernels.numbers import WHOLE, Emitter, Number
+from fuselog.recorders.compiling.kernels.values import (
     Array,
     is_local,
     leaves,
@@ -21,7 +20,8 @@ from fuselog.replay.engine.compiling.kernels.values import (
     signature,
     table,
 )
-from fuselog.replay.engine.compiling.kinds import AnyArray, Value
+from fuselog.recorders.compiling.kinds import AnyArray, Value
+from fuselog.recorders.errors import BadInput
 
 FEW = 30  # lines of a function that is always written where it is called
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from types import FunctionType
 from typing import NamedTuple
 
-from fuselog.replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.frame import Frame, Wider, common_value, unsure
+from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
     WHOLE,
     Emitter,
@@ -23,8 +23,8 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     is_static,
     kind_of,
 )
-from fuselog.replay.engine.compiling.kernels.program import DoesNotCompile, Program
-from fuselog.replay.engine.compiling.kernels.values import (
+from fuselog.recorders.compiling.kernels.program import DoesNotCompile, Program
+from fuselog.recorders.compiling.kernels.values import (
     Array,
     at_run_time,
     entries,
@@ -34,7 +34,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     signature,
     store,
 )
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import Value
 
 
 class _Loop(NamedTuple):

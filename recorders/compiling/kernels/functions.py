@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
@@ -23,7 +23,7 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     kind_of,
     negative,
 )
-from fuselog.replay.engine.compiling.kinds import KernelFunction, Value
+from fuselog.recorders.compiling.kinds import KernelFunction, Value
 
 
 def absolute(emitter: Emitter, x: Scalar) -> Number:

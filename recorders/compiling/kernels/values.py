@@ -12,7 +12,7 @@ from math import prod
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
@@ -25,7 +25,7 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     constant,
     is_static,
 )
-from fuselog.replay.engine.compiling.kinds import AnyArray, Value
+from fuselog.recorders.compiling.kinds import AnyArray, Value
 
 Size = int | str  # known, or the name of an integer
 Leaf = tuple[str, str]  # LLVM's type, and a name

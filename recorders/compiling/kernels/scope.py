@@ -4,14 +4,14 @@ import builtins
 from itertools import count
 from types import FunctionType
 
-from fuselog.replay.engine.compiling.kernels.known import (
+from fuselog.recorders.compiling.kernels.known import (
     from_python,
 )
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.numbers import (
     Emitter,
 )
-from fuselog.replay.engine.compiling.kernels.program import Program, definition_of
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kernels.program import Program, definition_of
+from fuselog.recorders.compiling.kinds import Value
 
 
 class Scope:

@@ -1,10 +1,8 @@
 """Compiles functions of one run into loops over all runs, which the cores share.
 
-A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
-arrays is written in LLVM's text by ourselves (`fuselog.replay.engine.compiling.kernels`), in
-milliseconds; any other goes through numba (`fuselog.replay.engine.compiling.through_numba`). With
-FUSELOG_UNCOMPILED=1 all are
-plain Python, which a debugger can follow: that is the reference.
+A kernel is a plain Python function over numbers and arrays, with all that it calls, that makes no
+arrays; `fuselog.recorders.compiling.kernels` writes it in LLVM's text, in milliseconds. With
+FUSELOG_UNCOMPILED=1 all are plain Python, which a debugger can follow: that is the reference.
 """
 
 import os
@@ -19,9 +17,9 @@ from typing import ParamSpec, Protocol, TypeVar, cast
 import numpy as np
 
 from fuselog.recorders import environment
-from fuselog.replay.engine.compiling.kinds import KernelArgument, RunOnce
-from fuselog.replay.engine.compiling.notices import done_once
-from fuselog.replay.engine.compiling.scratch import Memory, Scratch
+from fuselog.recorders.compiling.kinds import KernelArgument, RunOnce
+from fuselog.recorders.compiling.notices import done_once
+from fuselog.recorders.compiling.scratch import Memory, Scratch
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -40,19 +38,15 @@ class Loop(Protocol):
         ...
 
 
-def compiled(
-    function: Callable[Parameters, Result], *, allocates: bool = True
-) -> Callable[Parameters, Result]:
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Compile a function of arrays and numbers, with all that it calls, when it is first called.
 
     For what Python calls as it stands; inside another kernel it is compiled with the rest. Its arguments
-    are given by position. One that makes no arrays (`allocates=False`) is compiled in a twentieth of the
-    time; it returns nothing, or one number of the kind that its annotation says.
+    are given by position; it returns nothing, or one number of the kind that its annotation says.
     Raises BadInput, when called, where a source is not at hand.
 
     Args:
         function: plain Python over arrays and numbers.
-        allocates: whether it makes arrays.
 
     Returns:
         The function that does the same compiled.
@@ -60,10 +54,8 @@ def compiled(
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
-        if allocates:
-            from fuselog.replay.engine.compiling.through_numba import function_of
-        else:
-            from fuselog.replay.engine.compiling.kernels.native import function_of
+        from fuselog.recorders.compiling.kernels.native import function_of
+
         return function_of(function)
 
     @wraps(function)
@@ -76,15 +68,13 @@ def compiled(
     return call
 
 
-def compile_over_runs(run_once: RunOnce, *, allocates: bool = True, title: str = "") -> "OverRuns":
+def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
         run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
             belongs to that run. It may be a closure over model functions and numbers: that is how it is
-            specialised. It may use NumPy and functions that keep to the same.
-        allocates: whether it makes arrays. A kernel that does not is compiled in a twentieth of the
-            time, and is several times as fast.
+            specialised. It may use NumPy and functions that keep to the same, and makes no arrays.
         title: what it is to who waits until it is compiled, such as "ekf of robot".
 
     Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
@@ -100,16 +90,10 @@ def compile_over_runs(run_once: RunOnce, *, allocates: bool = True, title: str =
 
     @cache
     def loop() -> Loop:
-        if allocates:
-            from fuselog.replay.engine.compiling.through_numba import loop_of
-
-            return loop_of(run_once, title)
-        from fuselog.replay.engine.compiling.kernels.native import Kernel
+        from fuselog.recorders.compiling.kernels.native import Kernel
 
         return Kernel(cast(FunctionType, run_once), title)
 
-    if allocates and not is_uncompiled():
-        loop()  # says at once where a source is not at hand
     return OverRuns(run_once, loop)
 
 

@@ -2,13 +2,13 @@
 
 from types import FunctionType
 
-from fuselog.replay.engine.compiling.kernels.expressions import Expressions
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.expressions import Expressions
+from fuselog.recorders.compiling.kernels.numbers import (
     Number,
     common_kind,
 )
-from fuselog.replay.engine.compiling.kernels.program import Program, definition_of
-from fuselog.replay.engine.compiling.kernels.values import (
+from fuselog.recorders.compiling.kernels.program import Program, definition_of
+from fuselog.recorders.compiling.kernels.values import (
     Array,
     Record,
     at_run_time,
@@ -17,8 +17,8 @@ from fuselog.replay.engine.compiling.kernels.values import (
     rebuilt,
     signature,
 )
-from fuselog.replay.engine.compiling.kernels.variables import placed_names
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kernels.variables import placed_names
+from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):

@@ -4,7 +4,7 @@ import ast
 from collections.abc import Sequence
 from functools import cache
 
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import Value
 
 
 class _Names(ast.NodeVisitor):

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
+from fuselog.recorders.compiling.kernels.values import STORED, Array, Record, combined
+from fuselog.recorders.compiling.kinds import Value
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.engine.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
-from fuselog.replay.engine.compiling.kernels.values import STORED, Array, Record, combined
-from fuselog.replay.engine.compiling.kinds import Value
 
 KNOWN = 64  # sizes up to this are part of a kernel
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from fuselog.replay.engine.compiling.kinds import KernelArgument
+from fuselog.recorders.compiling.kinds import KernelArgument
 
 
 class Memory:

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import Value
 
 REAL, WHOLE, WORD, TRUTH = "double", "i64", "u64", "i1"  # kinds; a word is an unsigned integer
 _WIDTH = {TRUTH: 0, WHOLE: 1, WORD: 2, REAL: 3}

@@ -13,10 +13,10 @@ from types import CodeType, FunctionType, ModuleType
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import Value
 
 # Whose parts are known by their names alone.
-_OF_PYTHON = {"numpy", *sys.stdlib_module_names}
+OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 
 
 def identity(function: FunctionType) -> str:
@@ -71,7 +71,7 @@ def _words(
     elif isinstance(value, ModuleType | type):
         module = value.__name__ if isinstance(value, ModuleType) else value.__module__
         yield f"{module} {getattr(value, '__qualname__', '')} {getattr(value, '_fields', '')}"
-        if module.partition(".")[0] not in _OF_PYTHON:
+        if module.partition(".")[0] not in OF_PYTHON:
             for name in names:
                 if name in vars(value):
                     yield name

@@ -8,8 +8,8 @@ from types import FunctionType
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.functions import FUNCTIONS
-from fuselog.replay.engine.compiling.kernels.known import (
+from fuselog.recorders.compiling.kernels.functions import FUNCTIONS
+from fuselog.recorders.compiling.kernels.known import (
     OPERATORS,
     as_python,
     from_python,
@@ -17,7 +17,7 @@ from fuselog.replay.engine.compiling.kernels.known import (
     is_known,
     is_not_in,
 )
-from fuselog.replay.engine.compiling.kernels.numbers import (
+from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
@@ -30,8 +30,8 @@ from fuselog.replay.engine.compiling.kernels.numbers import (
     is_static,
     negative,
 )
-from fuselog.replay.engine.compiling.kernels.scope import Scope
-from fuselog.replay.engine.compiling.kernels.values import (
+from fuselog.recorders.compiling.kernels.scope import Scope
+from fuselog.recorders.compiling.kernels.values import (
     Array,
     Record,
     entries,
@@ -40,7 +40,7 @@ from fuselog.replay.engine.compiling.kernels.values import (
     part_of,
     store,
 )
-from fuselog.replay.engine.compiling.kinds import AnyArray, Value
+from fuselog.recorders.compiling.kinds import AnyArray, Value
 
 # Functions that make arrays, and whether these are zero.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
@@ -346,7 +346,7 @@ class Expressions(Scope, ABC):
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
-        if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
+        if isinstance(function, FunctionType) and not str(function.__module__).startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
         name = getattr(function, "__name__", function)
         raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")

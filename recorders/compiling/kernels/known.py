@@ -5,9 +5,9 @@ import operator
 
 import numpy as np
 
-from fuselog.replay.engine.compiling.kernels.numbers import Number
-from fuselog.replay.engine.compiling.kernels.values import Array, Record, entries
-from fuselog.replay.engine.compiling.kinds import Value
+from fuselog.recorders.compiling.kernels.numbers import Number
+from fuselog.recorders.compiling.kernels.values import Array, Record, entries
+from fuselog.recorders.compiling.kinds import Value
 
 
 def is_in(x: Value, many: Value) -> bool:
