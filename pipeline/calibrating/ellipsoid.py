@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.calibrating.ellipsoid_fit import AXES, NAMES, Fit, fit, matrix_of, middle
+from fuselog.pipeline.optimise import QUANTILE
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
-from fuselog.pipeline.tuning.confidence import QUANTILE
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2, unit_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource

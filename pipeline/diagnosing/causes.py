@@ -22,8 +22,10 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Fit, Supposed, fit, promised, undone
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
-from fuselog.pipeline.diagnosing.search import DROP_95, NUMBER_COST, Peak, end, peak, rival, side_by_side
+from fuselog.pipeline.diagnosing.search import NUMBER_COST, Peak, peak, rival
+from fuselog.pipeline.optimise import DROP_95, QUANTILE, curvature, end, side_by_side
 from fuselog.replay.engine import chi2
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.intervals import Interval
@@ -653,7 +655,7 @@ def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
     for at, _ in asking:
         # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
         scale = abs(at.value) * min(1.0, (DROP_95 / at.gain) ** 0.5)
-        searches += [end(at, -scale), end(at, scale)]
+        searches += [end(at.value, at.gain, -scale), end(at.value, at.gain, scale)]
     ends = side_by_side(
         searches, lambda asked: gains_of([(asking[place // 2][1], value) for place, value in asked])
     )
@@ -671,19 +673,13 @@ def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
 def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
     """Compute the 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
     values, steps = np.array(at.value), np.array(of.tried[0])
-    units = np.diag(steps)
-    pairs = [(row, column) for row in range(of.size) for column in range(row + 1)]
-    asked = [
-        values + a * units[row] + b * units[column]
-        for row, column in pairs
-        for a in (1, -1)
-        for b in (1, -1)
-    ]
-    found = np.array(gains_of([(of, tuple(map(float, each))) for each in asked])).reshape(-1, 4)
-    bend = np.zeros((of.size, of.size))
-    for (row, column), (both, one, other, none) in zip(pairs, found, strict=True):
-        bend[row, column] = bend[column, row] = 0.25 * (both - one - other + none)
-    spread = 1.96 * np.sqrt(np.abs(np.diag(np.linalg.pinv(-bend)))) * steps
+
+    def cost(points: Floats) -> Floats:
+        asked = values + points * steps
+        return -np.array(gains_of([(of, tuple(map(float, each))) for each in asked]))
+
+    _, bent = curvature(cost, np.zeros(of.size), range(of.size), 2.0)
+    spread = QUANTILE * np.sqrt(np.abs(np.diag(np.linalg.pinv(bent)))) * steps
     return tuple(map(float, values - spread)), tuple(map(float, values + spread))
 
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
-from fuselog.pipeline.diagnosing.search import ROOT_95, WIDE, Peak, end, side_by_side
+from fuselog.pipeline.diagnosing.search import WIDE, Peak
+from fuselog.pipeline.optimise import curvature, profile_ends
 from fuselog.pipeline.tuning.confidence import confidence
 from fuselog.pipeline.tuning.search import (
     CURVATURE_STEP,
@@ -21,7 +22,6 @@ from fuselog.pipeline.tuning.search import (
     UNIT,
     Coordinates,
     coordinates_of,
-    curvature,
     least,
 )
 from fuselog.recorders.errors import BadInput
@@ -113,14 +113,15 @@ def fit(
         is_free = ~(together.is_flat(start) | together.at_limits(start))
         are_estimates = [bool(is_free[own].all()) for own in together.places]
         return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
-    bent = curvature(together.cost, coordinates, point, range(len(point)), 1.0 / UNIT)
+    cost_at = coordinates.over(together.cost)
+    _, bent = curvature(cost_at, point, range(len(point)), 1.0 / UNIT)
     is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
     losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
     if has_converged and is_top and not at_bounds.any():
         covariance = confidence(range(len(point)), bent).covariance
         losses = [_loss(point[own], covariance[np.ix_(own, own)]) for own in together.places]
         if has_ends:
-            low, high = _ends(together, coordinates, point, covariance)
+            low, high = map(coordinates.unbounded, profile_ends(cost_at, point, bent))
             ends = list(zip(together.values(low), together.values(high), strict=True))
             point = _at_specials(together, coordinates, point, covariance, (low, high))
     numbers = coordinates.values(point)
@@ -140,13 +141,13 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
     coordinates = Coordinates(together.free, steps / CURVATURE_STEP)
-    point, apart = coordinates.of(together.start), CURVATURE_STEP * np.eye(len(steps))
-    bent = curvature(together.cost, coordinates, point, range(len(point)))
+    point = coordinates.of(together.start)
+    cost_at = coordinates.over(together.cost)
+    around, bent = curvature(cost_at, point, range(len(point)), CURVATURE_STEP)
     if not np.isfinite(bent).all() or (len(bent) and np.linalg.eigvalsh(bent)[0] <= 0.0):
         return np.inf
-    costs = together.cost(coordinates.values(np.concatenate([point + apart, point - apart])))
-    slopes = np.subtract(*np.split(costs, 2)) / (2.0 * CURVATURE_STEP)
-    return faults[-1][0].gain + 0.5 * WIDE * float(slopes @ np.linalg.solve(bent, slopes))
+    down = np.linalg.solve(bent, around.slopes)
+    return faults[-1][0].gain + 0.5 * WIDE * float(around.slopes @ down)
 
 
 def _errors(at: Peak, of: Hypothesis) -> Floats:
@@ -215,24 +216,6 @@ class _Together:
 def _loss(own: Floats, covariance: Floats) -> float:
     """Compute what is lost without numbers (m,) of a covariance (m, m); infinite without a number."""
     return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
-
-
-def _ends(
-    together: _Together, coordinates: Coordinates, point: Floats, covariance: Floats
-) -> tuple[Floats, Floats]:
-    """Find the ends (k,), (k,) of intervals: along each number all others follow by the curvature."""
-    [cost] = together.cost(coordinates.values(point)[None])
-    errors = np.sqrt(np.diagonal(covariance))
-    along = covariance / errors  # a column for each number
-    ways = [(place, way * 2.0**0.5 * ROOT_95) for place in range(len(point)) for way in (-1.0, 1.0)]
-
-    def gains(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
-        points = np.array([point + by * along[:, ways[search][0]] for search, by in asked])
-        return (-together.cost(coordinates.values(points))).tolist()
-
-    found = side_by_side([end(Peak(0.0, -float(cost)), way) for _, way in ways], gains)
-    low, high = np.reshape(found, (-1, 2)).T * errors + point
-    return coordinates.unbounded(low), coordinates.unbounded(high)
 
 
 def _at_specials(

@@ -4,24 +4,16 @@ A search is a generator: it yields values, is sent what they gain, and returns i
 has the next values of all faults.
 """
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from fuselog.pipeline.optimise import Search
 
 Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
-Search = Generator[Sequence[Number], Sequence[float], "Peak"]
-Result = TypeVar("Result")
-DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a parameter end
-ROOT_95 = DROP_95**0.5
-END = 1e-3  # of how far an end is: what it need not be known better by
-SHARES = 0.05, 0.95  # of a bracket, between which its next value is
 ROUNDS = 14  # of a refinement at most
-DOUBLINGS = 12  # of the way to an end
-NARROWINGS = 40  # of the bracket of an end at most
-LARGEST = 1e12  # a loss, of what cannot be used
 NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
 CLEAR = 0.05  # of the same, where a peak is of several numbers
 FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
@@ -46,7 +38,9 @@ class Peak(NamedTuple):
         return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
 
 
-def peak(of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0.0) -> Search:
+def peak(
+    of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0.0
+) -> Search[Number, Peak]:
     """Search for the greatest gain of a fault.
 
     Args:
@@ -159,7 +153,7 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
     return float(-(slope**2) / (4.0 * bend)) if bend < 0.0 else np.inf
 
 
-def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search:
+def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search[Number, Peak]:
     """Search for several numbers: by the paraboloid about the best, again and again.
 
     Where a filter diverges the gain is rough, and has no paraboloid: the best of the points that it is
@@ -204,9 +198,7 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
     return Peak(tuple(map(float, at)), gain) if gain > 0.0 else Peak((0.0,) * size, 0.0)
 
 
-def rival(
-    of: Hypothesis, at: Peak, least: float
-) -> Generator[Sequence[Number], Sequence[float], Peak | None]:
+def rival(of: Hypothesis, at: Peak, least: float) -> Search[Number, Peak | None]:
     """Search for another number of a fault that gains at least so much; None where there is none.
 
     It is another greatest gain, with a valley to the first: as of a delay on laps of equal length.
@@ -233,67 +225,3 @@ def rival(
         top.update(zip(asked, (yield asked), strict=True))
     value = max(top, key=lambda each: top[each])
     return Peak(value, top[value]) if top[value] >= least else None
-
-
-def end(at: Peak, scale: float) -> Generator[Sequence[Number], Sequence[float], float]:
-    """Search for an end of the 95 % interval of a number: where the gain is DROP_95 below its greatest.
-
-    `scale` is how far off it is about, with its side. An end that is not found is infinite. The gain is
-    about a parabola, so that the root of what it falls by is about a line. If the gain is a spike, the
-    bracket stops narrowing after `NARROWINGS` values and its outer end is returned.
-    """
-    assert isinstance(at.value, float)
-    inner, outer = at.value, at.value + scale
-    least, fallen = 0.0, 0.0
-    for _ in range(DOUBLINGS):
-        fallen = _root_of_fall(at, (yield [outer]))
-        if fallen > ROOT_95:
-            break
-        inner, outer, least = outer, outer + (outer - at.value), fallen
-    else:
-        return float(np.copysign(np.inf, scale))
-    value, most = outer, fallen
-    for _ in range(NARROWINGS):
-        if abs(fallen / ROOT_95 - 1.0) <= END:
-            return value
-        if abs(outer - inner) <= END * abs(outer - at.value):
-            return value
-        share = float(np.clip((ROOT_95 - least) / (most - least), *SHARES))
-        value = inner + share * (outer - inner)
-        if value in (inner, outer):  # numbers have no room between them
-            break
-        fallen = _root_of_fall(at, (yield [value]))
-        if fallen > ROOT_95:
-            outer, most = value, fallen
-        else:
-            inner, least = value, fallen
-    return outer
-
-
-def _root_of_fall(at: Peak, gains: Sequence[float]) -> float:
-    [gain] = gains
-    fall = at.gain - gain if gain < at.gain else 0.0
-    return float(np.sqrt(min(fall, LARGEST)))
-
-
-def side_by_side(
-    searches: Sequence[Generator[Sequence[Number], Sequence[float], Result]],
-    gains_of: Callable[[Sequence[tuple[int, Number]]], Sequence[float]],
-) -> list[Result]:
-    """Run searches together, by the gains of what all of them ask for: places and values.
-
-    A gain that is NaN counts as minus infinity: a value that cannot be used.
-    """
-    asked = {place: list(next(search)) for place, search in enumerate(searches)}
-    results: dict[int, Result] = {}
-    while asked:
-        gains = gains_of([(place, at) for place, each in asked.items() for at in each])
-        found = iter(-np.inf if np.isnan(gain) else gain for gain in gains)
-        answers = {place: [next(found) for _ in each] for place, each in asked.items()}
-        asked = {}
-        for place, answer in answers.items():
-            try:
-                asked[place] = list(searches[place].send(answer))
-            except StopIteration as stop:
-                results[place] = stop.value
-    return [results[place] for place in range(len(searches))]

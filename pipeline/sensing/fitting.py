@@ -5,21 +5,21 @@ two of three recordings, so "none found, and it is less than" is an answer.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize, minimize_scalar
+from scipy.optimize import brentq
 
+from fuselog.pipeline.optimise import DROP_95, Cost, curvature, minimum, profile_ends
 from fuselog.pipeline.sensing.likelihood import Likelihood, Samples, likelihood
 from fuselog.pipeline.sensing.terms import Terms
-from fuselog.replay.engine import chi2
 
 Floats = NDArray[np.float64]
-Objective = Callable[[Floats], float]
-DROP = 0.5 * float(chi2.ppf(0.95, 1))  # of the log-likelihood, at the ends of a 95 % interval
-_FARTHEST = 15.0  # standard deviations, beyond which an end of an interval is not looked for
+_GAIN = 1e-7  # of the log-likelihood: what a step towards the likeliest terms has to gain
+# of the ends of intervals: how near, and how often twice as far: up to 16 standard deviations
+_WITHIN, _DOUBLINGS = 1e-4, 4
 _SHORTEST = 30  # steps: a Gauss-Markov time below is the sensor's own filter, and no drift
 
 
@@ -87,41 +87,28 @@ def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
 
     def relative(point: Floats) -> tuple[Terms, Likelihood]:
         terms = Terms(1.0, **dict(zip(beside_white, np.exp(point).tolist(), strict=True)))
-        found = likelihood(samples, terms)
-        return terms, found
+        return terms, likelihood(samples, terms)
 
-    def cost(point: Floats) -> float:
-        if any(not low <= each <= high for each, (low, high) in zip(point, limits, strict=True)):
-            return math.inf
-        _, found = relative(point)
-        size = len(samples.values) - 1
-        # the log-likelihood where the white noise is scaled so that the mean square is one
-        return -(
-            found.log_likelihood + 0.5 * size * (found.mean_square - 1 - math.log(found.mean_square))
-        )
+    def cost(points: Floats) -> Floats:
+        """Compute minus the log-likelihoods with white noise scaled so that the mean square is one."""
+        squares, size = [], len(samples.values) - 1
+        for point in points:
+            _, found = relative(point)
+            gained = 0.5 * size * (found.mean_square - 1 - math.log(found.mean_square))
+            squares.append(-found.log_likelihood - gained)
+        return np.array(squares)
 
-    limits = [_limits(name, samples.step_s, span_s) for name in beside_white]
+    limits = np.array([_limits(name, samples.step_s, span_s) for name in beside_white]).reshape(-1, 2)
     point = np.zeros(0)
     if beside_white:
         grid = [np.linspace(low, high, 9 if len(limits) < 3 else 6)[:-1] for low, high in limits]
         places = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, len(limits))
-        costs = [cost(place) for place in places]
-        point = places[int(np.argmin(costs))]
-        if len(limits) == 1:
-            step = grid[0][1] - grid[0][0]
-            near = max(limits[0][0], point[0] - step), min(limits[0][1], point[0] + step)
-            one = minimize_scalar(
-                lambda x: cost(np.array([x])), bounds=near, method="bounded", options={"xatol": 1e-2}
-            )
-            point = np.array([one.x])
-        else:
-            options = {"xatol": 1e-2, "fatol": 1e-3, "maxfev": 400}
-            point = minimize(cost, point, method="Nelder-Mead", options=options).x
+        start = places[int(np.argmin(cost(places)))]
+        point, _ = minimum(cost, start, (limits[:, 0], limits[:, 1]), tolerance=_GAIN)
     terms, found = relative(point)
     scale = math.sqrt(found.mean_square)
     start = np.log([scale, *(_scaled(terms, name, scale) for name in beside_white)])
-    objective = _objective(samples, free)
-    return _polished(objective, free, start, len(samples.values))
+    return _polished(_cost(samples, free), free, start, len(samples.values))
 
 
 def _limits(name: str, step_s: float, span_s: float) -> tuple[float, float]:
@@ -140,11 +127,11 @@ def _scaled(terms: Terms, name: str, scale: float) -> float:
     return value if name == "markov_time_s" else value * scale
 
 
-def _objective(samples: Samples, free: Sequence[str]) -> Objective:
-    def log_likelihood(point: Floats) -> float:
-        return likelihood(samples, of_point(free, point)).log_likelihood
-
-    return log_likelihood
+def _cost(samples: Samples, free: Sequence[str]) -> Cost:
+    """Return minus the log-likelihoods (n,) of the logarithms (n, p) of numbers."""
+    return lambda points: np.array(
+        [-likelihood(samples, of_point(free, each)).log_likelihood for each in points]
+    )
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
@@ -160,82 +147,43 @@ def of_point(free: Sequence[str], point: Floats) -> Terms:
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 
-def _polished(objective: Objective, free: tuple[str, ...], point: Floats, size: int) -> Fit:
+def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fit:
     """Take Newton's steps, as long as they gain; none where a number is not determined."""
-    best = objective(point)
+    [best] = cost(point[None])
     reach = np.full(len(point), 0.01)
-    curvature = np.zeros((len(point), len(point)))
+    bent = np.zeros((len(point), len(point)))
     for _ in range(6):
-        gradient, curvature = _derivatives(objective, point, best, reach)
-        if np.linalg.eigvalsh(curvature)[0] <= 1e-3:
+        around, bent = curvature(cost, point, range(len(point)), reach)
+        if np.linalg.eigvalsh(bent)[0] <= 1e-3:
             break
-        sigmas = np.sqrt(np.diag(np.linalg.inv(curvature)))
+        sigmas = np.sqrt(np.diag(np.linalg.inv(bent)))
         reach = np.minimum(0.03 * sigmas, 0.1)
-        move = np.linalg.solve(curvature, gradient)
-        moved = objective(point + move)
-        if not moved > best - 1e-9 * abs(best) or np.max(np.abs(move)) > 2:
+        move = -np.linalg.solve(bent, around.slopes)
+        [moved] = cost((point + move)[None])
+        if not moved < best + 1e-9 * abs(best) or np.max(np.abs(move)) > 2:
             break
         point, best = point + move, moved
         if np.max(np.abs(move) / sigmas) < 3e-5:
             break
-    return Fit(free, of_point(free, point), best, curvature, size)
+    return Fit(free, of_point(free, point), -float(best), bent, size)
 
 
-def _derivatives(
-    objective: Objective, point: Floats, here: float, reach: Floats
-) -> tuple[Floats, Floats]:
-    """Compute the gradient and minus the second derivatives by central differences."""
-    moves = np.diag(reach)
-    ahead, behind = (np.array([objective(point + sign * move) for move in moves]) for sign in (1, -1))
-    curvature = np.diag(-(ahead - 2 * here + behind) / reach**2)
-    for i in range(len(point)):
-        for j in range(i):
-            both = objective(point + moves[i] + moves[j]) + objective(point - moves[i] - moves[j])
-            mixed = both - ahead[i] - ahead[j] - behind[i] - behind[j] + 2 * here
-            curvature[i, j] = curvature[j, i] = -mixed / (2 * reach[i] * reach[j])
-    return (ahead - behind) / (2 * reach), curvature
-
-
-def profile_interval(samples: Samples, found: Fit, name: str) -> tuple[float, float]:
-    """Return the 95 % interval of one number of a fit, all others following it.
+def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
+    """Return the 95 % intervals of a fit's numbers by name, for each all others following it.
 
     An end that no value within reach is at is zero, or infinite.
     """
-    place = found.free.index(name)
-    others = [i for i in range(len(found.free)) if i != place]
     point = np.log([getattr(found.terms, each) for each in found.free])
-    objective = _objective(samples, found.free)
-    sigma = float(found.sigmas[place])
-    block = found.curvature[np.ix_(others, others)]
-    follows = -np.linalg.pinv(block) @ found.curvature[others, place]
-    reach = 0.05 * found.sigmas[others]
-
-    def root(distance: float) -> float:
-        """Compute the signed root of twice the log-likelihood's loss, less that at an interval's end."""
-        at = point.copy()
-        at[place] += sign * distance * sigma
-        at[others] += follows * sign * distance * sigma
-        for _ in range(2 if others else 0):
-            slope = np.zeros(len(others))
-            for k, other in enumerate(others):
-                move = np.zeros(len(at))
-                move[other] = reach[k]
-                slope[k] = (objective(at + move) - objective(at - move)) / (2 * reach[k])
-            at[others] += np.linalg.pinv(block) @ slope
-        lost = found.log_likelihood - objective(at)
-        return math.sqrt(2 * max(lost, 0.0)) - math.sqrt(2 * DROP)
-
-    ends = []
-    for sign in (-1, 1):
-        far = 3.0
-        while far < _FARTHEST and root(far) < 0:
-            far *= 1.5
-        if far >= _FARTHEST:
-            ends.append(0.0 if sign < 0 else math.inf)
-        else:
-            distance = brentq(root, 0.5, far, xtol=1e-3) if root(0.5) < 0 else 0.5
-            ends.append(math.exp(point[place] + sign * distance * sigma))
-    return ends[0], ends[1]
+    ends = profile_ends(
+        _cost(samples, found.free),
+        point,
+        found.curvature,
+        corrections=2,
+        within=_WITHIN,
+        doublings=_DOUBLINGS,
+    )
+    low, high = np.exp(ends).tolist()
+    return dict(zip(found.free, zip(low, high, strict=True), strict=True))
 
 
 def walk_below(samples: Samples, white: Fit) -> float:
@@ -252,9 +200,11 @@ def walk_below(samples: Samples, white: Fit) -> float:
     values = [beside(each)[0] for each in grid]
     top = max(*values, white.log_likelihood)
     beyond = next(
-        (i for i in range(int(np.argmax(values)), len(grid)) if values[i] < top - DROP), len(grid) - 1
+        (i for i in range(int(np.argmax(values)), len(grid)) if values[i] < top - DROP_95), len(grid) - 1
     )
-    if beyond == 0 or values[beyond] >= top - DROP:
+    if beyond == 0 or values[beyond] >= top - DROP_95:
         return math.exp(grid[beyond]) * white.terms.white
-    ratio = brentq(lambda each: beside(each)[0] - top + DROP, grid[beyond - 1], grid[beyond], xtol=1e-3)
+    ratio = brentq(
+        lambda each: beside(each)[0] - top + DROP_95, grid[beyond - 1], grid[beyond], xtol=1e-3
+    )
     return math.exp(ratio) * beside(ratio)[1]

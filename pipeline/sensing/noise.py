@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.sensing import preparing
 from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom, interval, multiples_of
-from fuselog.pipeline.sensing.fitting import choose, profile_interval, walk_below
+from fuselog.pipeline.sensing.fitting import choose, intervals, walk_below
 from fuselog.pipeline.sensing.outcome import MISFIT, ColumnNoise, SensorNoise
 from fuselog.pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
 from fuselog.recorders import units
@@ -186,8 +186,8 @@ def _analysed(
         )
     fitted = choose(samples)
     numbers = {
-        each: Interval(getattr(fitted.terms, each), *profile_interval(samples, fitted, each))
-        for each in fitted.free
+        name: Interval(getattr(fitted.terms, name), *ends)
+        for name, ends in intervals(samples, fitted).items()
     }
     if not {"walk", "markov"} & set(fitted.free):
         numbers["walk"] = Interval(0.0, 0.0, walk_below(samples, fitted))

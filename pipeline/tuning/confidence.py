@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from fuselog.pipeline.tuning.search import UNIT, Coordinates, Cost
+from fuselog.pipeline.optimise import QUANTILE, Cost
+from fuselog.pipeline.tuning.search import UNIT, Coordinates
 from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
 INVOLVED = 0.3  # of a direction of length one
-QUANTILE = float(ndtri(0.975))
 PROFILE_POINTS = 9
 PROFILE_ERRORS = 3.0  # standard errors to either side
 MEANINGLESS = 100.0  # a factor that leaves nothing known

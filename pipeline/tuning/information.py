@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.pipeline.tuning.confidence import QUANTILE
+from fuselog.pipeline.optimise import QUANTILE
 from fuselog.pipeline.tuning.objective import Objective, Run, innovations_in
 from fuselog.pipeline.tuning.search import MOVES
 from fuselog.recorders.log import Stream

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from fuselog.pipeline.altering.sources import setting_of
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.replays import Replay, replay
+from fuselog.pipeline.optimise import DROP_95, QUANTILE
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from fuselog.pipeline.output.summary import summarise, summary_table
 from fuselog.pipeline.output.words import label_of
-from fuselog.pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
+from fuselog.pipeline.tuning.confidence import Profile, SearchOutcome, doubts, profiles
 from fuselog.pipeline.tuning.objective import Objective, innovations_in
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
@@ -395,7 +396,7 @@ class Tuning:
                 ),
                 y=Axis(label="log-likelihood less its greatest"),
                 series=[
-                    level("95 %", each.along, -0.5 * QUANTILE**2),
+                    level("95 %", each.along, -DROP_95),
                     curve("by curvature", each.along, -each.parabola, "dashed", reference=True),
                     curve("log-likelihood", each.along, -each.rise, "line+markers"),
                 ],

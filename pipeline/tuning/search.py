@@ -1,34 +1,28 @@
 """Searches for the parameters of least cost.
 
 It goes over the logarithm of what is positive, a standard deviation say; anything else has a unit of its
-own. Gradient and curvature are central differences, whose points are handed over together.
+own.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
-from typing import Any
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
+from fuselog.pipeline.optimise import ITERATIONS, TOLERANCE, Cost, minimum
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
-# Points (n, k) of k values -> what each costs (n,); infinity where it cannot be used.
-Cost = Callable[[Floats], Floats]
 
-STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
-ITERATIONS = 200
-TOLERANCE = 1e-13  # of a cost: what a step has to gain
+CURVATURE_STEP = 1e-2  # of the differences, in coordinates
 DESCENTS = 20  # each of which ends where another parameter's change costs less
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
 # of a calibration's parameter in a scan, in useful units
 MOVES = np.array([-10.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 10.0])
 LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
-FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches
 UNIT = 10.0  # standard errors that it has alone
 
@@ -55,6 +49,10 @@ class Coordinates:
         """Return the values (..., k) at coordinates, which may lie beyond the bounds."""
         with np.errstate(over="ignore"):
             return np.where(self._is_log, np.exp(coordinates), coordinates * self.units)
+
+    def over(self, cost: Cost) -> Cost:
+        """Return the cost of coordinates (n, k)."""
+        return lambda points: cost(self.values(points))
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -145,7 +143,7 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     axes = [np.linspace(begin, end, points) for begin, end in zip(low, high, strict=True)]
     start = coordinates.of(np.array([each.default for each in coordinates.free]))
     tried = np.array([start, *product(*axes)])
-    return tried[np.argmin(cost(coordinates.values(tried)))]
+    return tried[np.argmin(coordinates.over(cost)(tried))]
 
 
 def least(
@@ -221,92 +219,8 @@ def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
 def _minimum(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool, tolerance: float
 ) -> tuple[Floats, bool]:
-    """Find the minimum (k,) that the cost falls to from a start (k,), and whether the search converged.
-
-    In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
-    """
-    low, high = coordinates.bounds
+    """Find the minimum (k,) that the cost falls to, and whether the search converged."""
+    bounds = coordinates.bounds
     if all(each.is_fixed for each in coordinates.free):
-        return low, True
-    # what cannot be used is a wall that a search turns back from
-    at_start = float(cost(coordinates.values(start[None]))[0])
-    wall = (10.0 * abs(at_start) if np.isfinite(at_start) else 0.0) + 1e6
-
-    def costs(points: Floats) -> Floats:
-        return np.fmin(cost(coordinates.values(points)), wall)
-
-    def with_gradient(point: Floats) -> tuple[float, Floats]:
-        """Return the cost and its slopes; none towards a side that cannot be used, as at a bound."""
-        steps = STEP * np.eye(len(point))
-        points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
-        here, ahead, behind = np.split(costs(points), [1, 1 + len(point)])
-        above, below = np.split(points[1:], 2)
-        is_ahead, is_behind = ahead < wall, behind < wall
-        rise = np.where(is_ahead, ahead, here) - np.where(is_behind, behind, here)
-        ends = np.where(is_ahead, above.diagonal(), point) - np.where(is_behind, below.diagonal(), point)
-        slopes = np.divide(rise, ends, np.zeros_like(rise), where=ends > 0.0)
-        is_blocked = np.where(slopes < 0.0, ~is_ahead, ~is_behind)
-        return float(here[0]), np.where(is_blocked, 0.0, slopes)
-
-    bounds = list(zip(low, high, strict=True))
-    if is_smooth:
-        options: dict[str, Any] = {"maxiter": ITERATIONS, "ftol": tolerance, "gtol": 1e-5}
-        found = minimize(
-            with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-        )
-        return found.x, bool(found.nit < ITERATIONS)
-    simplex = np.clip(
-        np.concatenate([start[None], start + FIRST_SIMPLEX * np.eye(len(start))]), low, high
-    )
-    options = {
-        "initial_simplex": simplex,
-        "xatol": 1e-3,
-        "fatol": 1e-9,
-        "maxiter": ITERATIONS * len(start),
-    }
-    found = minimize(
-        lambda point: float(costs(point[None])[0]),
-        start,
-        method="Nelder-Mead",
-        bounds=bounds,
-        options=options,
-    )
-    return found.x, bool(found.success)
-
-
-def curvature(
-    cost: Cost,
-    coordinates: Coordinates,
-    point: Floats,
-    places: Sequence[int],
-    steps: float | Floats = CURVATURE_STEP,
-) -> Floats:
-    """Compute the second derivatives of the cost at a point.
-
-    Args:
-        cost: what values (n, k) cost.
-        coordinates: what is searched over.
-        point: (k,), in coordinates.
-        places: by which m of the k coordinates.
-        steps: of the differences, of all coordinates or (m,).
-
-    Returns:
-        (m, m), by coordinates; not finite where the cost beside the point is not.
-    """
-    m, h = len(places), np.broadcast_to(steps, len(places))
-    along = h[:, None] * np.eye(len(point))[list(places)]
-    pairs = list(combinations(range(m), 2))
-    corners = [
-        point + first * along[i] + second * along[j]
-        for i, j in pairs
-        for first, second in product((1, -1), repeat=2)
-    ]
-    costs = cost(coordinates.values(np.array([point, *(point + along), *(point - along), *corners])))
-    ahead, behind, crossed = np.split(costs[1:], [m, 2 * m])
-    both, plus, minus, neither = crossed.reshape(-1, 4).T
-    with np.errstate(invalid="ignore"):
-        found = np.diag((ahead - 2.0 * costs[0] + behind) / h**2)
-        mixed = (both - plus - minus + neither) / 4.0
-    for (i, j), value in zip(pairs, mixed, strict=True):
-        found[i, j] = found[j, i] = value / (h[i] * h[j])
-    return found
+        return bounds[0], True
+    return minimum(coordinates.over(cost), start, bounds, is_smooth=is_smooth, tolerance=tolerance)

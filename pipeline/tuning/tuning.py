@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from fuselog.pipeline.altering.changes import is_of_topic
 from fuselog.pipeline.altering.sources import split_settings
 from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
+from fuselog.pipeline.optimise import DROP_95, beside, curvature
 from fuselog.pipeline.runs.executors import WorkerPool, pool_for
 from fuselog.pipeline.tuning.confidence import (
-    QUANTILE,
     Confidence,
     SearchOutcome,
     confidence,
@@ -45,9 +45,7 @@ from fuselog.pipeline.tuning.search import (
     LOOKS,
     MOVES,
     Coordinates,
-    Cost,
     coordinates_of,
-    curvature,
     least,
     least_of_grid,
     scanned,
@@ -69,7 +67,6 @@ NOISY_REACH = 5.0  # standard errors, to which they reach at most if another ste
 NOISY_PAIRS = 32  # of copies that tell what the noise of the controls adds to slopes; a power of two
 DIVERGED = 2.0  # NIS per component: twice what it should be
 ROUNDS = 4  # of searches, each from where filters begin with the values of the one before
-ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
 
 
 @without_warnings_of_numbers()
@@ -440,7 +437,7 @@ def _search(
         low, high = nearer.bounds
         ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
         best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
-        if cost - best < ENOUGH:
+        if cost - best < DROP_95:
             coordinates = nearer
             point, known, at_edge = _confidence_at(objective, coordinates, ended)
     optimum, evaluations = coordinates.values(point), objective.best.evaluations
@@ -493,10 +490,10 @@ def _noisy_steps(
     others = np.where([each.is_log for each in free], CURVATURE_STEP, NOISY_STEP)
     steps = np.where(useful > 0.0, useful, others)
     for _ in range(LOOKS):
-        ahead, here, behind = _beside(objective, coordinates, point, places, steps)
+        bends = beside(coordinates.over(objective), point, places, steps).bends
         with np.errstate(divide="ignore", invalid="ignore"):
-            nearer = NOISY_REACH * steps / np.sqrt(ahead - 2.0 * here + behind)
-        nearer = np.where(np.isfinite(ahead + behind), nearer, 0.5 * steps)
+            nearer = NOISY_REACH / np.sqrt(bends)
+        nearer = np.where(np.isfinite(bends), nearer, 0.5 * steps)
         steps = np.where((useful > 0.0) & (nearer < steps), nearer, steps)
     return steps
 
@@ -513,16 +510,7 @@ def _curvature(
     Then an edge next to the point changes it as it does the differences of slopes over these steps.
     """
     times = 2.0 if objective.is_corrected else 1.0
-    return curvature(objective, coordinates, point, places, times * steps)
-
-
-def _beside(
-    cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int], steps: Floats
-) -> tuple[Floats, float, Floats]:
-    """Compute what it costs a step (m,) ahead along each place, at the point, and a step behind."""
-    along = steps[:, None] * np.eye(len(point))[list(places)]
-    costs = cost(coordinates.values(np.array([point, *(point + along), *(point - along)])))
-    return costs[1 : 1 + len(steps)], float(costs[0]), costs[1 + len(steps) :]
+    return curvature(coordinates.over(objective), point, places, times * steps)[1]
 
 
 def _levelled(
@@ -543,8 +531,7 @@ def _levelled(
         return point
     level = point
     for _ in range(LOOKS):
-        ahead, _, behind = _beside(objective, coordinates, level, places, steps)
-        move = -np.linalg.solve(bent, (ahead - behind) / (2.0 * steps))
+        move = -np.linalg.solve(bent, beside(coordinates.over(objective), level, places, steps).slopes)
         if not np.isfinite(move).all():
             return point
         level = level.copy()
@@ -591,7 +578,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
     second = np.clip(coordinates.of(found.optimum) + moves, low, high)
     ended, _ = least(objective, coordinates, second, is_smooth=True)
     best, cost = objective(np.array([found.optimum, coordinates.values(ended)]))
-    if abs(cost - best) < ENOUGH:
+    if abs(cost - best) < DROP_95:
         return found
     if cost < best:
         better = _search(objective, coordinates.free, 1, ended)

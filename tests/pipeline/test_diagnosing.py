@@ -23,7 +23,8 @@ from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations, o
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
-from fuselog.pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
+from fuselog.pipeline.diagnosing.search import Gains, Peak, peak
+from fuselog.pipeline.optimise import end, side_by_side
 from fuselog.recorders.linting.lint import lint
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
@@ -84,7 +85,7 @@ def test_a_peak_far_from_where_the_search_begins_has_its_interval() -> None:
 
     found = found_by(parabola(-1.0, 1.0), gain, 5.0)
     assert found[:2] == pytest.approx((30.0, 45000.0), rel=1e-6)
-    searches = [end(found, -1.0), end(found, 1.0)]
+    searches = [end(found.value, found.gain, way) for way in (-1.0, 1.0)]
     ends = side_by_side(searches, lambda asked: gain([value for _, value in asked]))
     assert ends == pytest.approx((29.804, 30.196), abs=2e-3)
     assert found_by(parabola(-1.0, 1.0, limit=10.0), gain, 5.0).value == pytest.approx(10.0, abs=0.02)
@@ -118,7 +119,7 @@ def test_every_search_ends(name: str) -> None:
         return [GAINS_WITHOUT_A_PEAK[name](value) for value in values]
 
     def ends(at: Peak, scale: float) -> list[float]:
-        searches = [end(at, -scale), end(at, scale)]
+        searches = [end(at.value, at.gain, way * scale) for way in (-1.0, 1.0)]
         return side_by_side(searches, lambda asked: gain([value for _, value in asked]))
 
     found = found_by(parabola(-1.0, 1.0, 0.5, limit=1e3), gain, 5.0)

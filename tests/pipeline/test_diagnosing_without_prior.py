@@ -26,7 +26,7 @@ from fuselog.pipeline.diagnosing.likelihood import (
     _span,
     first_of_each,
 )
-from fuselog.pipeline.diagnosing.search import DROP_95
+from fuselog.pipeline.optimise import DROP_95
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 

@@ -12,7 +12,7 @@ import fuselog as fl
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.calibrating import ellipsoid_study as study
 from fuselog.pipeline.calibrating.ellipsoid_fit import NAMES
-from fuselog.pipeline.tuning.confidence import QUANTILE
+from fuselog.pipeline.optimise import QUANTILE
 from tests.goldens import keeping
 from tests.pipeline.conftest import Said
 

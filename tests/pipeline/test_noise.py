@@ -17,7 +17,7 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.sensing import exports, study
 from fuselog.pipeline.sensing.allan import allan_deviation, degrees_of_freedom
-from fuselog.pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
+from fuselog.pipeline.sensing.fitting import choose, fit, intervals, walk_below
 from fuselog.pipeline.sensing.likelihood import Samples, likelihood
 from fuselog.pipeline.sensing.noise import _drifts, parse_sheet
 from fuselog.pipeline.sensing.preparing import (
@@ -131,12 +131,9 @@ def test_the_likeliest_noise_and_its_interval(walking: np.ndarray) -> None:
     )
     assert found.log_likelihood == pytest.approx(231458.393072, abs=1e-4)
     assert found.sigmas == pytest.approx([0.002765, 0.117495], rel=1e-3)
-    assert profile_interval(samples, found, "white") == pytest.approx(
-        (9.9442081e-4, 1.0052586e-3), rel=1e-5
-    )
-    assert profile_interval(samples, found, "walk") == pytest.approx(
-        (8.9022984e-5, 1.4102172e-4), rel=1e-4
-    )
+    ends = intervals(samples, found)
+    assert ends["white"] == pytest.approx((9.9442081e-4, 1.0052586e-3), rel=1e-5)
+    assert ends["walk"] == pytest.approx((8.9022984e-5, 1.4102172e-4), rel=1e-4)
 
 
 def test_a_walk_that_is_not_there_has_a_bound() -> None:

@@ -17,12 +17,13 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
+from fuselog.pipeline.optimise import DROP_95, Cost, curvature
 from fuselog.pipeline.output.results import read_result
 from fuselog.pipeline.runs.executors import InlineExecutor
 from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence
 from fuselog.pipeline.tuning.objective import Best, Objective
-from fuselog.pipeline.tuning.search import Coordinates, Cost, curvature, least, scanned
-from fuselog.pipeline.tuning.tuning import ENOUGH, _confirmed
+from fuselog.pipeline.tuning.search import Coordinates, least, scanned
+from fuselog.pipeline.tuning.tuning import _confirmed
 from fuselog.recorders.log import RunMetadata
 from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.recording import Recording
@@ -631,7 +632,7 @@ def test_a_start_ten_times_off_leads_to_the_same_optimum(
     far = fl.tune(log, estimator, free, set=dict(factor * starts), bounds=bounds)
     # what a log does not determine stays where it began or goes to its bound, as rounding has it
     is_open = any("not at all" in note or "bound" in note for note in near.notes_of_search)
-    within = ENOUGH if is_open else 0.01
+    within = DROP_95 if is_open else 0.01
     assert far.costs[1] == pytest.approx(near.costs[1], abs=within)
     for row in near.parameters.assign(far=far.found.optimum).to_dict("records"):
         is_said = any(row["parameter"] in note for note in near.notes_of_search)
