@@ -304,7 +304,8 @@ def _print_outcome(
         print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
-    print_metrics(values, judge.bounds, judge.runs_table)
+    runs = judge.runs_table if judge.runs > 1 else None  # which takes pandas, slow to import
+    print_metrics(values, judge.bounds, runs)
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(

@@ -47,6 +47,7 @@ from fuselog.replay.judging.errors.differences import (
     target_of,
 )
 from fuselog.replay.judging.intervals import FEWEST_RUNS
+from fuselog.replay.judging.verdicts import DIFFER, Comparison
 
 MARGIN = 0.02
 # The differences over time have at most so many spans.
@@ -86,14 +87,14 @@ class Differences:
             about = {"quantity": each.quantity, "case": each.case, "aim": _target_text(each.target)}
             when = {"most_from_s": begin_s, "most_to_s": end_s}
             if each.is_withheld:
-                found["verdict"] = "withheld"
+                found["verdict"] = Comparison.WITHHELD.value
             rows.append({"first": first, "second": second, **about, **found, **when})
         return pd.DataFrame(rows)
 
     @property
     def sentences(self) -> list[str]:
         """Return the verdicts in words, those on differences first."""
-        order = ("worse", "better", "higher", "lower", "unclear", "no difference")
+        order = (*DIFFER, Comparison.UNDECIDED, Comparison.TIE)
         return [
             each.sentence for each in sorted(self.paired, key=lambda p: order.index(p.found.verdict))
         ]
@@ -113,7 +114,9 @@ class Differences:
                 f"{runs_of(runs)} cannot show that a side is worse, since an interval needs "
                 f"{FEWEST_RUNS}; give more runs, or leave out --fail-if-worse"
             )
-        worse = [each for each in judged if each.found.verdict == "worse" and not each.is_withheld]
+        worse = [
+            each for each in judged if each.found.verdict == Comparison.WORSE and not each.is_withheld
+        ]
         failing = {each.second for each in worse}
         for first, *others in self.groups:
             for second in others:
@@ -409,7 +412,7 @@ def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
     """Find the run of spans that has most of a difference, where that is beyond the margin."""
-    if over_time.empty or found.verdict in ("no difference", "unclear"):
+    if over_time.empty or found.verdict not in DIFFER:
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]
     own = own.sort_values("from_s").reset_index(drop=True)

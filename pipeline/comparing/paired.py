@@ -7,9 +7,9 @@ from fuselog.pipeline.comparing.groups import runs_of
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.replay.judging.errors.differences import Difference, Target
 from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
+from fuselog.replay.judging.verdicts import DIFFER, Comparison
 
 ALL = "all"
-DECIDED = ("worse", "better", "higher", "lower")
 
 
 class Paired(NamedTuple):
@@ -37,7 +37,7 @@ class Paired(NamedTuple):
     @property
     def is_withheld(self) -> bool:
         """Tell whether changes that should not matter move the metric further than the difference."""
-        return self.found.verdict in DECIDED and abs(self.found.more.value) < self.stressed
+        return self.found.verdict in DIFFER and abs(self.found.more.value) < self.stressed
 
     @property
     def sentence(self) -> str:
@@ -48,14 +48,14 @@ class Paired(NamedTuple):
         if isinstance(self.target, float):
             values += f", where {self.target:g} is right"
         if found.runs < FEWEST_RUNS:
-            equal = "equal in every run; " if found.verdict == "no difference" else ""
+            equal = "equal in every run; " if found.verdict == Comparison.TIE else ""
             return f"{self.quantity}{of}: {values}; {equal}{too_few(found.runs)}"
         interval = f"difference {found.more}"
         of_runs = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
-        if found.verdict == "unclear":
+        if found.verdict == Comparison.UNDECIDED:
             verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
-        elif found.verdict == "no difference":
+        elif found.verdict == Comparison.TIE:
             verdict = f"no difference beyond the margin between {self.second} and {self.first}"
         if self.is_withheld:
             return (

@@ -14,6 +14,7 @@ from fuselog.pipeline.output.results import RUNS, Result, read_table
 from fuselog.pipeline.output.words import count, meaning_alone, number, quantity, scale
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.replay.judging.verdicts import Consistency
 
 MENDED = "mended"
 STILL_WRONG = (
@@ -32,7 +33,8 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
     settings = result.settings.get("estimators") or {}
     causes = []
     for label, evidence in found.of.items():
-        if not logs or label not in settings or evidence.state not in ("too sure", "too careful"):
+        is_off = evidence.verdict in (Consistency.OVERCONFIDENT, Consistency.CONSERVATIVE)
+        if not logs or label not in settings or not is_off:
             continue
         own = {"kind": label, **settings[label]}
         gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))

@@ -9,12 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Stream, schemas, topics_of
-from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.judging.consistency.whiteness import Whiteness, whitened, whiteness
-from fuselog.replay.judging.errors.evaluation import POSITION, Errors, split_topic
+from fuselog.replay.judging.errors.evaluation import (
+    POSITION,
+    Errors,
+    chi_square_band,
+    chi_square_interval,
+    split_topic,
+)
 
 Floats = NDArray[np.float64]
 BIN_S = 1.0  # NIS is drawn as means over so long
@@ -71,8 +76,7 @@ class Case:
     def nees_interval(self) -> tuple[float, float]:
         """Return where 95 % of NEES of a consistent filter lie, of the components that the truth has."""
         assert self.errors is not None
-        low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.errors.components)))
-        return float(low), float(high)
+        return chi_square_interval(len(self.errors.components), 1)
 
 
 def cases_of(
@@ -159,8 +163,7 @@ def _of_innovations(
     count = np.bincount(place, degrees)
     known = count > 0
     starts, squared, count = starts[known], squared[known], count[known]
-    low, high = (np.asarray(chi2.ppf(np.full(len(count), each), count)) for each in (0.025, 0.975))
-    nis = Nis(np.asarray((starts + 0.5) * BIN_S), squared / count, low / count, high / count)
+    nis = Nis(np.asarray((starts + 0.5) * BIN_S), squared / count, *chi_square_band(count))
     series = whitened(stream).T
     white = {name: whiteness([each]) for name, each in zip(stream.components, series, strict=True)}
     stated = stream.columns.get("log_likelihood")

@@ -7,7 +7,7 @@ from fuselog.pipeline.exploring.curves import LINES, Case
 from fuselog.pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
 from fuselog.pipeline.exploring.session import Played
 from fuselog.pipeline.exploring.sliders import Slider, in_words
-from fuselog.pipeline.exploring.verdict import LIKELIHOOD, Verdict, numbers_of
+from fuselog.pipeline.exploring.verdict import LIKELIHOOD, Summary, numbers_of
 from fuselog.pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
@@ -55,7 +55,7 @@ def head_html(
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
-        verdict = one.verdicts.get(case, Verdict("failed", "It estimated nothing.", ""))
+        verdict = one.verdicts.get(case, Summary("failed", "It estimated nothing.", ""))
         parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
         if case in one.cases:
             parts.append(_numbers_html(one, played.get(PINNED), case))
@@ -79,7 +79,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
     return found
 
 
-def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
+def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
     """Write a filter's verdict, in its colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"

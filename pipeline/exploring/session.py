@@ -17,7 +17,7 @@ from fuselog.pipeline.api.replays import replay as replayed
 from fuselog.pipeline.diagnosing.diagnosis import diagnose
 from fuselog.pipeline.exploring.curves import Case, cases_of
 from fuselog.pipeline.exploring.sliders import Slider, setting_text, sliders_of
-from fuselog.pipeline.exploring.verdict import Verdict, verdict_of
+from fuselog.pipeline.exploring.verdict import Summary, verdict_of
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.runs.settings import parameters_by_label, with_settings
 from fuselog.pipeline.tuning.objective import Run, in_memory
@@ -54,7 +54,7 @@ class Played:
     label: str
     values: Values
     cases: Mapping[str, Case]
-    verdicts: Mapping[str, Verdict]
+    verdicts: Mapping[str, Summary]
     seconds: float
 
 

@@ -1,7 +1,7 @@
 """Writes the verdict on a filter on a log: one sentence, and what it rests on."""
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,12 +9,15 @@ import numpy as np
 from fuselog.pipeline.exploring.curves import Case
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
+from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Consistency, Squares, decisive
 
 LIKELIHOOD = "log-likelihood, open gate"
 Level = Literal["good", "doubtful", "failed"]
 
 
-class Verdict(NamedTuple):
+class Summary(NamedTuple):
     """States a judgement in words.
 
     Attributes:
@@ -28,40 +31,33 @@ class Verdict(NamedTuple):
     detail: str
 
 
-def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Verdict:
-    """Judge one filter on one log, by the alarms of its replay; those of other cases do not count.
-
-    Whether a filter is too sure of itself is what NIS and NEES say, see
-    `fuselog.pipeline.output.alarming`.
-    """
+def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Summary:
+    """Judge one filter on one log, by NEES and NIS and by the alarms of its replay, if of this case."""
     if failures:
-        return Verdict("failed", "It stopped.", failures[0])
+        return Summary("failed", "It stopped.", failures[0])
     own = [each for each in alarms if each.case in ("", case.name)]
-    if not own:
-        return Verdict("good", "Nothing speaks against it.", _evidence(case))
-    ratio, of_what = _ratio(case, {each.kind for each in own})
-    if math.isnan(ratio):
-        return Verdict("doubtful", "Doubtful.", own[0].words)
-    if ratio > 1.0:
-        return Verdict(
-            "doubtful", "Too sure of itself.", f"Its {of_what} are {ratio:.2g} times what it claims."
-        )
-    return Verdict("doubtful", "Too careful.", f"Its {of_what} are {ratio:.2g} of what it claims.")
+    by = decisive(_squares_of(case))
+    has_other_cause = bool(own) and {"errors", "innovations"}.isdisjoint(each.kind for each in own)
+    if by is None or by.verdict == Consistency.CONSISTENT or has_other_cause:
+        if own:
+            return Summary("doubtful", "Doubtful.", own[0].words)
+        return Summary("good", "Nothing speaks against it.", _evidence(case))
+    times = "times what" if by.verdict == Consistency.OVERCONFIDENT else "of what"
+    detail = f"Its {by.name} are {by.factor:.2g} {times} it claims."
+    return Summary("doubtful", f"{by.verdict.capitalize()}.", detail)
 
 
-def _ratio(case: Case, about: Set[str]) -> tuple[float, str]:
-    """Find how many times larger errors or innovations are than stated, and which of them it is.
-
-    Of those that alarms are about the one that is farther from one: a filter may be right on what it
-    measures and wrong on the rest. NaN where no alarm is about either, or there are no numbers.
-    """
+def _squares_of(case: Case) -> list[Squares]:
+    """Return NEES and NIS of one log, as far as there are any."""
     found = []
-    if "errors" in about and case.errors is not None and np.isfinite(case.errors.nees).any():
-        nees = float(np.nanmean(case.errors.nees))
-        found.append((math.sqrt(nees / len(case.errors.components)), "errors"))
-    if "innovations" in about and not math.isnan(nis := mean_nis(case)):
-        found.append((math.sqrt(nis), "innovations"))
-    return max(found, key=lambda each: abs(math.log(max(each[0], 1e-12))), default=(math.nan, ""))
+    if case.errors is not None and np.isfinite(case.errors.nees).any():
+        nees, size = float(np.nanmean(case.errors.nees)), len(case.errors.components)
+        found.append(Squares("errors", Interval(nees), size, chi_square_interval(size, 1)))
+    if not math.isnan(nis := mean_nis(case)):
+        size = sum(each.size for each in case.whiteness.values() if np.isfinite(each.mean_square))
+        low, high = chi_square_interval(size, 1)
+        found.append(Squares("innovations", Interval(nis), 1.0, (low / size, high / size)))
+    return found
 
 
 def mean_nis(case: Case) -> float:

@@ -1,7 +1,8 @@
 """Finds what makes a replay's numbers doubtful, the worst first: a sentence each, and what to do.
 
 A filter whose covariances are right leaves NIS, NEES and the share that its gate keeps out within
-limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error that stays.
+limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error that stays. What it says of
+the filter is decided by `fuselog.replay.judging.verdicts.Squares`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.results import split_metric
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.usage import SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import LOST
@@ -19,6 +21,7 @@ from fuselog.replay.judging.errors.differences import FEWEST_DOMINATED, dominati
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.measuring import metric_key
+from fuselog.replay.judging.verdicts import MATERIAL, Consistency, Squares
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,46 +29,40 @@ if TYPE_CHECKING:
 USUAL_GATE = 0.99  # where it is not known
 RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
 LARGEST = 1e300  # as JSON has no infinity
-# Squared errors so many times too large are no matter of covariances: 10,000 standard deviations.
-DIVERGED = 1e8
+NIS = "nis_per_component"
 OF_DIVERGENCE = "it diverged, or its covariances are of another unit"
+REASONS = {
+    Consistency.OVERCONFIDENT: "its covariances are too small",
+    Consistency.CONSERVATIVE: "its covariances are too large",
+    Consistency.CONSISTENT: f"its covariances are off by less than {MATERIAL:.0%}".replace("%", " %"),
+}
 UNUSED = 0.05  # of a topic's messages
 
 
 class _Range(NamedTuple):
-    """Holds NIS or NEES and the limits within which a consistent filter has it."""
+    """Holds NIS or NEES that is beyond the limits within which a consistent filter has it."""
 
-    value: float
+    of: Squares
     low: float
     high: float
 
     @property
-    def is_within(self) -> bool:
-        """Tell whether a consistent filter has it."""
-        return not (self.value < self.low or self.value > self.high)
-
-    @property
-    def has_diverged(self) -> bool:
-        """Tell whether it is no matter of covariances."""
-        return self.value > DIVERGED * self.high
-
-    @property
     def excess(self) -> float:
         """Return how many times it is beyond a limit."""
-        beyond = self.value / self.high if self.value > self.high else self.low / max(self.value, 1e-9)
+        value = self.of.found.value
+        beyond = value / self.high if value > self.high else self.low / max(value, 1e-9)
         return min(beyond, LARGEST)
 
     @property
-    def limits(self) -> str:
-        """Return the limits in words."""
-        return f"where a consistent filter is within {self.low:.3g} and {self.high:.3g}"
+    def fact(self) -> str:
+        """Return the number and its limits."""
+        limits = f"where a consistent filter is within {self.low:.3g} and {self.high:.3g}"
+        return f"is {self.of.found.value:.3g}{' per component' * (self.of.name == NIS)}, {limits}"
 
     @property
     def reason(self) -> str:
         """Return what it says of the estimator."""
-        if self.has_diverged:
-            return OF_DIVERGENCE
-        return f"its covariances are too {'small' if self.value > self.high else 'large'}"
+        return OF_DIVERGENCE if self.of.has_diverged else REASONS[self.of.verdict]
 
 
 def alarms_of(
@@ -80,11 +77,11 @@ def alarms_of(
     """
     uninformed = [*_of_components(judge)]
     explained = {(each.estimator, each.case) for each in uninformed}
-    nis, nees = _nis(judge), _nees(judge)
+    nis, nees = _beyond(judge, NIS), _beyond(judge, "nees")
     diverged = {
         what: nees[what]
         for what in nis.keys() & nees.keys()
-        if nis[what].has_diverged or nees[what].has_diverged
+        if nis[what].of.has_diverged or nees[what].of.has_diverged
     }
     inconsistent = [
         *_of_innovations(judge, parameters, nis, diverged),
@@ -112,26 +109,14 @@ def _of_components(judge: Judge) -> Iterator[Alarm]:
         yield Alarm("uninformed", estimator, case, LARGEST, words)
 
 
-def _nis(judge: Judge) -> dict[tuple[str, str], _Range]:
-    """Return the NIS per component of estimators and cases where it is beyond its limits."""
-    found = {}
-    for topic, innovations in judge.innovations.items():
-        sums = innovations.total
-        limits = chi_square_interval(max(sums.degrees, 1), 1, CONSISTENT)
-        if sums.degrees:
-            found[split_topic(topic)] = _Range(*(np.array([sums.squared, *limits]) / sums.degrees))
-    return {what: each for what, each in found.items() if not each.is_within}
-
-
-def _nees(judge: Judge, quantity: str = "nees") -> dict[tuple[str, str], _Range]:
-    """Return the NEES of estimators and cases where it is beyond its limits."""
-    intervals, found = judge.intervals(CONSISTENT), {}
-    for topic in judge.judged:
-        estimator, case = split_topic(topic)
-        key = metric_key(estimator, quantity, case)
-        if key in intervals:
-            found[estimator, case] = _Range(judge.metrics[key], *intervals[key])
-    return {what: each for what, each in found.items() if not each.is_within}
+def _beyond(judge: Judge, quantity: str) -> dict[tuple[str, str], _Range]:
+    """Return NIS or NEES of estimators and cases where it is beyond its limits."""
+    metrics, found = judge.metrics, dict[tuple[str, str], _Range]()
+    for key, (low, high) in judge.intervals(CONSISTENT).items():
+        estimator, own, case = split_metric(key)
+        if own == quantity and (metrics[key] < low or metrics[key] > high):
+            found[estimator, case] = _Range(judge.squares(estimator, quantity, case), low, high)
+    return found
 
 
 def _of_innovations(
@@ -163,10 +148,10 @@ def _of_innovations(
             facts.append("its log-likelihood is that of no measurement")
         if own := nis.get((estimator, case)):
             excess = max(excess, own.excess)
-            facts.append(f"NIS is {own.value:.3g} per component, {own.limits}")
+            facts.append(f"NIS {own.fact}")
             if nees := diverged.get((estimator, case)):
                 excess = max(excess, nees.excess)
-                facts.append(f"NEES is {nees.value:.3g}, {nees.limits}")
+                facts.append(f"NEES {nees.fact}")
             facts[-1] += f": {OF_DIVERGENCE if nees else own.reason}"
         if facts:
             words = f"{_name(estimator, case)}: {'; '.join(facts)}; "
@@ -180,16 +165,16 @@ def _of_errors(
     diverged: Mapping[tuple[str, str], _Range],
 ) -> Iterator[Alarm]:
     """Find NEES beyond its interval, if none diverged; of positions whose error stays, that."""
-    constants, positions = judge.constants, _nees(judge, "position_nees")
+    constants, positions = judge.constants, _beyond(judge, "position_nees")
     for topic in judge.judged:
         what = estimator, case = split_topic(topic)
         own, either = nees.get(what), (nees.get(what), positions.get(what))
-        if what in constants and any(each and each.value > each.high for each in either):
+        if what in constants and any(each and each.of.found.value > each.high for each in either):
             yield _of_constant(estimator, case, constants[what])
         elif own and what not in diverged:
-            words = f"{_name(*what)}: NEES is {own.value:.3g}, {own.limits}: {own.reason}"
+            words = f"{_name(*what)}: NEES {own.fact}: {own.reason}"
             words += _of_one_run(judge, estimator, case)
-            if (lacking := judge.unestimated.get(what)) and own.value > own.high:
+            if (lacking := judge.unestimated.get(what)) and own.of.found.value > own.high:
                 more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
                 words += (
                     f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from string import Template
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import PositiveInt, model_validator
@@ -32,12 +32,11 @@ from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
+from fuselog.replay.judging.verdicts import Claimed
 
-Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
-# What a claim has in place of one where the data are not those that it is made of.
-NO_VERDICT: Literal["no verdict"] = "no verdict"
 # The recording of a claim that is made of all there are.
 ANY = "any"
+TOO_FEW = f"too few runs for a 95 % interval, which takes {FEWEST_RUNS}"
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,18 @@ class Claim:
         claim: the statement.
         paper: what the paper prints, or where.
         ours: what we measured.
-        verdict: see `Verdict`.
+        verdict: a `Claimed`, or its word.
         why: the reason of the verdict; of a refuted claim at least the numbers that are against it.
     """
 
     claim: str
     paper: str
     ours: str
-    verdict: Verdict | Literal["no verdict"]
+    verdict: Claimed
     why: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "verdict", Claimed(self.verdict))
 
 
 def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str = "") -> Claim:
@@ -77,16 +79,16 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
     >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
     'confirmed'
     """
-    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
+    return Claim(claim, paper, ours, Claimed.CONFIRMED if holds else Claimed.REFUTED, why)
 
 
 def known(claim: Claim) -> Claim:
     """Return the claim, neither confirmed nor refuted where a number of ours is missing."""
-    is_decided = claim.verdict in ("confirmed", "refuted")
-    if not is_decided or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
+    has_none = claim.verdict in (Claimed.NOT_REPRODUCIBLE, Claimed.NO_VERDICT) or claim.why == TOO_FEW
+    if has_none or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
         return claim
     why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
-    return replace(claim, verdict="not reproducible", why=why)
+    return replace(claim, verdict=Claimed.NOT_REPRODUCIBLE, why=why)
 
 
 class StatedClaim(Parameters):
@@ -97,7 +99,7 @@ class StatedClaim(Parameters):
     Attributes:
         sentence: what is claimed.
         paper: what the paper says, or where the limit comes from.
-        holds: comparison that decides: confirmed, refuted, or not shown where an interval holds both;
+        holds: comparison that decides: confirmed, refuted, or inconclusive if an interval holds both;
             without one the claim is not reproducible.
         value: expression that the texts and the comparison name `value`.
         ours: what we found.
@@ -110,8 +112,8 @@ class StatedClaim(Parameters):
         given: numbers or expressions by the names that the texts and the comparison have for them.
         optional: whether it is left out where the result lacks one of its metrics, in place of not
             reproducible.
-        least_runs: with fewer runs it is not shown, unless each number that decides it has an interval;
-            by default as many as the file of the experiment states, if it makes runs.
+        least_runs: with fewer runs it is inconclusive, unless each number that decides it has an
+            interval; by default as many as the file of the experiment states, if it makes runs.
         recording: of which of the experiment's recordings it is claimed, by default of the first; `any`
             for all data there are. Of other data it has its numbers, and no verdict.
     """
@@ -220,7 +222,7 @@ def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim)
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
-    return replace(claim, verdict=NO_VERDICT, why=f"claimed of {name}, not of these data")
+    return replace(claim, verdict=Claimed.NO_VERDICT, why=f"claimed of {name}, not of these data")
 
 
 def _combinations(
@@ -274,7 +276,7 @@ def _decided(claim: StatedClaim, values: Values) -> Claim | None:
         limits = {name: exactly(of) for name, of in claim.given.items() if not isinstance(of, str)}
         values = values._replace(names={**values.names, **limits})
         sentence, paper = (_as_far_as_known(text, values) for text in (claim.sentence, claim.paper))
-        return Claim(sentence, paper, "-", "not reproducible", f"the result has no {error}")
+        return Claim(sentence, paper, "-", Claimed.NOT_REPRODUCIBLE, f"the result has no {error}")
 
 
 def _as_far_as_known(text: str, values: Values) -> str:
@@ -311,19 +313,19 @@ def _verdict(claim: StatedClaim, values: Values) -> Claim:
         formatted(text, values)
         for text in (claim.sentence, claim.paper, claim.ours, claim.why, claim.unless)
     )
-    verdict: Verdict = "not reproducible"
+    verdict = Claimed.NOT_REPRODUCIBLE
     holds = truth(claim.holds, values) if claim.holds else False
     if holds == "missing" and lacks_interval(claim.holds, _stated(claim), values):
-        few = f"too few runs for a 95 % interval, which takes {FEWEST_RUNS}"
-        return Claim(sentence, paper, ours, "not shown", few)
+        return Claim(sentence, paper, ours, Claimed.INCONCLUSIVE, TOO_FEW)
     if holds == "missing":
         unless = "; ".join(filter(None, [unless, "estimates are missing"]))
     elif claim.holds and (not claim.reproducible or truth(claim.reproducible, values) is True):
-        verdict = "not shown" if holds is None else "confirmed" if holds else "refuted"
-    if verdict != "not reproducible" and (few := _few_runs(claim, values)):
-        return Claim(sentence, paper, ours, "not shown", few)
-    if verdict != "confirmed":
+        decided = Claimed.CONFIRMED if holds else Claimed.REFUTED
+        verdict = Claimed.INCONCLUSIVE if holds is None else decided
+    if verdict != Claimed.NOT_REPRODUCIBLE and (few := _few_runs(claim, values)):
+        return Claim(sentence, paper, ours, Claimed.INCONCLUSIVE, few)
+    if verdict != Claimed.CONFIRMED:
         why = "; ".join(filter(None, [why, unless]))
-    if verdict == "refuted" and not why:
+    if verdict == Claimed.REFUTED and not why:
         why = refutation(claim.holds, _stated(claim), values)
     return Claim(sentence, paper, ours, verdict, why)

@@ -244,7 +244,8 @@ def require_ours(found: Path, place: Path) -> None:
         raise BadInput(
             f"{place}: exists and is not a result of fuselog; give another folder with --out"
         ) from None
-    if _sealed(result) != result:
+    values = parse_json((found / RESULT_FILE).read_text(encoding="utf-8"))
+    if _digest(values) != result.files.get(RESULT_FILE):
         raise BadInput(
             f"{place / RESULT_FILE}: was changed since fuselog wrote it, or an older version wrote it; "
             "give another --out"
@@ -268,14 +269,18 @@ def require_ours(found: Path, place: Path) -> None:
 
 def _sealed(result: Result) -> Result:
     """Put the SHA-256 of the result's own text among its files."""
-    files = {name: digest for name, digest in result.files.items() if name != RESULT_FILE}
-    bare = result.model_copy(update={"files": files})
-    digest = hashlib.sha256(_text(bare).encode()).hexdigest()
-    return result.model_copy(update={"files": {**files, RESULT_FILE: digest}})
+    digest = _digest(result.model_dump(mode="json"))
+    return result.model_copy(update={"files": {**result.files, RESULT_FILE: digest}})
 
 
-def _text(result: Result) -> str:
-    return json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
+def _digest(values: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a result's own text, which is of all but itself."""
+    files = {name: digest for name, digest in values["files"].items() if name != RESULT_FILE}
+    return hashlib.sha256(_text({**values, "files": files}).encode()).hexdigest()
+
+
+def _text(values: Mapping[str, Any]) -> str:
+    return json.dumps(values, indent=2, allow_nan=False) + "\n"
 
 
 def _is_by_clock(path: Path) -> bool:
@@ -343,7 +348,7 @@ def write_outcome(
             },
         )
     )
-    (folder / RESULT_FILE).write_text(_text(result), encoding="utf-8")
+    (folder / RESULT_FILE).write_text(_text(result.model_dump(mode="json")), encoding="utf-8")
     return result
 
 
@@ -353,7 +358,7 @@ def keep(
     """Write what was found afterwards, `causes`, or `stress` and `claims`, into a result's folder."""
     sealed = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
     with whole_file(folder / RESULT_FILE) as new:
-        new.write_text(_text(sealed), encoding="utf-8")
+        new.write_text(_text(sealed.model_dump(mode="json")), encoding="utf-8")
     return sealed
 
 

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fuselog.pipeline.output.alarms import Alarm
-from fuselog.pipeline.output.claims import NO_VERDICT, Claim
+from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.results import (
     Bounds,
     Measured,
@@ -33,6 +33,7 @@ from fuselog.pipeline.output.results import (
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.errors import printable
 from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
+from fuselog.replay.judging.verdicts import Claimed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -336,7 +337,7 @@ def print_others(alarms: Sequence[Alarm]) -> None:
 
 def print_claims(claims: Sequence[Claim]) -> None:
     """Print the claims, each with what the paper says and what we found, after those undecided."""
-    elsewhere = sum(claim.verdict == NO_VERDICT for claim in claims)
+    elsewhere = sum(claim.verdict == Claimed.NO_VERDICT for claim in claims)
     if elsewhere:
         say(
             f"{elsewhere} of {len(claims)} claims are made of another recording than these data: their "

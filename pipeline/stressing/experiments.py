@@ -23,6 +23,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import build
 from fuselog.recorders.registry import load
 from fuselog.replay.foreign.naming import allowed
+from fuselog.replay.judging.verdicts import Claimed
 
 
 class _Part(NamedTuple):
@@ -89,7 +90,7 @@ def stress_result(
 def claims_under_stress(
     experiment: Experiment, result: Result, stress: Sequence[Stressing]
 ) -> list[Claim]:
-    """Return the claims of a result: those that stress may carry across their limit are not shown.
+    """Return the claims of a result: those that stress may carry across their limit are inconclusive.
 
     They are decided again with each metric's interval, or its value, wider on both sides by the largest
     change that stress makes to it. Verdicts on metrics that are not of single estimators stay.
@@ -108,9 +109,9 @@ def claims_under_stress(
     claims = list(result.claims)
     for place, found in enumerate(again, first):
         own = claims[place]
-        if own.verdict in ("confirmed", "refuted") and found.verdict != own.verdict:
+        if own.verdict in (Claimed.CONFIRMED, Claimed.REFUTED) and found.verdict != own.verdict:
             why = "; ".join(filter(None, [own.why, "changes that should not matter may reverse it"]))
-            claims[place] = replace(own, verdict="not shown", why=why)
+            claims[place] = replace(own, verdict=Claimed.INCONCLUSIVE, why=why)
     return claims
 
 

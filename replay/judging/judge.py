@@ -34,6 +34,7 @@ from fuselog.replay.judging.errors.moments import Moment, Moments, worst_of
 from fuselog.replay.judging.errors.planes import first_fixes
 from fuselog.replay.judging.errors.truths import Doubt, Truths
 from fuselog.replay.judging.errors.uninformed import Uninformed
+from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval, mean_interval
 from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
 from fuselog.replay.judging.metrics.means import MeansOfAll
 from fuselog.replay.judging.metrics.measuring import (
@@ -45,6 +46,7 @@ from fuselog.replay.judging.metrics.measuring import (
 )
 from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from fuselog.replay.judging.metrics.sums import BinnedSums
+from fuselog.replay.judging.verdicts import Squares
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -246,21 +248,35 @@ class Judge:
         runs; innovations do not, and NIS has that of them all.
         """
         found: dict[str, tuple[float, float]] = {}
+        for key, (size, runs, aim) in self._sizes().items():
+            low, high = chi_square_interval(size, runs, probability)
+            found[key] = low / (size / aim), high / (size / aim)
+        return {key: found[key] for key in self.metrics if key in found}
+
+    def _sizes(self) -> dict[str, tuple[int, int, int]]:
+        """Return of NEES and NIS by key of how many components and runs they are, and what is right."""
+        found: dict[str, tuple[int, int, int]] = {}
         for quantities in self._quantities.values():
             errors, cells = quantities.errors, quantities.by_time.filled()[0]
             runs = len(np.unique(cells[:, 0]))
             sizes = {"nees": len(errors.components), "position_nees": len(errors.position)}
             for name, size in sizes.items():
                 if runs and size:
-                    key = metric_key(errors.estimator, name, errors.case)
-                    found[key] = chi_square_interval(size, runs, probability)
+                    found[metric_key(errors.estimator, name, errors.case)] = size, runs, size
         for topic, sums in self.innovations.items():
             if degrees := sums.total.degrees:
-                low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
-                key = metric_key(estimator, "nis_per_component", case)
-                found[key] = low / degrees, high / degrees
-        return {key: found[key] for key in self.metrics if key in found}
+                found[metric_key(estimator, "nis_per_component", case)] = degrees, 1, 1
+        return found
+
+    def squares(self, estimator: str, quantity: str, case: str) -> Squares:
+        """Return what decides by NEES or NIS whether an estimator is overconfident."""
+        key = metric_key(estimator, quantity, case)
+        found = Interval(self.metrics[key])
+        if self.runs >= FEWEST_RUNS and quantity in (table := self.runs_table):
+            own = table[(table["estimator"] == estimator) & (table["case"] == case)]
+            found = mean_interval(own[quantity].dropna())._replace(value=found.value)
+        return Squares(quantity, found, self._sizes()[key][2], self.bounds[key])
 
     @property
     def constants(self) -> dict[tuple[str, str], Constant]:

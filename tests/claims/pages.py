@@ -22,10 +22,10 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from fuselog.pipeline.api.lists import listed
-from fuselog.pipeline.output.claims import Verdict, decide, known
+from fuselog.pipeline.output.claims import decide, known
 from fuselog.pipeline.output.results import MetricValue, Result, read_result
 from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
 from fuselog.pipeline.runs.inputs import shipped
@@ -33,6 +33,7 @@ from fuselog.recorders.importers.tables.mapping import read_mapping
 from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
 from fuselog.recorders.parameters import build
 from fuselog.recorders.registry import load
+from fuselog.replay.judging.verdicts import Claimed
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
@@ -50,7 +51,9 @@ class Stored:
         self._name: str = result["experiment"]
         self.metrics: dict[str, MetricValue] = result["metrics"]
         self.intervals: dict[str, list[float | None]] = result.get("intervals", {})
-        self.stated_claims: list[dict[str, str]] = result["claims"]
+        self.stated_claims: list[dict[str, str]] = [
+            {**claim, "verdict": Claimed(claim["verdict"]).value} for claim in result["claims"]
+        ]
 
     def __getitem__(self, key: str) -> MetricValue:
         """A metric."""
@@ -58,7 +61,7 @@ class Stored:
 
     @property
     def verdicts(self) -> str:
-        """How many claims are confirmed, refuted, not shown and not reproducible."""
+        """How many claims are confirmed, refuted, inconclusive and not reproducible."""
         return ", ".join(map(str, self._counts().values()))
 
     @property
@@ -78,7 +81,7 @@ class Stored:
 
     def _counts(self) -> dict[str, int]:
         found = Counter(claim["verdict"] for claim in self.stated_claims)
-        return {verdict: found[verdict] for verdict in get_args(Verdict)}
+        return {verdict.value: found[verdict] for verdict in Claimed if verdict != Claimed.NO_VERDICT}
 
     def _rows(self) -> Iterator[str]:
         for claim in self.stated_claims:

@@ -80,7 +80,7 @@ def test_a_changed_result_changes_its_page(tmp_path: Path, monkeypatch: pytest.M
     text = pages.rendered(f"A\n<!-- results\n{template}\n-->\nold\n<!-- end -->\nZ")
     assert text.partition("-->\n")[2] == (
         "0.25 and 1\n\n"
-        "`fuselog run mine` (seed 3, 7 runs): 1 confirmed, 1 refuted, 0 not shown, "
+        "`fuselog run mine` (seed 3, 7 runs): 1 confirmed, 1 refuted, 0 inconclusive, "
         "0 not reproducible.\n\n"
         "| claim | paper | ours | verdict |\n|---|---|---|---|\n"
         "| a \\| b | 1 | 2 | refuted: why |\n| c | 1 | 1 | confirmed |\n<!-- end -->\nZ"

@@ -50,7 +50,7 @@ def draw_explorer() -> None:
             page.goto(explorer.url)
             page.wait_for_selector("text=Nothing speaks against it.")
             page.evaluate(SET, [slider.name, slider.place(PINNED_M)])
-            page.wait_for_selector("text=Too sure of itself.")
+            page.wait_for_selector("text=Overconfident.")
             page.get_by_text("Pin", exact=True).click()
             page.evaluate(SET, [slider.name, slider.place(DRAGGED_M)])
             page.wait_for_selector(f"text={slider.words(DRAGGED_M)}")

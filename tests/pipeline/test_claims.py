@@ -22,6 +22,7 @@ from fuselog.pipeline.runs.inputs import Recording, holding, shipped
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import build
 from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Claimed
 from tests.goldens.recipes import DATA, importer_of, unpack
 
 METRICS = {
@@ -119,9 +120,9 @@ def claim(**values: object) -> StatedClaim:
     ("value", "verdict"),
     [
         ("gain[ekf, ukf]", "confirmed"),
-        ("gain[ekf, ukf] - 0.3", "not shown"),
+        ("gain[ekf, ukf] - 0.3", "inconclusive"),
         ("gain[ekf, ukf] - 1", "refuted"),
-        ("gain[ekf, few]", "not shown"),
+        ("gain[ekf, few]", "inconclusive"),
         ("rmse_m[lost]", "not reproducible"),
         ("rmse_m[ekf | nobody][0]", "not reproducible"),
         ("rmse_m[nobody]", "not reproducible"),
@@ -201,15 +202,15 @@ def test_a_claim_is_made_of_each_and_its_limit_stands_once() -> None:
     [
         ({"value": "gain[ekf, ukf]", "holds": "value > 0"}, "confirmed"),  # an interval decides
         ({"given": {"lead": "gain[ekf, ukf]"}, "holds": "lead > 1"}, "refuted"),
-        ({"value": "rmse_m[ekf]", "holds": "value < 1"}, "not shown"),
-        ({"given": {"half": "rmse_m[ekf] / 2"}, "value": "half", "holds": "value < 1"}, "not shown"),
-        ({"holds": "gain[ekf, ukf] > 0 and rmse_m[ekf] < 1"}, "not shown"),
-        ({"holds": "value(gain[ekf, ukf]) > 0"}, "not shown"),
+        ({"value": "rmse_m[ekf]", "holds": "value < 1"}, "inconclusive"),
+        ({"given": {"half": "rmse_m[ekf] / 2"}, "value": "half", "holds": "value < 1"}, "inconclusive"),
+        ({"holds": "gain[ekf, ukf] > 0 and rmse_m[ekf] < 1"}, "inconclusive"),
+        ({"holds": "value(gain[ekf, ukf]) > 0"}, "inconclusive"),
         (
             {"value": "nees[ekf, robot1]", "holds": "2 in value"},
-            "not shown",
+            "inconclusive",
         ),  # the fewer runs, the wider
-        ({"holds": "2 in consistent(2, runs) and nees[ekf, robot2] < 4"}, "not shown"),
+        ({"holds": "2 in consistent(2, runs) and nees[ekf, robot2] < 4"}, "inconclusive"),
         ({"holds": "rmse_m[ekf] < 1", "least_runs": 3}, "confirmed"),
         ({"holds": "rmse_m[lost] < 1"}, "not reproducible"),
     ],
@@ -227,9 +228,9 @@ def test_few_runs_decide_by_intervals_or_by_a_stated_number_of_runs(
 
     assert decided(3).verdict == verdict
     assert ("of 3 runs; without an interval it is decided from 20 on" in decided(3).why) == (
-        verdict == "not shown"
+        verdict == "inconclusive"
     )
-    assert (decided(20).verdict == verdict) == (verdict != "not shown")
+    assert (decided(20).verdict == verdict) == (verdict != "inconclusive")
 
 
 @pytest.mark.parametrize(
@@ -252,6 +253,11 @@ def test_what_cannot_be_read_is_refused_before_the_run(values: dict[str, str], m
 
 def test_nothing_is_confirmed_beside_a_number_that_is_missing() -> None:
     """Code that judges its own claims compares with NaN, which is false: no refutation."""
+    assert Claim("s", "p", "2", "not shown").verdict == Claimed.INCONCLUSIVE  # of an older result
+    [few] = decide(
+        [claim(value="gain[ekf, few]", holds="value > 0", ours="{high(value)}")], METRICS, INTERVALS, {}
+    )
+    assert known(few) == few
     found = known(judged("s", "p", "nan against 2", holds=False))
     assert (found.verdict, found.why) == ("not reproducible", "estimates are missing")
     assert known(judged("s", "p", "nancy 1", holds=False)).verdict == "refuted"

@@ -148,7 +148,7 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
         return fl.replay(logs[0], wrong, **options)
 
     kept = fl.compare(result, result, estimators=["ekf"])
-    assert set(kept.table["verdict"]) == {"no difference"}
+    assert set(kept.table["verdict"]) == {"tie"}
     names = [candidate.name for candidate in kept.groups[0]]
     assert [row.estimator for row in kept.coverage] == names
     assert "ekf" not in names
@@ -184,7 +184,7 @@ def test_a_trajectory_is_compared_like_estimates(
     row = found.table.query("quantity == 'position_rmse_m'").iloc[0]
     own = fl.compare(log, estimators=["ekf", "ukf"]).table.query("quantity == 'position_rmse_m'").iloc[0]
     assert row["difference"] == pytest.approx(own["difference"], rel=1e-6)
-    assert row["verdict"] == "unclear"
+    assert row["verdict"] == "undecided"
     assert "takes 5 runs or more, and this is of 1 run" in found.sentences[0]
     assert "nees" not in set(found.table["quantity"])
     found.draw(tmp_path / "both.rrd")

@@ -26,10 +26,13 @@ from fuselog.pipeline.exploring.curves import Path as Track
 from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.session import Session, open_session
 from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.pipeline.output.report.evidence import findings
+from fuselog.pipeline.output.results import Result
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.estimators.landmarks import ROBOT
 
 SURE = {"sigma_range_m": 0.03}  # of .1
+GOOD = "Nothing speaks against it."
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +69,27 @@ def test_verdicts_are_on_the_right_side(session: Session) -> None:
     sure = session.play("ekf", SURE).verdicts["robot1"]
     careful = session.play("ekf", {"sigma_range_m": 0.4, "sigma_bearing_rad": 0.08}).verdicts["robot1"]
     assert session.play("ekf", {}).verdicts["robot1"].level == "good"
-    assert (sure.level, sure.headline) == ("doubtful", "Too sure of itself.")
-    assert careful.headline == "Too careful."
+    assert (sure.level, sure.headline) == ("doubtful", "Overconfident.")
+    assert careful.headline == "Conservative."
+
+
+def test_report_explorer_and_warnings_have_one_verdict(session: Session, log: Path) -> None:
+    """With 0.0868 m NIS is 1.11: outside of its 95 % band, within what 999 of 1,000 logs leave."""
+    verdicts = []
+    for sigma_range_m in (0.03, 0.0868, 0.1, 0.2):
+        own = {"sigma_range_m": sigma_range_m}
+        done = fl.replay(log, {"ekf": {"kind": "ekf", **own}})
+        said: dict[str, Any] = {"metrics": done.judge.metrics, "bounds": done.judge.bounds, "claims": []}
+        result = Result(experiment="e", fuselog="", settings={}, input_sha256="", **said)
+        verdict = findings(result, {"runs": done.runs}).of["ekf"].verdict
+        headline = session.play("ekf", own).verdicts["robot1"].headline
+        assert headline == (f"{verdict.capitalize()}." if verdict != "consistent" else GOOD)
+        reasons = {"small": "overconfident", "large": "conservative"}
+        warned = [each.words.partition("its covariances are too ")[2][:5] for each in done.alarms]
+        assert {reasons[each] for each in warned} <= {verdict}
+        verdicts.append((verdict, len(warned)))
+    sure = "overconfident"
+    assert verdicts == [(sure, 2), (sure, 0), ("consistent", 0), ("conservative", 1)]
 
 
 def test_saved_settings_replay_to_the_same_numbers(
@@ -172,7 +194,7 @@ def test_a_log_without_truth_is_explored(log: Path) -> None:
     case = found.play("ekf", SURE).cases["robot1"]
     assert case.errors is None
     assert typical_time_s(case) is None
-    assert found.play("ekf", SURE).verdicts["robot1"].headline == "Too sure of itself."
+    assert found.play("ekf", SURE).verdicts["robot1"].headline == "Overconfident."
 
 
 def test_nothing_drawn_is_lost(session: Session) -> None:
@@ -273,7 +295,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     assert slider.words(slider.value(peak["x"][0])) in titles["likelihood"]
     seen = page.plots["likelihood"].figure.y_range
     assert seen.start < min(here["y"]) <= max(peak["y"]) < seen.end
-    assert "Too sure of itself." in page._head.text
+    assert "Overconfident." in page._head.text
     assert "pinned" in page._head.text
     for slow_s, is_said in ((1e9, False), (0.0, True)):
         monkeypatch.setattr("fuselog.pipeline.exploring.markup.SLOW_S", slow_s)
@@ -425,7 +447,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         wanted = explorer.session.play("ekf", {"sigma_range_m": slider.value(0.25)}).cases["robot1"]
         mean = float(wanted.nis.mean.mean())
         page.wait_for_function(f"Math.abs(({NOW})() - {mean}) < 1e-9 * {mean}")
-        page.wait_for_selector("text=Too sure of itself.")
+        page.wait_for_selector("text=Overconfident.")
         assert mean > 2.0 * before
         page.wait_for_selector(f"text=--set sigma_range_m={slider.value(0.25)!r}")
         page.get_by_text("Pin", exact=True).click()

@@ -13,7 +13,7 @@ from fuselog.pipeline.diagnosing.hypotheses.parameters import STEPS
 from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
-from fuselog.pipeline.exploring.verdict import mean_nis, verdict_of
+from fuselog.pipeline.exploring.verdict import verdict_of
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
 from fuselog.pipeline.sensing.preparing import _STILL
@@ -153,28 +153,28 @@ def test_settings_are_kept_as_toml_with_what_is_estimated(log: fl.MemorySource) 
     )
 
 
-def test_a_verdict_goes_by_what_is_farther_from_one() -> None:
-    """Innovations twice as large as stated, errors a third of it; alarms say which of them count."""
-    white = {
-        "a": SimpleNamespace(size=1, mean_square=1.0),
-        "b": SimpleNamespace(size=3, mean_square=5.0),
-        "c": SimpleNamespace(size=9, mean_square=np.nan),
-    }
-    errors = SimpleNamespace(nees=np.array([0.1, np.nan, 0.3444]), components=("x_m", "y_m"))
-    case: Any = SimpleNamespace(name="robot1", whiteness=white, errors=errors)
-    assert mean_nis(case) == 4.0
+def test_a_verdict_goes_by_errors_and_then_by_innovations() -> None:
+    """It is the report's: of one log NEES of 2 lies in 0.05 to 7.4, NIS of 4 numbers in 0.12 to 2.8."""
 
-    def said(*kinds: str, of: str = "robot1") -> str:
+    def said(nees: float, nis: float, *kinds: str, of: str = "robot1") -> str:
+        white = {
+            "a": SimpleNamespace(size=1, mean_square=nis - 0.3),
+            "b": SimpleNamespace(size=3, mean_square=nis + 0.1),
+            "c": SimpleNamespace(size=9, mean_square=np.nan),
+        }
+        squares = np.array([nees - 0.01, np.nan, nees + 0.01])
+        errors = SimpleNamespace(nees=squares, components=("x_m", "y_m"))
+        case: Any = SimpleNamespace(name="robot1", whiteness=white, errors=errors)
         alarms = [Alarm(kind, "ekf", of, 1.0, f"{kind}!") for kind in kinds]  # type: ignore[arg-type]
         verdict = verdict_of(case, alarms, [])
+        assert verdict_of(case, alarms, ["it stopped"])[0::2] == ("failed", "it stopped")
         return f"{verdict.level}: {verdict.headline} {verdict.detail}"
 
-    assert said("innovations") == (
-        "doubtful: Too sure of itself. Its innovations are 2 times what it claims."
-    )
-    assert said("errors") == "doubtful: Too careful. Its errors are 0.33 of what it claims."
-    assert said("errors", "innovations") == said("errors")
-    assert said("unused") == "doubtful: Doubtful. unused!"
-    good = "good: Nothing speaks against it. NIS is 4.00 per component and NEES is 0.22 for 2"
-    assert said("errors", of="robot2") == said() == f"{good}, within their intervals."
-    assert verdict_of(case, [], ["it stopped at 3 s"])[0::2] == ("failed", "it stopped at 3 s")
+    over = "doubtful: Overconfident. Its {} are 2 times what it claims."
+    assert said(2.0, 4.0) == said(2.0, 4.0, "innovations") == over.format("innovations")
+    assert said(8.0, 4.0) == said(8.0, 1.0) == over.format("errors")
+    assert said(0.02, 4.0) == "doubtful: Conservative. Its errors are 0.1 of what it claims."
+    assert said(8.0, 4.0, "unused") == "doubtful: Doubtful. unused!"
+    assert said(2.0, 1.0, "innovations") == "doubtful: Doubtful. innovations!"  # off by little
+    good = "good: Nothing speaks against it. NIS is 1.00 per component and NEES is 2.00 for 2"
+    assert said(2.0, 1.0, "errors", of="robot2") == said(2.0, 1.0) == f"{good}, within their intervals."

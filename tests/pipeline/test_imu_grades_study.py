@@ -56,7 +56,7 @@ def test_errors_count_in_the_outage_alone():
     [
         (0.9, 59, "confirmed"),
         (1.1, 59, "refuted"),  # one beyond it
-        (0.9, 58, "not shown"),  # too few to show anything
+        (0.9, 58, "inconclusive"),  # too few to show anything
     ],
 )
 def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(largest_m, runs, verdict):

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps
-from fuselog.pipeline.output.report.evidence import Consistency, findings
+from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.report.kinds import how_many_differ, opening
 from fuselog.pipeline.output.report.naming import title_of
 from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
@@ -23,6 +23,7 @@ from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
 from fuselog.replay.judging.errors.differences import dominating
 from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Squares
 
 
 def _told(
@@ -154,8 +155,8 @@ def test_who_is_too_careful_in_every_run_is_not_honest_however_few_there_are() -
         {f"{label}.nees": HONEST for label in "abc"} | {"d.nis_per_component": (0.9, 1.1)},
     )
     words = {card.estimator: card.chip for card in told.cards}
-    assert words["b"] == words["d"] == "Too careful"
-    assert words["c"] == "Honest, less accurate"
+    assert words["b"] == words["d"] == "Conservative"
+    assert words["c"] == "Consistent, less accurate"
     assert told.doubts == ["the covariances of b and d, which are too large"]
 
 
@@ -168,8 +169,8 @@ def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
         for place, (label, of) in enumerate(nees.items())
     }
     told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
-    assert told.verdict == ["b and a tie in position error: take b, as a is too careful."]
-    assert [card.chip for card in told.cards] == ["As good as a", "As accurate as b, but too careful"]
+    assert told.verdict == ["b and a tie in position error: take b, as a is conservative."]
+    assert [card.chip for card in told.cards] == ["As good as a", "As accurate as b, but conservative"]
     runs["b"]["nees"] = runs["a"]["nees"]
     told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
     advice = "take either, but mend its covariance, which is too large."
@@ -251,7 +252,7 @@ def test_the_opening_says_which_claims_hold() -> None:
         Claim("A is 1", "1", "1", "confirmed"),
         Claim("B is 2", "2", "3", "refuted"),
         Claim("C is 3", "3", "", "not reproducible"),
-        Claim("D is 4", "4", "3 to 5", "not shown"),
+        Claim("D is 4", "4", "3 to 5", "inconclusive"),
     ]
     settings = {"estimators": {"a": {}, "b": {}}, "record": {"scenario": "s"}, "runs": 4, "seed": 7}
     result = Result(
@@ -263,7 +264,7 @@ def test_the_opening_says_which_claims_hold() -> None:
         == "a and b over 4 simulated runs (scenario s), seed 7, each on the same measurements."
     )
     assert begun.story.verdict == [
-        "1 of 4 claims confirmed; 1 refuted, 1 not shown and 1 not reproducible."
+        "1 of 4 claims confirmed; 1 refuted, 1 inconclusive and 1 not reproducible."
     ]
 
 
@@ -352,7 +353,7 @@ def test_who_is_best_on_average_alone_is_doubtful() -> None:
 
 
 def test_a_page_of_claims_alone_has_a_card() -> None:
-    claims = [Claim(LONG, "", "", "confirmed"), Claim("B", "", "", "not shown")]
+    claims = [Claim(LONG, "", "", "confirmed"), Claim("B", "", "", "inconclusive")]
     result = Result(
         experiment="x",
         fuselog="1",
@@ -490,7 +491,7 @@ def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -
     assert re.fullmatch(r"ekf errs least with standard deviation of a range = 0\.[12] m\.", where)
     assert still == "ukf does not depend on it."
     ekf, ukf = begun.story.cards
-    assert (ekf.chip, ukf.chip) == ("Take this one", "Honest, less accurate")
+    assert (ekf.chip, ukf.chip) == ("Take this one", "Consistent, less accurate")
     found = re.fullmatch(r"position error, RMS; 95 % ([\d.]+) to ([\d.]+)", ekf.about)
     assert found
     low, high = map(float, found.groups())
@@ -616,19 +617,23 @@ def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[
 
 @pytest.mark.parametrize(
     ("value", "place", "state", "factor"),
-    [(2.0, 32.3, "honest", 1.0), (6.0, 64.6, "too sure", 3**0.5), (0.2, 0.0, "too careful", 0.1**0.5)],
+    [
+        (2.0, 32.3, "consistent", 1.0),
+        (6.0, 64.6, "overconfident", 3**0.5),
+        (0.2, 0.0, "conservative", 0.1**0.5),
+    ],
 )
 def test_a_gauge_goes_by_the_logarithm_and_a_state_by_chance(
     value: float, place: float, state: str, factor: float
 ) -> None:
     """The scale goes from a third of what is right to ten times it; the grey box holds 10 % at least."""
-    by = Consistency("NEES", Interval(value, 0.9 * value, 1.1 * value), 2.0, (1.9, 2.4))
+    by = Squares("NEES", Interval(value, 0.9 * value, 1.1 * value), 2.0, (1.9, 2.4))
     drawn = gauge(by)
     assert (drawn.aim, drawn.value) == pytest.approx((32.3, place), abs=0.01)
-    assert drawn.honest == pytest.approx((29.2, 37.66), abs=0.01)
+    assert drawn.usual == pytest.approx((29.2, 37.66), abs=0.01)
     if value == 6.0:
         assert drawn.spread == pytest.approx((61.5, 67.4), abs=0.01)
         assert drawn.words.startswith("NEES 6.00 (95 % 5.40 to 6.60); 2 is right")
     assert drawn.is_beyond == (value == 0.2)
-    assert by.state == state
+    assert by.verdict == state
     assert by.factor == pytest.approx(factor)

@@ -441,7 +441,7 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
     assert NOT_TESTED not in told
     kept = read_result(out)
     assert [each.estimator for each in kept.stress] == ["one", "other"]
-    assert [each.verdict for each in kept.claims] == ["not shown", "confirmed"]
+    assert [each.verdict for each in kept.claims] == ["inconclusive", "confirmed"]
     assert "may reverse it" in kept.claims[0].why
     assert all(words in told for each in kept.stress for words in each.words)
     assert "over 5 runs: " in kept.stress[0].words[0]

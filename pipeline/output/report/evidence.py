@@ -8,12 +8,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from fuselog.pipeline.output.alarming import DIVERGED
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
 from fuselog.pipeline.output.words import is_error, quantity
@@ -31,59 +30,12 @@ from fuselog.replay.judging.intervals import (
     root_mean_square,
     too_few,
 )
+from fuselog.replay.judging.verdicts import DIFFER, Comparison, Consistency, Squares, decisive
 
 Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and the messages it was given
 # By what estimators are compared, where they have it; else by the first error that there is.
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
-# A mean of squares may be off by this share: nobody would act on less, however many runs show it.
-MATERIAL = 0.1
-FAR = 1.25  # times larger than claimed: errors of that are no matter of a few percent
 MARGIN = 0.02  # as `fuselog compare` has it
-
-Relation = Literal["draw", "unclear", "withheld", "beyond chance", "untold"]
-State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Holds a mean of normalised squares, NEES or NIS.
-
-    Attributes:
-        name: which of the two.
-        found: the mean.
-        aim: what it should be.
-        honest: where it lies with 95 % if the estimator is consistent.
-    """
-
-    name: str
-    found: Interval
-    aim: float
-    honest: tuple[float, float]
-
-    @property
-    def factor(self) -> float:
-        """Return how many times larger errors are than the estimator claims."""
-        return math.sqrt(max(self.found.value, 0.0) / self.aim)
-
-    @property
-    def is_far(self) -> bool:
-        """Tell whether errors are so far beyond what is claimed that the covariance is no guide."""
-        return self.factor > FAR
-
-    @property
-    def has_diverged(self) -> bool:
-        """Tell whether errors are so large that they are no matter of covariances."""
-        return self.factor**2 > DIVERGED
-
-    @property
-    def state(self) -> State:
-        """Return what that says of the estimator: by chance over covariances, and over the runs."""
-        low, high = self.honest
-        is_excluded = self.found.is_bounded and not self.found.low <= self.aim <= self.found.high
-        is_usual = low <= self.found.value <= high and not is_excluded
-        if is_usual or abs(self.found.value / self.aim - 1.0) <= MATERIAL:
-            return "honest"
-        return "too sure" if self.found.value > (self.aim if is_excluded else high) else "too careful"
 
 
 @dataclass(frozen=True)
@@ -103,27 +55,33 @@ class Evidence:
 
     estimator: str
     error: Interval | None
-    consistency: Consistency | None
-    also: Consistency | None
+    consistency: Squares | None
+    also: Squares | None
     failed: int | None
     runs: int
     share: float
     outside: tuple[int, int] = (0, 1)
 
     @property
-    def state(self) -> State:
-        """Return what can be said of it in a word; NIS counts where NEES finds nothing."""
-        if self.failed and self.failed >= self.runs:
-            return "failed"
-        states = [each.state for each in (self.consistency, self.also) if each is not None]
-        return next((state for state in states if state != "honest"), states[0] if states else "unknown")
+    def has_failed(self) -> bool:
+        """Tell whether it fails in every run."""
+        return bool(self.failed and self.failed >= self.runs)
 
     @property
-    def decisive(self) -> Consistency | None:
-        """Return by what its state is: NEES, or NIS where that alone is off."""
-        if self.also is not None and self.consistency is not None and self.consistency.state == "honest":
-            return self.also if self.also.state != "honest" else self.consistency
-        return self.consistency
+    def decisive(self) -> Squares | None:
+        """Return by what it is judged: NEES, or NIS where that alone is off."""
+        return decisive([each for each in (self.consistency, self.also) if each is not None])
+
+    @property
+    def verdict(self) -> Consistency:
+        """Return whether its covariances are right; undecided if it fails in every run."""
+        by = None if self.has_failed else self.decisive
+        return by.verdict if by is not None else Consistency.UNDECIDED
+
+    @property
+    def is_broken(self) -> bool:
+        """Tell whether nobody can believe it."""
+        return self.has_failed or self.verdict == Consistency.OVERCONFIDENT
 
     @property
     def has_diverged(self) -> bool:
@@ -272,17 +230,17 @@ class Findings:
         each_run = self.by_run(label, self.main).to_numpy(dtype=float)
         return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
-    def _of_nees(self, label: str) -> Consistency | None:
+    def _of_nees(self, label: str) -> Squares | None:
         for key, name in (("nees", "NEES"), ("position_nees", "NEES of the position")):
             found = self._consistency(label, key, name)
             if found is not None:
                 return found
         return None
 
-    def _of_nis(self, label: str) -> Consistency | None:
+    def _of_nis(self, label: str) -> Squares | None:
         return self._consistency(label, "nis_per_component", "NIS")
 
-    def _consistency(self, label: str, key: str, name: str) -> Consistency | None:
+    def _consistency(self, label: str, key: str, name: str) -> Squares | None:
         """Return the mean over the cases, judged by the interval of one of them; None without any."""
         measured = [
             each
@@ -292,39 +250,39 @@ class Findings:
         if not measured:
             return None
         values = [float(each.value) for each in measured if isinstance(each.value, int | float)]
-        honest = max(
+        usual = max(
             (each.bounds for each in measured if each.bounds), key=lambda ends: ends[1] - ends[0]
         )
-        aim = 1.0 if name == "NIS" else self._size(honest)
+        aim = 1.0 if name == "NIS" else self.size_of(usual)
         each_run = self.by_run(label, key).to_numpy(dtype=float)
         over_cases = mean_interval(each_run)._replace(value=float(np.mean(values)))
-        return Consistency(name, over_cases, aim, honest)
+        return Squares(name, over_cases, aim, usual)
 
-    def _size(self, honest: tuple[float, float]) -> float:
+    def size_of(self, usual: tuple[float, float]) -> float:
         """Return of how many components NEES is: of as many as have this chi-square interval."""
         from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
         sizes = range(1, 100)
         runs = max(self.runs, 1)
-        return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - honest[1])))
+        return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - usual[1])))
 
 
-def relation(found: Findings, first: str, second: str) -> Relation:
-    """Say whether two estimators' errors differ: by the runs, or, of few runs, by the margin."""
+def relation(found: Findings, first: str, second: str) -> Comparison | None:
+    """Compare a second estimator's error with a first's by the runs; None if there are too few.
+
+    Of few runs, two within the margin tie.
+    """
     difference = found.difference(first, second, found.main, "low")
-    if difference is not None and difference.verdict == "no difference":
-        return "draw"
-    if difference is not None and difference.more.is_bounded:
-        if difference.verdict == "unclear":
-            return "unclear"
-        return (
-            "withheld" if is_withheld(found, first, second, difference.more.value) else "beyond chance"
-        )
-    errors = [found.of[label].error for label in (first, second)]
-    one, other = (each.value if each else math.nan for each in errors)
-    if abs(other - one) <= MARGIN * abs(one):
-        return "draw"
-    return "withheld" if is_withheld(found, first, second, other - one) else "untold"
+    verdict: Comparison | None
+    if difference is not None and (difference.more.is_bounded or difference.verdict == Comparison.TIE):
+        more, verdict = difference.more.value, difference.verdict
+    else:
+        errors = [found.of[label].error for label in (first, second)]
+        one, other = (each.value if each else math.nan for each in errors)
+        more = other - one
+        verdict = Comparison.TIE if abs(more) <= MARGIN * abs(one) else None
+    is_moved = verdict in (*DIFFER, None) and is_withheld(found, first, second, more)
+    return Comparison.WITHHELD if is_moved else verdict
 
 
 def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:

@@ -22,7 +22,7 @@ _TERMS = {
         "NEES",
         "Normalised estimation error squared: the true error over the one that the estimator claims, "
         "squared and summed over the state's components. Their number is right; above, the estimator is "
-        "too sure of itself, below too careful.",
+        "overconfident, below conservative.",
         f"{_WIKI}/Mahalanobis_distance",
     ),
     "nis": Term(

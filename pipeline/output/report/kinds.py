@@ -9,15 +9,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pandas as pd
 
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, curve
-from fuselog.pipeline.output.claims import NO_VERDICT, Verdict
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
-    MATERIAL,
     Findings,
     Timings,
     findings,
@@ -38,20 +36,20 @@ from fuselog.pipeline.output.words import (
 )
 from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
+from fuselog.replay.judging.verdicts import DIFFER, MATERIAL, Claimed, Comparison
 
 Tables = Mapping[str, pd.DataFrame]
 # More estimators than these are counted, and more claims that are refuted stand in the table alone.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
-OF_CLAIMS: Mapping[Verdict | Literal["no verdict"], str] = {
-    "confirmed": "confirms {}",
-    "refuted": "refutes {}",
-    "not shown": "leaves {} to chance",
-    "not reproducible": "cannot reproduce {}",
-    NO_VERDICT: "does not judge {}",
+OF_CLAIMS: Mapping[Claimed, str] = {
+    Claimed.CONFIRMED: "confirms {}",
+    Claimed.REFUTED: "refutes {}",
+    Claimed.INCONCLUSIVE: "leaves {} to chance",
+    Claimed.NOT_REPRODUCIBLE: "cannot reproduce {}",
+    Claimed.NO_VERDICT: "does not judge {}",
 }
 MOST_PAIRS = 3
-DIFFER = ("better", "worse", "higher", "lower")  # verdicts on a difference beyond chance
 # The tables that sentences are made of.
 TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
@@ -146,7 +144,7 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
 def _with_claims(base: Story, result: Result) -> Story:
     """Tell a story, then how many claims hold, with a card of those that do not."""
     counts = Counter(claim.verdict for claim in result.claims)
-    refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
+    refuted = [claim.claim for claim in result.claims if claim.verdict == Claimed.REFUTED]
     notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
     if len(refuted) > MOST_CLAIMS:
         more = len(refuted) - MOST_CLAIMS
@@ -165,14 +163,13 @@ def claims_sentences(result: Result) -> list[str]:
     """Say how many claims hold, and how many do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
-    if counts["confirmed"] == len(result.claims):
+    if counts[Claimed.CONFIRMED] == len(result.claims):
         return [f"{'The only claim is' if len(result.claims) == 1 else f'All {of_all} are'} confirmed."]
-    counted = [
-        f"{counts[each]} {each}" for each in ("refuted", "not shown", "not reproducible") if counts[each]
-    ]
-    if counts[NO_VERDICT]:
-        counted.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
-    return [f"{counts['confirmed']} of {of_all} confirmed; {listed(counted)}."]
+    others = (Claimed.REFUTED, Claimed.INCONCLUSIVE, Claimed.NOT_REPRODUCIBLE)
+    counted = [f"{counts[each]} {each}" for each in others if counts[each]]
+    if counts[Claimed.NO_VERDICT]:
+        counted.append(f"{counts[Claimed.NO_VERDICT]} of another recording, without a verdict")
+    return [f"{counts[Claimed.CONFIRMED]} of {of_all} confirmed; {listed(counted)}."]
 
 
 def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
@@ -208,12 +205,12 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
 
 def _of_comparison(result: Result, tables: Tables) -> Opening:
     rows = tables["differences"]
-    rows = rows[rows["case"] != "all"]
+    rows = rows[rows["case"] != "all"].assign(verdict=rows["verdict"].map(Comparison))
     sides = [label for group in result.settings["sides"] for label in group]
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
     base = story(found)
     differ = rows[rows["verdict"].isin(DIFFER)]
-    unclear = rows[rows["verdict"] == "unclear"]
+    unclear = rows[rows["verdict"] == Comparison.UNDECIDED]
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():

@@ -20,7 +20,7 @@ from fuselog.recorders.log import open_log, read_streams, schemas, topics_of
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.detections import ORIGIN, detected_places
 from fuselog.replay.engine.streams.sources import LogSource
-from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
+from fuselog.replay.judging.errors.evaluation import chi_square_band, split_topic
 
 Floats = NDArray[np.float64]
 # Particles are drawn at so many times, and of each cloud so many of equal weight.
@@ -375,6 +375,5 @@ def _binned(
     filled = np.flatnonzero(counts)
     sums = np.bincount(place, squared, BINS)[filled]
     of = counts[filled]
-    ends = np.array([chi_square_interval(int(each), 1) for each in of]) / of[:, None]
     middle = time_s.min() + (filled + 0.5) * width
-    return middle, sums / of, ends[:, 0], ends[:, 1]
+    return middle, sums / of, *chi_square_band(of)

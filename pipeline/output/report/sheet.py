@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fuselog.pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
+from fuselog.pipeline.output.report.evidence import MARGIN, Findings
 from fuselog.pipeline.output.report.story import choice_of
 from fuselog.pipeline.output.results import Measured, MetricTable
 from fuselog.pipeline.output.words import (
@@ -26,7 +26,8 @@ from fuselog.pipeline.output.words import (
     scale,
 )
 from fuselog.replay.judging.errors.differences import target_of
-from fuselog.replay.judging.intervals import mean_interval, rms_interval
+from fuselog.replay.judging.intervals import Interval, mean_interval, rms_interval
+from fuselog.replay.judging.verdicts import Consistency, Squares
 
 MOST_ROWS = 12
 GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
@@ -168,17 +169,20 @@ def _row(
         else:
             low, high = spreads[key][label]
             small = interval(low, high, own) if low < high else ""
-        is_out = each.place in ("above", "below") and _is_material(each)
+        is_out = _is_out(found, key, each)
         cells.append(
             Cell(own.text(numbers[label]), small, "out" if is_out else "best" if label in best else "")
         )
     return Row(key, words.name, words.meaning, own.sign, aim, cells)
 
 
-def _is_material(each: Measured) -> bool:
-    low, high = each.bounds or (math.nan, math.nan)
-    middle = 0.5 * (low + high)
-    return isinstance(each.value, int | float) and abs(each.value / middle - 1.0) > MATERIAL
+def _is_out(found: Findings, key: str, each: Measured) -> bool:
+    """Tell whether a number of NEES or NIS with bounds is not that of a consistent estimator."""
+    if each.bounds is None or not isinstance(each.value, int | float):
+        return False
+    aim = 1.0 if key == "nis_per_component" else found.size_of(each.bounds)
+    squares = Squares(key, Interval(float(each.value)), aim, each.bounds)
+    return squares.verdict != Consistency.CONSISTENT
 
 
 def _interval(found: Findings, key: str, label: str, own: Scale) -> str:

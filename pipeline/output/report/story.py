@@ -12,8 +12,6 @@ from fuselog.pipeline.output.alarming import dominating_run
 from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
-    MATERIAL,
-    Consistency,
     Evidence,
     Findings,
     Timings,
@@ -33,6 +31,7 @@ from fuselog.pipeline.output.words import (
 )
 from fuselog.replay.judging.diagnostics import LEAST_SHARE
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
+from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
 
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
@@ -66,17 +65,17 @@ Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
 class Gauge(NamedTuple):
-    """Shows where a mean of squares lies, in percent of a scale from too careful to too sure.
+    """Shows where a mean of squares lies, in percent of a scale from conservative to overconfident.
 
     Attributes:
-        honest: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
+        usual: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
         aim, value: the right value, and the one that was found.
         spread: where the latter lies with 95 %; both ends at it where that is not known.
         is_beyond: whether the value lies beyond the scale's end.
         words: the same for who cannot see it.
     """
 
-    honest: tuple[float, float]
+    usual: tuple[float, float]
     aim: float
     value: float
     spread: tuple[float, float]
@@ -199,7 +198,7 @@ def _advice(
         if each.error
         and error
         and each.error.value < (1.0 - MARGIN) * error.value
-        and relation(found, take, each.estimator) in ("beyond chance", "untold")
+        and relation(found, take, each.estimator) not in ALIKE
     ]
     if better:
         best = min(better, key=lambda each: each.error.value if each.error else math.inf)
@@ -214,15 +213,15 @@ def _advice(
         tied = [take, *equal]
         both = listed(tied) if len(tied) <= MOST_CARDS else f"{take} and {len(equal)} others"
         whom, left = of_the_tied(found, tied)
-        if all(relation(found, take, each) == "draw" for each in equal):
+        if all(relation(found, take, each) == Comparison.TIE for each in equal):
             return f"{both} tie in {main}: {whom}{_cheapest(left, timings)}."
-        if any(relation(found, take, each) == "withheld" for each in equal):
+        if any(relation(found, take, each) == Comparison.WITHHELD for each in equal):
             return (
                 f"No verdict between {both}: changes that should not matter move the {main} "
                 "farther than they differ."
             )
         return f"A tie so far: {runs} do not tell {both} apart; {whom}."
-    if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
+    if all(relation(found, take, each) is None for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
         tells = f"{FEWEST_RUNS} runs or more tell" if few else "is not known"
@@ -244,7 +243,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
     """Say what there is of the only estimator."""
     error = f"{found.error_name} of {_value(only.error, own)} RMS"
     errs = f"{only.estimator} has a {error}" if only.error else ""
-    if only.state in ("too sure", "failed"):
+    if only.is_broken:
         return [*filter(None, [errs and f"{errs}."]), _doubt(only, causes)]
     if only.decisive is None:
         return [f"{errs}; whether its covariance is right is not known." if errs else ""]
@@ -254,12 +253,12 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 
 def _of_innovations(found: Findings) -> str:
     """Say what is known without a truth."""
-    honest = [each.estimator for each in found.of.values() if each.state == "honest"]
+    right = [each.estimator for each in found.of.values() if each.verdict == Consistency.CONSISTENT]
     without = "Without a truth nobody's error is known"
-    if not honest:
+    if not right:
         return f"{without}."
-    is_are = "is" if len(honest) == 1 else "are"
-    return f"{without}; by the innovations {listed(honest)} {is_are} honest."
+    is_are = "is" if len(right) == 1 else "are"
+    return f"{without}; by the innovations {listed(right)} {is_are} consistent."
 
 
 def _value(error: Interval | None, own: Scale) -> str:
@@ -268,7 +267,7 @@ def _value(error: Interval | None, own: Scale) -> str:
 
 def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
     """Say in a sentence why an estimator is not to be believed."""
-    if each.decisive is None or each.decisive.state != "too sure":
+    if each.decisive is None or each.decisive.verdict != Consistency.OVERCONFIDENT:
         return f"{each.estimator} fails in every run."
     how = "is overconfident" if each.decisive.is_far else "is slightly overconfident"
     how = "diverged" if each.has_diverged else how
@@ -287,9 +286,9 @@ def _claim(each: Evidence, runs: int) -> str:
     if by is None:
         return "its covariance was not judged"
     what = "innovations" if by.name == "NIS" else "errors"
-    if by.state == "too sure":
+    if by.verdict == Consistency.OVERCONFIDENT:
         return f"its {what} are {_times(by.factor)} what it states"
-    if by.state == "too careful":
+    if by.verdict == Consistency.CONSERVATIVE:
         return f"its {what} are {number(by.factor, 2)} of what it states"
     if runs == 1 and by.name != "NIS" and each.also is None:
         return "one run does not show it to be inconsistent"
@@ -327,10 +326,10 @@ def _card(
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
     """Return how a card looks, its sign, and its word."""
-    state = each.state
-    if state == "failed":
+    verdict = each.verdict
+    if each.has_failed:
         return "broken", "✕", "Fails in every run"
-    if state == "too sure":
+    if verdict == Consistency.OVERCONFIDENT:
         if each.has_diverged:
             return "broken", "✕", "Diverged"
         is_far = each.decisive is None or each.decisive.is_far
@@ -338,15 +337,15 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
     if each.estimator in (take, *equal) and len(found.labels) > 1:
         others = [label for label in (take, *equal) if label != each.estimator]
         as_who = listed(others) if len(others) < MOST_CARDS else f"{len(others)} others"
-        if others and state == "too careful":
-            return "careful", "○", f"As accurate as {as_who}, but too careful"
+        if others and verdict == Consistency.CONSERVATIVE:
+            return "careful", "○", f"As accurate as {as_who}, but conservative"
         return "best", "✓", f"As good as {as_who}" if others else "Take this one"
-    if state == "too careful":
-        return "careful", "○", "Too careful"
-    honest = "Honest" if state == "honest" else "Not judged"
+    if verdict == Consistency.CONSERVATIVE:
+        return "careful", "○", "Conservative"
+    is_right = verdict == Consistency.CONSISTENT
     if take and each.estimator != take:
-        return "fair", "○", f"{honest}, less accurate" if state == "honest" else "Less accurate"
-    return "fair", "○", honest
+        return "fair", "○", "Consistent, less accurate" if is_right else "Less accurate"
+    return "fair", "○", "Consistent" if is_right else "Not judged"
 
 
 def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list[str]:
@@ -430,18 +429,17 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
     main = found.error_name
     for label in labels if take else ():
         difference = found.difference(take, label, found.main, "low") if label != take else None
-        if difference is None or not (
-            difference.more.is_bounded or difference.verdict == "no difference"
-        ):
+        is_tie = difference is not None and difference.verdict == Comparison.TIE
+        if difference is None or not (is_tie or difference.more.is_bounded):
             continue
         more = difference.more
         size = abs(more.value)
         near = scale(quantity(found.main).unit, size or own.factor)
         ends = f"95 % {interval(more.low, more.high, near)} {near.sign}".rstrip()
-        if difference.verdict == "no difference":
+        if is_tie:
             exactly = "are equal" if not size else f"differ by {near.with_unit(size)} on average, {ends}"
             draws.append(f"In {main}, {take} and {label} cannot be told apart: they {exactly}.")
-        elif difference.verdict == "unclear":
+        elif difference.verdict == Comparison.UNDECIDED:
             runs = count(difference.runs, "run")
             draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
         elif is_withheld(found, take, label, size):
@@ -461,12 +459,12 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
 
 
 def broken_of(found: Findings) -> list[Evidence]:
-    """List who cannot be believed: who fails, then who is too sure, the worst first."""
+    """List who cannot be believed: who fails, then who is overconfident, the worst first."""
 
     def badness(each: Evidence) -> float:
-        return math.inf if each.state == "failed" else each.decisive.factor if each.decisive else 0.0
+        return math.inf if each.has_failed else each.decisive.factor if each.decisive else 0.0
 
-    bad = [each for each in found.of.values() if each.state in ("failed", "too sure")]
+    bad = [each for each in found.of.values() if each.is_broken]
     return sorted(bad, key=badness, reverse=True)
 
 
@@ -475,18 +473,13 @@ def choice_of(found: Findings) -> tuple[str, list[str]]:
 
     Of those that draw, whose covariances are too large comes last.
     """
-    sound = [
-        each
-        for each in found.of.values()
-        if each.error is not None and each.state not in ("failed", "too sure")
-    ]
+    sound = [each for each in found.of.values() if each.error is not None and not each.is_broken]
     if not sound:
         return "", []
     best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
     others = [each.estimator for each in sound if each.estimator != best]
-    alike = ("draw", "unclear", "withheld")
-    tied = [best, *(label for label in others if relation(found, best, label) in alike)]
-    first, *equal = sorted(tied, key=lambda label: found.of[label].state == "too careful")
+    tied = [best, *(label for label in others if relation(found, best, label) in ALIKE)]
+    first, *equal = sorted(tied, key=lambda label: found.of[label].verdict == Consistency.CONSERVATIVE)
     return first, equal
 
 
@@ -501,8 +494,8 @@ def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str
 
 
 def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
-    """Choose whom to take of estimators that err alike, and these: not too careful ones, if any."""
-    careful = [label for label in tied if found.of[label].state == "too careful"]
+    """Choose whom to take of estimators that err alike, and these: conservative ones only if all are."""
+    careful = [label for label in tied if found.of[label].verdict == Consistency.CONSERVATIVE]
     left = [label for label in tied if label not in careful] or tied
     whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"
     if careful == tied:
@@ -510,7 +503,7 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
     if careful:
         whom = " or ".join(left) if len(left) <= MOST_CARDS else "any of the others"
         are = "is" if len(careful) == 1 else "are"
-        return f"take {whom}, as {listed(careful)} {are} too careful", left
+        return f"take {whom}, as {listed(careful)} {are} conservative", left
     return f"take {whom}", left
 
 
@@ -541,19 +534,21 @@ def named(labels: Sequence[str], among: int = 0) -> str:
 
 def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
     """Say whose covariances are not right, by what."""
-    states = {label: each.state for label, each in found.of.items()}
+    verdicts = {label: each.verdict for label, each in found.of.items()}
     sentences = []
     diverged = [label for label in found.labels if found.of[label].has_diverged]
     if diverged:
         sentences.append(f"the estimates of {named(diverged, len(found.labels))}, which diverged")
-    for size, state in (("small", "too sure"), ("large", "too careful")):
-        whose = [label for label in found.labels if states[label] == state and label not in diverged]
+    for size, verdict in (("small", Consistency.OVERCONFIDENT), ("large", Consistency.CONSERVATIVE)):
+        whose = [label for label in found.labels if verdicts[label] == verdict and label not in diverged]
         if whose:
             of = named(whose, len(found.labels))
             sentences.append(f"the covariances of {of}, which are too {size}")
     for kind, what in _OF_COVARIANCES.items():
         whose = [each.estimator for each in alarms if each.kind == kind]
-        little = [label for label in dict.fromkeys(whose) if states.get(label) == "honest"]
+        little = [
+            label for label in dict.fromkeys(whose) if verdicts.get(label) == Consistency.CONSISTENT
+        ]
         if little:
             sentences.append(
                 f"the {what} of {named(little)}, which are off by little, but beyond chance"
@@ -597,7 +592,7 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
     if compared and found.runs < FEWEST_RUNS:
         do = "does" if found.runs == 1 else "do"
         return [f"who is better, as {runs} {do} not tell differences from chance"]
-    unclear = [label for label in equal if relation(found, take, label) == "unclear"]
+    unclear = [label for label in equal if relation(found, take, label) == Comparison.UNDECIDED]
     if unclear:
         return [f"who of {named([take, *unclear])} is better, which {runs} do not tell"]
     if len(compared) > 1 and found.by_run(take or compared[0], found.main).empty:
@@ -630,7 +625,7 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
 # The gauge of a card
 
 
-def numbers_of(by: Consistency) -> str:
+def numbers_of(by: Squares) -> str:
     """Return the mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
@@ -639,7 +634,7 @@ def numbers_of(by: Consistency) -> str:
     return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is right"
 
 
-def gauge(by: Consistency) -> Gauge:
+def gauge(by: Squares) -> Gauge:
     """Return where a mean of squares lies on its scale."""
 
     def place(value: float) -> float:
@@ -647,7 +642,7 @@ def gauge(by: Consistency) -> Gauge:
         share = (math.log(max(value, 1e-12) / by.aim) - low) / (high - low)
         return round(100.0 * min(max(share, 0.0), 1.0), 2)
 
-    low, high = by.honest
+    low, high = by.usual
     found = by.found
     spread = (found.low, found.high) if found.is_bounded else (found.value, found.value)
     words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"

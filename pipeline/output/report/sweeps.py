@@ -13,7 +13,6 @@ from typing import Any
 import pandas as pd
 
 from fuselog.pipeline.output.report.evidence import (
-    Consistency,
     Findings,
     findings,
     relation,
@@ -24,6 +23,7 @@ from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.words import count, is_error, listed, quantity, scale, stated
 from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Comparison, Consistency, Squares
 
 MOST_POINTS = 4  # more are counted
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point
@@ -66,7 +66,7 @@ class Sweep:
             return squared**0.5
         return own.groupby("point")["value"].mean()
 
-    def consistency(self, label: str, point: int) -> Consistency | None:
+    def consistency(self, label: str, point: int) -> Squares | None:
         """Return NEES at a point, where the sweep kept its interval: of the first case."""
         table = self.table
         if "bound_low" not in table:
@@ -77,12 +77,12 @@ class Sweep:
             return None
         row = own.iloc[0]
         ends = float(row["bound_low"]), float(row["bound_high"])
-        return Consistency("NEES", Interval(float(row["value"])), float(row["aim"]), ends)
+        return Squares("NEES", Interval(float(row["value"])), float(row["aim"]), ends)
 
-    def is_too_sure(self, label: str, point: int) -> bool:
+    def is_overconfident(self, label: str, point: int) -> bool:
         """Tell whether an estimator is overconfident at a point."""
         by = self.consistency(label, point)
-        return by is not None and by.state == "too sure"
+        return by is not None and by.verdict == Consistency.OVERCONFIDENT
 
     def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
         """Return estimators at one point each, as if these were an experiment: by name and point."""
@@ -179,7 +179,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
     """Find where an estimator errs least, if possible of the points where it is not overconfident."""
-    sure = [point for point in own.index if sweep.is_too_sure(label, int(point))]
+    sure = [point for point in own.index if sweep.is_overconfident(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])
 
@@ -228,7 +228,8 @@ def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> li
     return [
         int(point)
         for point in own.index
-        if point != best and relation(found, str(best), str(point)) in ("draw", "unclear")
+        if point != best
+        and relation(found, str(best), str(point)) in (Comparison.TIE, Comparison.UNDECIDED)
     ]
 
 
@@ -246,7 +247,7 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
 def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
     """Say what is doubtful of a best point."""
     parts = []
-    sure = [int(point) for point in own.index if sweep.is_too_sure(label, int(point))]
+    sure = [int(point) for point in own.index if sweep.is_overconfident(label, int(point))]
     if sure and best not in sure:
         parts.append(f"{label} at {_named(sweep, sure)}, where it is overconfident")
     if alike:

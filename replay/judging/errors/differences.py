@@ -10,15 +10,15 @@ by chance.
 import math
 from collections.abc import Callable
 from fnmatch import fnmatch
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from fuselog.replay.judging.intervals import FEWEST_RUNS, RESAMPLES, Floats, Interval
+from fuselog.replay.judging.verdicts import Comparison
 
 # What a metric should be: small, large, near a value; None where neither is better.
 Target = Literal["low", "high"] | float | None
-Verdict = Literal["better", "worse", "higher", "lower", "no difference", "unclear"]
 # So many numbers of resamples are in memory at once.
 BATCH_NUMBERS = 1 << 22
 # The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
@@ -83,16 +83,16 @@ class Difference(NamedTuple):
     second: float
     more: Interval
     margin: float
-    verdict: Verdict
+    verdict: Comparison
     sure: float
     runs: int
 
     @property
-    def columns(self) -> dict[str, float | str]:
+    def columns(self) -> dict[str, Any]:
         """Return its numbers by the names that they have in tables."""
-        about = {"margin": self.margin, "verdict": self.verdict, "sure": self.sure, "runs": self.runs}
+        about = {"margin": self.margin, "verdict": str(self.verdict), "sure": self.sure}
         ends = {"difference": self.more.value, "low": self.more.low, "high": self.more.high}
-        return {"first_mean": self.first, "second_mean": self.second, **ends, **about}
+        return {"first_mean": self.first, "second_mean": self.second, **ends, **about, "runs": self.runs}
 
 
 def target_of(quantity: str) -> Target:
@@ -117,16 +117,16 @@ def paired_difference(
         scale = target if isinstance(target, float) else abs(means[0])
     difference, runs, allowed = means[1] - means[0], len(first), margin * scale
     more, sure = Interval(difference), math.nan
-    verdict: Verdict = "unclear"
+    verdict = Comparison.UNDECIDED
     if np.array_equal(first, second):
         more = Interval(0.0, 0.0, 0.0) if runs >= FEWEST_RUNS else Interval(0.0)
-        sure, verdict = 1.0, "no difference"
+        sure, verdict = 1.0, Comparison.TIE
     elif runs >= FEWEST_RUNS:
         low, high, resamples = _interval(first, second, _difference)
         more = Interval(difference, low, high)
         sure = float(np.mean(np.sign(resamples) == np.sign(difference)))
         if -allowed <= low and high <= allowed:
-            verdict = "no difference"
+            verdict = Comparison.TIE
         elif low > allowed or high < -allowed:
             verdict = _direction(first, second, target, difference)
     return Difference(*means, more, allowed, verdict, sure, runs)
@@ -159,10 +159,10 @@ def _interval(
     return *map(float, done.confidence_interval), done.bootstrap_distribution
 
 
-def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Verdict:
+def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
     """Say what a difference means; of two on either side of their aim, maybe only which is higher."""
     if target in ("low", "high"):
-        return "worse" if (difference > 0) == (target == "low") else "better"
+        return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):
 
         def farther(first: Floats, second: Floats, axis: int = -1) -> Floats:
@@ -171,5 +171,5 @@ def _direction(first: Floats, second: Floats, target: Target, difference: float)
 
         low, high, _ = _interval(first, second, farther)
         if low > 0 or high < 0:
-            return "worse" if low > 0 else "better"
-    return "higher" if difference > 0 else "lower"
+            return Comparison.WORSE if low > 0 else Comparison.BETTER
+    return Comparison.HIGHER if difference > 0 else Comparison.LOWER

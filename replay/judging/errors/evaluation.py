@@ -177,6 +177,13 @@ def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> t
     return float(interval[0]), float(interval[1])
 
 
+def chi_square_band(degrees: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Compute where chi-square values of so many degrees (n,), each by its degree, lie with 95 %."""
+    tail = 0.5 * (1 - 0.95)
+    low, high = (np.asarray(chi2.ppf(np.full(len(degrees), p), degrees)) for p in (tail, 1 - tail))
+    return low / degrees, high / degrees
+
+
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:

@@ -51,11 +51,11 @@ def test_a_verdict_says_where_the_interval_lies() -> None:
     assert paired_difference(first, second, "high", 0.02).verdict == "better"
     assert paired_difference(second, first, "low", 0.02).verdict == "better"
     assert paired_difference(first, second, None, 0.02).verdict == "higher"
-    assert paired_difference(first, second, "low", 0.2).verdict == "no difference"
+    assert paired_difference(first, second, "low", 0.2).verdict == "tie"
     for one, other in ((first, second), (second, first)):  # about the margin, above and below
         margin = found.more.value / one.mean()
-        assert paired_difference(one, other, "low", margin).verdict == "unclear"
-    assert paired_difference(first, first, "low", 0.0).verdict == "no difference"
+        assert paired_difference(one, other, "low", margin).verdict == "undecided"
+    assert paired_difference(first, first, "low", 0.0).verdict == "tie"
 
 
 def test_what_has_an_aim_is_judged_by_its_distance() -> None:
@@ -70,5 +70,5 @@ def test_what_has_an_aim_is_judged_by_its_distance() -> None:
 
 def test_few_runs_have_no_interval() -> None:
     found = paired_difference(np.arange(4.0), np.arange(4.0) + 5.0, "low", 0.02)
-    assert found.verdict == "unclear"
+    assert found.verdict == "undecided"
     assert np.isnan([found.more.low, found.more.high, found.sure]).all()

@@ -37,7 +37,7 @@ def claims() -> Iterator[str]:
         Claim("A is 1", "1", "1", "confirmed"),
         Claim(long, "2", "3", "refuted"),
         Claim("C is 3", "3", "", "not reproducible"),
-        Claim("D is 4", "4", "3 to 5", "not shown"),
+        Claim("D is 4", "4", "3 to 5", "inconclusive"),
         Claim("E is 5", "5", "6", "refuted"),
         Claim("F is 6", "6", "7", "refuted"),
         Claim("G is 7", "7", "8", "no verdict"),

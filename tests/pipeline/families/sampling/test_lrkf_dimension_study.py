@@ -66,7 +66,7 @@ def test_a_share_that_pays_has_its_whole_interval_beyond_it():
         return found, outcome.metrics["lrkf.samples_that_pay.d"]
 
     assert verdicts([0.98, 0.981, 0.979, 0.98, 0.98]) == ("confirmed", 100.0)
-    assert verdicts([0.7, 1.2, 0.8, 1.22, 0.98]) == ("not shown", 100.0)
+    assert verdicts([0.7, 1.2, 0.8, 1.22, 0.98]) == ("inconclusive", 100.0)
     assert verdicts([0.995, 0.994, 0.995, 0.996, 0.995]) == ("refuted", 7.0)
 
 

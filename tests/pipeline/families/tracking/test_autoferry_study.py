@@ -26,9 +26,9 @@ def test_the_stored_result_is_the_sheets() -> None:
     verdicts = [claim["verdict"] for claim in STORED["claims"]]
     assert verdicts == [
         *["confirmed"] * 4,
-        *["not shown"] * 3,
+        *["inconclusive"] * 3,
         "confirmed",
-        *["not shown"] * 2,
+        *["inconclusive"] * 2,
         *["confirmed"] * 3,
     ]
     rows = {
