@@ -70,12 +70,8 @@ def mean_nis(case: Case) -> float:
 
 
 def _evidence(case: Case) -> str:
-    facts = []
-    if not math.isnan(nis := mean_nis(case)):
-        facts.append(f"NIS is {nis:.2f} per component")
-    if case.errors is not None and np.isfinite(case.errors.nees).any():
-        nees = float(np.nanmean(case.errors.nees))
-        facts.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
+    words = {"innovations": "NIS is {:.2f} per component", "errors": "NEES is {:.2f} for {:.0f}"}
+    facts = [words[each.name].format(each.found.value, each.aim) for each in _squares_of(case)[::-1]]
     within = "within its interval" if len(facts) == 1 else "within their intervals"
     return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge by."
 

@@ -181,14 +181,9 @@ def lacks_interval(expression: str, stated: Mapping[str, str], values: Values) -
 
     The arguments are those of `needs_runs`.
     """
-    return any(
-        values.metrics[key] is not None and None in map(_known, values.intervals.get(key, ()))
-        for key in _keys_in(_expanded(expression, stated), values)
-    )
-
-
-def _known(end: float | None) -> float | None:
-    return None if end is None or math.isnan(end) else end
+    keys = {*_keys_in(_expanded(expression, stated), values)} & values.intervals.keys()
+    ends = [end for key in keys if values.metrics[key] is not None for end in values.intervals[key]]
+    return any(end is None or math.isnan(end) for end in ends)
 
 
 def _keys_in(tree: ast.expr, values: Values) -> list[str]:

@@ -80,7 +80,7 @@ class Outcome:
     kind: Kind = "run"
 
     def measure(self, key: str, number: Interval) -> None:
-        """Keep a number as the metric `key`, with its 95 % interval."""
+        """Keep `number`, with its 95 % interval, as the metric `key`."""
         self.metrics[key], self.intervals[key] = float(number.value), (number.low, number.high)
 
 

@@ -5,7 +5,7 @@ It is computed of the metrics and of the table of runs, which all kinds of resul
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -45,8 +45,7 @@ class Evidence:
     Attributes:
         estimator: its label.
         error: of what estimators are compared by; None where it has none.
-        consistency: by NEES, or by NIS where there is no truth.
-        also: by NIS, where NEES is known too.
+        squares: NEES, or that of the position, and NIS, as far as there are any.
         failed: how many runs failed; None where that is not known.
         runs: how many there were, of all cases.
         share: of the time that was estimated.
@@ -55,8 +54,7 @@ class Evidence:
 
     estimator: str
     error: Interval | None
-    consistency: Squares | None
-    also: Squares | None
+    squares: Sequence[Squares]
     failed: int | None
     runs: int
     share: float
@@ -70,7 +68,7 @@ class Evidence:
     @property
     def decisive(self) -> Squares | None:
         """Return by what it is judged: NEES, or NIS where that alone is off."""
-        return decisive([each for each in (self.consistency, self.also) if each is not None])
+        return decisive(self.squares)
 
     @property
     def verdict(self) -> Consistency:
@@ -203,7 +201,8 @@ class Findings:
 
     def _evidence(self, label: str) -> Evidence:
         failed = self.values(label, "failed_runs")
-        nees, nis = self._of_nees(label), self._of_nis(label)
+        nees = self._squares(label, "nees", "NEES")
+        nees = nees or self._squares(label, "position_nees", "NEES of the position")
         judged = [
             measured.place
             for table in self.tables
@@ -212,8 +211,7 @@ class Findings:
         return Evidence(
             label,
             self._error(label),
-            nees or nis,
-            nis if nees else None,
+            [*filter(None, (nees, self._squares(label, "nis_per_component", "NIS")))],
             int(sum(failed)) if failed else None,
             self.runs * max(len(failed), 1),
             min(self.values(label, "estimated_share") or [1.0]),
@@ -230,17 +228,7 @@ class Findings:
         each_run = self.by_run(label, self.main).to_numpy(dtype=float)
         return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
-    def _of_nees(self, label: str) -> Squares | None:
-        for key, name in (("nees", "NEES"), ("position_nees", "NEES of the position")):
-            found = self._consistency(label, key, name)
-            if found is not None:
-                return found
-        return None
-
-    def _of_nis(self, label: str) -> Squares | None:
-        return self._consistency(label, "nis_per_component", "NIS")
-
-    def _consistency(self, label: str, key: str, name: str) -> Squares | None:
+    def _squares(self, label: str, key: str, name: str) -> Squares | None:
         """Return the mean over the cases, judged by the interval of one of them; None without any."""
         measured = [
             each

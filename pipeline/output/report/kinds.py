@@ -185,18 +185,16 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
     """Tell the values that were found, then whether they change what the estimator is worth."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
-        ends = row["low"], row["high"]
-        known = all(math.isfinite(each) for each in ends)
-        interval = (
-            f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
-        )
+        low, high = row["low"], row["high"]
+        known = math.isfinite(low) and math.isfinite(high)
+        ends = f" (95 % {number(low)} to {number(high)})" if known else ", without an interval"
         begun = (
             "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
         unit = f" {sign}" if (sign := written(unit_of(row["parameter"]))) else ""
-        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{interval}{begun}.")
+        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{ends}{begun}.")
     return replace(base, verdict=[*sentences, *base.verdict])
 
 

@@ -198,11 +198,8 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
 
 def _aim(found: Findings, key: str) -> str:
     """Say how large NEES should be, where all estimators have as many components."""
-    sizes = {
-        number(each.consistency.aim)
-        for each in found.of.values()
-        if each.consistency is not None and each.consistency.name == "NEES"
-    }
+    squares = [by for each in found.of.values() for by in each.squares]
+    sizes = {number(by.aim) for by in squares if by.name == "NEES"}
     return next(iter(sizes)) if key == "nees" and len(sizes) == 1 else ""
 
 

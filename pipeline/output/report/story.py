@@ -290,7 +290,7 @@ def _claim(each: Evidence, runs: int) -> str:
         return f"its {what} are {_times(by.factor)} what it states"
     if by.verdict == Consistency.CONSERVATIVE:
         return f"its {what} are {number(by.factor, 2)} of what it states"
-    if runs == 1 and by.name != "NIS" and each.also is None:
+    if runs == 1 and by.name != "NIS" and len(each.squares) == 1:
         return "one run does not show it to be inconsistent"
     return f"its {what} are as large as it states"
 
@@ -361,10 +361,9 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
     outside, cases = each.outside
     if cases > 1:
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
-    if each.also is not None and each.decisive is each.consistency and found.runs == 1:
-        notes.append(
-            f"By its innovations, NIS is {number(each.also.found.value)} per component; 1 is right."
-        )
+    if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
+        nis = number(each.squares[1].found.value)
+        notes.append(f"By its innovations, NIS is {nis} per component; 1 is right.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes

@@ -6,13 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.alarming import NIS, alarms_of
 from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.coverage import sentences
 from fuselog.pipeline.output.terminal import print_others, print_worst
 from fuselog.replay.engine.replaying.usage import EARLY, SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import Conditioning
 from fuselog.replay.judging.errors.constant import Constant
+from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
+from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.metrics.measuring import metric_key
+from fuselog.replay.judging.verdicts import Squares
 from tests.words.made.printing import printed
 
 POSE = "/estimates/ekf/robot1/pose"
@@ -29,6 +33,7 @@ def innovations() -> Iterator[str]:
         (1000, 1000, 840),
         (1000, 1000, 1150),
         (1000, 1000, 1160),
+        (10000, 9900, 10700),
         (1000, 0, 9e6),
         (0, 0, 0),
     ):
@@ -164,13 +169,31 @@ def _judge(
     constants: Any = None,
     conditioning: Any = None,
 ) -> Any:
+    totals = {topic: each.total for topic, each in (innovations or {}).items() if each.total.degrees}
+    sizes = {metric_key(split_topic(topic)[0], NIS, "robot1"): each for topic, each in totals.items()}
+    metrics = {**{key: each.squared / each.degrees for key, each in sizes.items()}, **(metrics or {})}
+
+    def intervals(probability: float) -> dict[str, tuple[float, float]]:
+        ends = {key: chi_square_interval(each.degrees, 1, probability) for key, each in sizes.items()}
+        of_nis = {
+            key: (low / sizes[key].degrees, high / sizes[key].degrees)
+            for key, (low, high) in ends.items()
+        }
+        return of_nis | (bounds or {})
+
+    def squares(estimator: str, quantity: str, case: str) -> Squares:
+        key = metric_key(estimator, quantity, case)
+        aim = {"nees": 3.0, "position_nees": 2.0, NIS: 1.0}[quantity]
+        return Squares(quantity, Interval(metrics[key]), aim, intervals(0.95)[key])
+
     return SimpleNamespace(
         conditioning=conditioning or {},
         uninformed={},
         unestimated={},
         innovations=innovations or {},
-        metrics=metrics or {},
-        intervals=lambda _: bounds or {},
+        metrics=metrics,
+        intervals=intervals,
+        squares=squares,
         constants=constants or {},
         judged=[POSE],
         runs=1,
