@@ -113,7 +113,7 @@ def word(data: NDArray[np.uint8], place: int) -> int:
         data: bytes.
         place: where the number begins.
     """
-    part, number = data[place : place + 8], 0
+    part, number = data[np.uint64(place) :], 0
     for k in (7, 6, 5, 4, 3, 2, 1, 0):
         number = number << 8 | int(part[k])
     return number
