@@ -1,9 +1,23 @@
-"""Makes a command's help: its docstring, and below it commands to try."""
+"""Makes commands, and their help: the docstring, and below it commands to try."""
 
 import inspect
 from collections.abc import Callable
 
 import click
+
+from fuselog.pipeline.command_line.options import SetOption
+
+
+class _Command(click.Command):
+    """Settles its settings before it begins."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the options."""
+        left = super().parse_args(ctx, args)
+        for each in self.params:
+            if isinstance(each, SetOption) and not ctx.resilient_parsing:
+                each.settle(ctx)
+        return left
 
 
 def with_examples(text: str, *examples: str) -> str:
@@ -18,6 +32,6 @@ def command(
 
     def added(function: Callable[..., None]) -> click.Command:
         text = with_examples(function.__doc__ or short_help, *examples)
-        return click.command(name=name, short_help=short_help, help=text)(function)
+        return click.command(name, _Command, short_help=short_help, help=text)(function)
 
     return added

@@ -1,8 +1,7 @@
 """Defines types of options, and the options that several commands have."""
 
 import os
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -211,49 +210,58 @@ def estimator_option(
     )
 
 
-def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return the option --set of a command; `fuselog.pipeline.api.asking.TAKERS` says what takes it.
+_REPLAYING = ("estimators", "experiment")
 
-    Where it asks, NAME=?, the command prints what that parameter means, and does nothing else. A command
-    that replays logs has --origin too, which is a setting of all their topics.
+
+class SetOption(click.Option):
+    """Accepts settings, which a command's other options complete once all are parsed: see `settle`.
+
+    Attributes:
+        takes: what takes them, a key of `fuselog.pipeline.api.asking.TAKERS`.
+        replays: whether the command replays logs. It has --origin too, a setting of all their topics.
     """
-    replays = takes in ("estimators", "experiment")
 
-    def complete(
-        context: click.Context,
-        parameter: click.Parameter,  # noqa: ARG001
-        incomplete: str,
-    ) -> list[CompletionItem]:
+    def __init__(self, names: Sequence[str], *, takes: str, **options: Any) -> None:
+        super().__init__(names, **options)
+        self.takes, self.replays = takes, takes in _REPLAYING
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Return the parameters whose names begin so."""
         from fuselog.pipeline.api.asking import settings_that_begin
 
         # click leaves arguments aside while the option lacks its value
-        [argument, *_] = [each for each in context.command.params if isinstance(each, click.Argument)]
-        left = tuple(context.args) if argument.nargs < 0 else next(iter(context.args), None)
-        options = context.params | ({str(argument.name): left} if left else {})
-        found = settings_that_begin(incomplete, takes, options)
+        [argument, *_] = [each for each in ctx.command.params if isinstance(each, click.Argument)]
+        left = tuple(ctx.args) if argument.nargs < 0 else next(iter(ctx.args), None)
+        options = ctx.params | ({str(argument.name): left} if left else {})
+        found = settings_that_begin(incomplete, self.takes, options)
         return [CompletionItem(name, help=meaning) for name, meaning in found.items()]
 
+    def settle(self, context: click.Context) -> None:
+        """Add the origin to the settings; where these ask, NAME=?, print what it means and exit."""
+        options = context.params
+        if self.replays and (place := options.pop("origin")):
+            options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
+        if any(text.endswith("=?") for text in options["settings"]):
+            from fuselog.pipeline.api.asking import show_meanings
+
+            show_meanings(options["settings"], self.takes, options)
+            context.exit()
+
+
+def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add the option --set of a command, see `SetOption`."""
+
     def added(function: Callable[..., None]) -> Callable[..., None]:
-        @click.option(
+        option = click.option(
             "--set",
             "settings",
+            cls=SetOption,
+            takes=takes,
             multiple=True,
             metavar="KEY=VALUE",
-            shell_complete=complete,
             help="Set a parameter (repeatable); KEY=? says what it means.",
         )
-        @wraps(function)
-        def asked_first(*arguments: Any, **options: Any) -> None:
-            if replays and (place := options.pop("origin")):
-                options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
-            if any(text.endswith("=?") for text in options["settings"]):
-                from fuselog.pipeline.api.asking import show_meanings
-
-                show_meanings(options["settings"], takes, options)
-            else:
-                function(*arguments, **options)
-
-        return origin_option(asked_first) if replays else asked_first
+        return origin_option(option(function)) if takes in _REPLAYING else option(function)
 
     return added
 

@@ -507,6 +507,13 @@ def test_rows_of_a_database_that_are_no_messages_are_counted(tmp_path: Path) -> 
             f"{path}: 1 messages have no topic, and are lost",
             f"{path}: 2 rows of messages have no whole stamp or no bytes, and are lost",
         ]
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE topics SET name = CAST(x'2fff' AS TEXT)")
+    with (
+        pytest.raises(BadInput, match=r"cannot be read as a sqlite3 bag .*UTF-8"),
+        open_bag(path),
+    ):
+        pass
 
 
 def test_records_of_a_bag_that_are_no_messages_are_counted(tmp_path: Path) -> None:

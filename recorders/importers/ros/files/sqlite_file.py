@@ -74,7 +74,8 @@ class SqliteFile:
 
     def _mend(self, error: sqlite3.Error) -> str:
         """Name what may get back more of a damaged file."""
-        if error.sqlite_errorcode != sqlite3.SQLITE_CORRUPT:
+        # Python's own errors, as of a text that is not UTF-8, have no code
+        if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_CORRUPT:
             return ""
         return f"; `sqlite3 {self.path.name} .recover | sqlite3 whole.db3` may get more of it back"
 
