@@ -110,7 +110,15 @@ def winding(seed: int, period_s: float, late_s: float, speed_period_s: float) ->
     }
 
 
-PERIODS_S = [(3.0, np.inf), (3.0, 3.0), (6.0, 7.0), (15.7, np.inf), (15.7, 15.7), (np.inf, np.inf)]
+PERIODS_S = [
+    (3.0, 3.0),
+    (6.0, 7.0),
+    (np.inf, np.inf),
+    *(
+        pytest.param(*each, marks=pytest.mark.paper)
+        for each in ((3.0, np.inf), (15.7, np.inf), (15.7, 15.7))
+    ),
+]
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.25, 2.0])
