@@ -6,10 +6,14 @@ imported.
 """
 
 import json
+import re
+from collections.abc import Iterator
+from itertools import groupby
 from typing import Any
 
 from fuselog.pipeline.output.terminal import print_table, say
 from fuselog.pipeline.runs.inputs import SHIPPED, shipped
+from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.registry import available
 
 KEPT = SHIPPED / "lists.json"
@@ -22,19 +26,55 @@ GROUPS = {
     "metrics": "metrics",
     "experiments": "",
 }
+# What a name belongs to, by the module that defines it, in the order in which it is printed.
+FAMILIES = {
+    r"fuselog\.replay\.inference\.": "Methods, for any model",
+    r"fuselog\.\w+\.importers\.": "Real data",
+    r"fuselog\.(recorders\.simulators|replay\.estimators)\.": "Robots and navigation",
+    r"fuselog\.replay\.foreign\.": "Filters of your own",
+    r"fuselog\.\w+\.families\.vehicles\.": "Vehicles",
+    r"fuselog\.\w+\.families\.tracking\.": "Many targets",
+    r"fuselog\.\w+\.families\.networks\.": "Networks of estimators",
+    r"fuselog\.\w+\.families\.ranging\.": "Ranging",
+    r"fuselog\.\w+\.families\.sets\.": "Guaranteed sets",
+    r"fuselog\.\w+\.families\.directional\.": "Orientations",
+    r"fuselog\.\w+\.families\.sampling\.": "Sampling",
+    r"fuselog\.\w+\.families\.los\.": "Lines of sight",
+    r"fuselog\.\w+\.families\.acoustic\.": "Shots and sounds",
+    r"fuselog\.\w+\.families\.biometrics\.": "Biometrics",
+    r"": "Of other packages",
+}
 
 
 def show_list(kind: str) -> None:
-    """Print the names of a kind ("scenarios", say) with a line on each."""
-    print_table([kind.removesuffix("s"), "what"], list(listed(kind).items()))
+    """Print the names of a kind ("scenarios", say) with a line on each, in families if there are any."""
+    in_families = kind in ("scenarios", "models", "estimators")
+    rows = by_family(kind) if in_families else listed(kind).items()
+    print_table([kind.removesuffix("s"), "what"], [*rows])
     say(f"For all about one of them: fuselog {kind} NAME")
     if kind == "models":
-        rows = [
+        methods = [
             [name, " ".join(method for method, answer in answers.items() if answer == "yes")]
             for name, answers in listed("methods").items()
         ]
-        print_table(["model", "methods that estimate it"], rows)
+        print_table(["model", "methods that estimate it"], methods)
         say("What a model lacks for another method: fuselog models NAME")
+
+
+def by_family(kind: str) -> Iterator[tuple[str, str]]:
+    """Yield a row for each family, and below it the names that belong to it, each with its line."""
+    lines, places = listed(kind), places_of(kind)
+    order = [*FAMILIES]
+
+    def family_of(name: str) -> int:
+        place = places[name]
+        if name == place:  # a file, which belongs where its recorder does
+            place = places[read_toml(shipped(kind)[name])["recorder"]]
+        return next(at for at, module in enumerate(order) if re.match(module, place))
+
+    for family, names in groupby(sorted(lines, key=family_of), family_of):
+        yield FAMILIES[order[family]], ""
+        yield from ((f"  {name}", lines[name]) for name in names)
 
 
 def listed(kind: str) -> dict[str, Any]:

@@ -5,8 +5,56 @@ import click
 from fuselog.pipeline.command_line import experiments, judging, lists, logs, recording, replaying
 from fuselog.pipeline.command_line.help import with_examples
 
+SECTIONS = {
+    "Start here": (
+        recording.record,
+        recording.import_,
+        logs.info,
+        replaying.replay,
+        logs.view,
+        judging.diagnose,
+        replaying.tune,
+        judging.compare,
+        experiments.run,
+        experiments.report,
+    ),
+    "Check sensors and logs": (logs.lint, logs.noise, replaying.calibrate, logs.ellipsoid),
+    "Judge estimators": (
+        judging.evaluate,
+        replaying.explore,
+        judging.stress,
+        judging.observability,
+        experiments.sweep,
+        replaying.check,
+    ),
+    "Change and convert logs": (logs.cut, logs.merge, logs.relabel, logs.constrain, logs.export),
+    "Deploy filters": (replaying.deploy, lists.header),
+    "List what there is": (
+        lists.scenarios,
+        lists.models,
+        lists.estimators,
+        lists.metrics,
+        lists.experiments,
+        lists.cache,
+    ),
+}
+
+
+class _Sections(click.Group):
+    """Prints its commands in sections."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Write a line for each command, all in the same columns."""
+        width = max(map(len, self.commands))
+        for title, commands in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(f"{each.name:{width}}", each.get_short_help_str(1000)) for each in commands]
+                )
+
 
 @click.group(
+    cls=_Sections,
     context_settings={"help_option_names": ["-h", "--help"]},
     help=with_examples(
         "Record, replay, judge and look at estimators for sensor fusion.",
@@ -23,22 +71,6 @@ def fuselog() -> None:
     once_a_minute.begin()
 
 
-for each in (
-    *(recording.record, recording.import_),
-    *(replaying.replay, replaying.explore, replaying.tune, replaying.calibrate, replaying.check),
-    replaying.deploy,
-    *(judging.evaluate, judging.compare, judging.diagnose, judging.stress, judging.observability),
-    *(experiments.run, experiments.sweep, experiments.report),
-    *(logs.info, logs.lint, logs.noise, logs.ellipsoid, logs.view, logs.export),
-    *(logs.cut, logs.merge, logs.constrain, logs.relabel),
-    *(
-        lists.scenarios,
-        lists.models,
-        lists.estimators,
-        lists.metrics,
-        lists.experiments,
-        lists.cache,
-        lists.header,
-    ),
-):
-    fuselog.add_command(each)
+for section in SECTIONS.values():
+    for each in section:
+        fuselog.add_command(each)

@@ -1,4 +1,4 @@
-"""Makes commands, and their help: the docstring, and below it commands to try."""
+"""Makes a command's help: its docstring, and below it commands to try; each option with an example."""
 
 import inspect
 from collections.abc import Callable
@@ -6,6 +6,89 @@ from collections.abc import Callable
 import click
 
 from fuselog.pipeline.command_line.options import SetOption
+
+# A value of every option that takes one, by its name, or by the command's and its name.
+EXAMPLES = {
+    "--again": "run.mcap",
+    "--against": "ekf.golden.xz",
+    "--at": "worst:ekf",
+    "--bound": "sigma_range_m=0.01:1",
+    "--case": "robot2",
+    "--component": "x_m=east_m",
+    "--connect": "rerun+http://localhost:9876/proxy",
+    "--data": "mrclam6.tar.xz",
+    "--decimate": "/robot1/odometry=5Hz",
+    "--delta": "5",
+    "--end": "20",
+    "--estimator": "ekf",
+    "--every": "0.1",
+    "--field": "/imu.magnetic_field_ut",
+    "--fixed": "lever_y_m",
+    "--focus": "robot3",
+    "--folds": "5",
+    "--free": "sigma_range_m",
+    "--gap-limit": "0.5",
+    "--grid": "5",
+    "--junit": "check.xml",
+    "--keep": "'*/pose mean'",
+    "--late": "rewind:0.5",
+    "--length": "48.5",
+    "--log": "run.mcap",
+    "--logs": "30",
+    "--mapping": "mapping.toml",
+    "--margin": "0.05",
+    "--max-difference": "0.02",
+    "--metric": "consistency",
+    "--model": "robot",
+    "--offset": "left.mcap=-0.5",
+    "--origin": "48.137,11.575,520",
+    "--out": "out/mine",
+    "--over": "ekf.sigma_range_m=0.05:0.8:log9",
+    "--run": "3",
+    "--runs": "20",
+    "--samples": "64",
+    "--save": "run.rrd",
+    "--scale": "x_m=0.5",
+    "--scheduler": "local:8",
+    "--screenshot": "view.png",
+    "--seed": "7",
+    "--set": "sigma_range_m=0.3",
+    "--settings": "out/tune/settings.toml",
+    "--sheet": "turn_rate_radps='0.05 deg/s/sqrt(Hz)'",
+    "--start": "10",
+    "--start-from": "truth",
+    "--start-sigma": "heading_rad=0.1",
+    "--tau": "10",
+    "--time-offset": "estimate",
+    "--tolerance": "'/estimates/ekf/* mean=1e-9'",
+    "--topic": "/robot1/odometry",
+    "--topics": "'/robot1/*'",
+    "--truth": "truth.txt",
+    "--unit": "/imu",
+    "--validate": "test",
+    "--window": "10",
+    "--workers": "4",
+    "record --out": "run.mcap",
+    "import --out": "run.mcap",
+    "replay --out": "est.mcap",
+    "cut --out": "part.mcap",
+    "merge --out": "both.mcap",
+    "relabel --out": "left.mcap",
+    "constrain --out": "constrained.mcap",
+    "deploy --out": "robot_ekf",
+    "report --out": "report.html",
+    "export --out": "odometry.csv",
+    "import --set": "truth=/mocap",
+    "record --set": "duration_s=120",
+    "run --set": "ekf.sigma_range_m=0.3",
+    "sweep --set": "duration_s=30",
+    "constrain --set": "rolling_hz=10",
+    "lint --set": "/imu.specific_force_scale=9.807",
+    "calibrate --set": "lever_x_m=1.1",
+    "calibrate --bound": "lever_x_m=-2:2",
+    "noise --topic": "/imu",
+    "relabel --topic": "/robot1/=/left/",
+}
 
 
 class _Command(click.Command):
@@ -25,6 +108,14 @@ def with_examples(text: str, *examples: str) -> str:
     return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
 
 
+def example_of(command: str, option: click.Option) -> str | None:
+    """Return an example of an option as one types it; None for flags and options that list choices."""
+    if option.is_flag or isinstance(option.type, click.Choice):
+        return None
+    name = option.opts[-1]
+    return f"{option.opts[0]} {EXAMPLES.get(f'{command} {name}') or EXAMPLES[name]}"
+
+
 def command(
     short_help: str, *examples: str, name: str | None = None
 ) -> Callable[[Callable[..., None]], click.Command]:
@@ -32,6 +123,10 @@ def command(
 
     def added(function: Callable[..., None]) -> click.Command:
         text = with_examples(function.__doc__ or short_help, *examples)
-        return click.command(name, _Command, short_help=short_help, help=text)(function)
+        made = click.command(name, _Command, short_help=short_help, help=text)(function)
+        for option in made.params:
+            if isinstance(option, click.Option) and (example := example_of(str(made.name), option)):
+                option.help = f"{option.help} Example: {example}"
+        return made
 
     return added

@@ -10,7 +10,6 @@ from fuselog.pipeline.command_line.options import (
     ANY_PATH,
     FORMAT,
     METRIC,
-    MODEL,
     RESULT,
     TIMELINE,
     Seconds,
@@ -19,6 +18,7 @@ from fuselog.pipeline.command_line.options import (
     estimator_option,
     gap_option,
     json_option,
+    model_option,
     recover_option,
     replay_options,
     set_option,
@@ -128,7 +128,7 @@ def evaluate(
 
 
 @command(
-    "Compare estimators over the same runs, with a verdict on every metric.",
+    "Compare estimators run by run, with a verdict on every metric.",
     "fuselog compare out/before out/after",
     "fuselog compare out/landmarks/logs -e ekf -e smoother:ekf",
 )
@@ -173,14 +173,14 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 
 
 @command(
-    "Say why an estimator is inconsistent.",
+    "Find out why an estimator is inconsistent.",
     "fuselog diagnose run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("label", "The estimator; by default the only one of estimates.")
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
 @click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
+@model_option
 @click.option("--tried", "tells_tried", is_flag=True, help="List what was tried, with what it gains.")
 @replay_options
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
@@ -195,12 +195,12 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 
 
 @command(
-    "Say whether a result is one: replay under changes that should not matter.",
+    "Test whether a result is robust to irrelevant changes.",
     "fuselog stress run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("labels", "Which estimators (repeatable).", many=True, required=True)
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
+@model_option
 @click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
 @click.option(
     "--save", type=TIMELINE, help="A timeline (.rrd) of the first log to write: copies fan out in it."
@@ -218,11 +218,11 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
 
 
 @command(
-    "Say how well the measurements of logs determine a model's state.",
+    "Show how well measurements determine a model's state.",
     "fuselog observability run.mcap --window 10",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--model", type=MODEL, help="The model, where several fit the logs.")
+@model_option
 @click.option(
     "--window",
     "window_s",

@@ -28,16 +28,14 @@ def _show(kind: str, name: str | None, *, as_json: bool) -> None:
         catalog.show(kind, name, as_json=as_json)
 
 
-scenarios = _listing(
-    "scenario", "List what can be recorded and imported, or all about NAME.", "landmarks"
-)
-estimators = _listing("estimator", "List the estimators, or all about NAME.", "ekf")
-metrics = _listing("metric", "List the metrics, or all about NAME.", "consistency")
-experiments = _listing("experiment", "List the shipped experiments, or all about NAME.", "landmarks")
+scenarios = _listing("scenario", "List what can be recorded or imported, or describe NAME.", "landmarks")
+estimators = _listing("estimator", "List the estimators, or describe NAME.", "ekf")
+metrics = _listing("metric", "List the metrics, or describe NAME.", "consistency")
+experiments = _listing("experiment", "List the shipped experiments, or describe NAME.", "landmarks")
 
 
 @command(
-    "List the models, and the methods that estimate each, or all about NAME.",
+    "List the models and their methods, or describe NAME.",
     "fuselog models",
     "fuselog models robot",
     "fuselog models robot --formulas",
@@ -56,7 +54,7 @@ def models(name: str | None, formulas: bool, as_json: bool) -> None:
 
 
 @command(
-    "Say what the cache of kernels and samples holds, clear it, or compile kernels ahead.",
+    "Show, clear or fill the cache of compiled kernels.",
     "fuselog cache",
     "fuselog cache --clear",
     "fuselog cache --warm robot inertial:smoother:ekf",

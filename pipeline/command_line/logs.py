@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @command(
-    "Say what a log holds.",
+    "Show what a log holds.",
     "fuselog info run.mcap",
 )
 @click.argument("log", type=ANY_PATH)
@@ -47,7 +47,7 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 @command(
-    "Say what noise sensors at rest have, with intervals.",
+    "Find the noise of sensors at rest, with intervals.",
     "fuselog noise rest.mcap",
     "fuselog noise rest.mcap --topic /imu --out noise",
 )
@@ -93,7 +93,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 
 
 @command(
-    "Calibrate a magnetometer or an accelerometer that was turned.",
+    "Calibrate a magnetometer or accelerometer that was turned.",
     "fuselog ellipsoid turned.mcap --field /imu.magnetic_field_ut --length 48.5",
     "fuselog ellipsoid positions.mcap --field /imu.specific_force_mps2",
 )
@@ -120,7 +120,7 @@ def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
 
 
 @command(
-    "Say what is wrong with a log as it is written.",
+    "Find wrong units, signs, stamps and frames in a log.",
     "fuselog lint run.mcap",
     "fuselog lint run.mcap --set /imu.turn_rate_scale=0.01745",
 )
@@ -193,7 +193,7 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 
 
 @command(
-    "Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.",
+    "Export streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove.",
     "fuselog export est.mcap --to tum",
     "fuselog export run.mcap --to csv --topic /robot1/odometry -o odometry.csv",
 )
@@ -288,7 +288,7 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 
 
 @command(
-    "Write a log with what its inertial unit says of standing and rolling.",
+    "Add zero-velocity and non-holonomic measurements to a log.",
     "fuselog constrain run.mcap -o constrained.mcap --set rolling_hz=10",
 )
 @click.argument("path", type=ANY_PATH)

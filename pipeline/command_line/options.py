@@ -156,6 +156,9 @@ scheduler_option = click.option(
     help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+model_option = click.option(
+    "--model", type=MODEL, help="The model to estimate, if several fit the logs."
+)
 parameters_option = click.option(
     "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
 )

@@ -21,7 +21,7 @@ from fuselog.recorders.errors import BadInput, printable
 
 
 @command(
-    "Simulate a scenario and write its log.",
+    "Simulate a scenario as a log.",
     "fuselog record landmarks --seed 7 -o run.mcap",
     "fuselog record landmarks --set duration_s=120 -o long.mcap",
     "fuselog record --again run.mcap -o again.mcap",
@@ -84,7 +84,7 @@ def record(
 
 
 @command(
-    "Import real data and write their log.",
+    "Import real data (ROS, CSV, ULog, ...) as a log.",
     "fuselog import ros drive.bag -o drive.mcap",
     "fuselog import table drive.csv --guess -o mapping.toml",
     "fuselog import table drive.csv --mapping mapping.toml -o drive.mcap",

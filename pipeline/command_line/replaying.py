@@ -12,7 +12,6 @@ from fuselog.pipeline.command_line.options import (
     GOLDEN,
     JUNIT,
     LOG_OR_FOLDER,
-    MODEL,
     RESULT,
     TIMELINE,
     Seconds,
@@ -22,6 +21,7 @@ from fuselog.pipeline.command_line.options import (
     gap_option,
     json_option,
     late_option,
+    model_option,
     parameters_option,
     recover_option,
     replay_options,
@@ -60,7 +60,7 @@ folds_option = click.option(
     type=LOG_OR_FOLDER,
     help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
 )
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
+@model_option
 @click.option(
     "--every",
     "every_s",
@@ -110,13 +110,13 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 
 
 @command(
-    "Drag parameters of an estimator, and see at once what that changes.",
+    "Drag parameters of an estimator and watch the result change.",
     "fuselog explore run.mcap -e ekf",
     "fuselog explore run.mcap -e ekf -e ukf --set gate_probability=1",
 )
 @click.argument("log", type=ANY_PATH)
 @estimator_option("names", "An estimator, or two (repeatable).", many=True, required=True)
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
+@model_option
 @click.option("--no-browser", is_flag=True, help="Print the page's address, and open nothing.")
 @recover_option
 @gap_option
@@ -134,7 +134,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 
 
 @command(
-    "Search the parameters of an estimator that explain logs best.",
+    "Find the noise and other parameters that explain logs best.",
     "fuselog tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad",
     "fuselog tune train -e ekf --free sigma_range_m --validate test",
 )
@@ -165,7 +165,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @click.option(
     "--out", type=RESULT, default=Path("out/tune"), show_default=True, help="The result folder."
 )
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
+@model_option
 @workers_option
 @scheduler_option
 @replay_options
@@ -183,7 +183,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 
 
 @command(
-    "Search how sensors are mounted, scaled, biased and delayed.",
+    "Find how sensors are mounted, scaled, biased and delayed.",
     "fuselog calibrate run.mcap -e ekf",
     "fuselog calibrate train -e ekf --fixed lever_y_m --validate test",
 )
@@ -207,7 +207,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option(
     "--out", type=RESULT, default=Path("out/calibrate"), show_default=True, help="The result folder."
 )
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the logs.")
+@model_option
 @workers_option
 @scheduler_option
 @replay_options
@@ -224,7 +224,7 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
 
 
 @command(
-    "Check that estimators still give what a golden has.",
+    "Check that estimates are still those of a golden file.",
     "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
     "fuselog check run.mcap --against ekf.golden.xz",
     "fuselog check run.mcap --against ekf.golden.xz -e lib:./robot_ekf.so",
@@ -282,7 +282,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 )
 @click.argument("log", type=ANY_PATH)
 @estimator_option("name", "The filter: ekf, or ukf.", required=True)
-@click.option("--model", type=MODEL, help="The model to estimate, where several fit the log.")
+@model_option
 @click.option(
     "-o",
     "--out",

@@ -133,7 +133,7 @@ class _OfAnyModel(AnyEstimator):
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
-            summary=f"{method.summary}, of any model (`fuselog models` lists them)",
+            summary=method.summary,
             bind=partial(_bind_fitting, method=method),
             variant=method.variant,
             _method=method,

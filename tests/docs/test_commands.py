@@ -9,6 +9,7 @@ import click
 import pytest
 
 from fuselog.pipeline.command_line import fuselog
+from fuselog.pipeline.command_line.help import EXAMPLES, example_of
 from fuselog.pipeline.runs.inputs import shipped
 
 ROOT = Path(__file__).parents[2]
@@ -76,3 +77,27 @@ def test_the_help_ends_with_examples(name: str) -> None:
         assert len(line) <= 78
         assert line.split()[1] == name or not name
         understand(line)
+
+
+def test_the_help_has_every_command_in_one_section() -> None:
+    """And begins with the ten that one starts with."""
+    with click.Context(fuselog, info_name="fuselog") as context:
+        _, start, *others = re.split(r"^(?=\S.*:$)", fuselog.get_help(context), flags=re.MULTILINE)[1:]
+    assert start.startswith("Start here:\n")
+    assert len(named := re.findall(r"^  ([a-z]+) ", start, re.MULTILINE)) == 10
+    assert sorted(named + re.findall(r"^  ([a-z]+) ", "".join(others), re.MULTILINE)) == COMMANDS
+
+
+def test_every_option_has_an_example_that_is_understood() -> None:
+    used = set()
+    for name, command in fuselog.commands.items():
+        for option in (each for each in command.params if isinstance(each, click.Option)):
+            if (example := example_of(name, option)) is None:
+                continue
+            assert (option.help or "").endswith(f" Example: {example}")
+            _, value = shlex.split(example)
+            with click.Context(command) as context:
+                option.type.convert(value, option, context)
+            long = option.opts[-1]
+            used.add(own if (own := f"{name} {long}") in EXAMPLES else long)
+    assert used == EXAMPLES.keys()

@@ -35,6 +35,7 @@ WORKED = [
     "lint",
     "noise",
     "calibrate",
+    "stress",
     "smooth",
     "contract",
     "from-filterpy",

@@ -377,6 +377,17 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         assert row.split() == [method for method, said in cells.items() if said == "yes"]
 
 
+@pytest.mark.parametrize("kind", ["scenarios", "models", "estimators"])
+def test_lists_are_grouped_by_family(fuselog: Fuselog, kind: str) -> None:
+    """Every name is there once, and ours belong to families that have a title."""
+    lines = fuselog(kind).out.splitlines()
+    names = [words[0] for line in lines if line.startswith("   ") and (words := line.split())]
+    assert sorted(names) == sorted(getattr(fl, kind))
+    assert not [line for line in lines if "Of other packages" in line]
+    families = [line.strip() for line in lines if re.match(" [A-Z]", line)]
+    assert len(families) == len({*families}) >= 4
+
+
 @pytest.mark.usefixtures("here")
 def test_observability_of_a_log_is_a_command(world: Path, fuselog: Fuselog) -> None:
     """For a person and for machines; what cannot be asked is one sentence."""

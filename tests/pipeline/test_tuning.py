@@ -337,7 +337,7 @@ def test_the_worked_example_of_the_page(
     """Its commands give its table, a result folder, and settings that replay, run and tune take."""
     page = (Path(__file__).parents[2] / "docs" / "tune.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    commands = re.findall(r"^fuselog (.*)$", page, re.MULTILINE)
+    commands = re.findall(r"^fuselog (.*)$", page.replace("\\\n", ""), re.MULTILINE)
     told = [fuselog(*shlex.split(command)) for command in commands]
     assert [(each.code, each.err) for each in told] == [(0, "")] * 4
     shown, printed = (
