@@ -11,10 +11,11 @@ Tracking and Navigation, 2001, section 5.4; Durbin and Koopman, Time Series Anal
 Methods, 2nd ed. 2012, chapter 7.
 """
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,14 @@ from fuselog.pipeline.tuning.broad_starts import (
 from fuselog.pipeline.tuning.control_noise import disturbed
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log.impossible import YEAR_NS, possible
 from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
+Found = TypeVar("Found")
 MOST_MESSAGES = 300_000  # of the runs that are replayed together
 EVER_NS = 2**62
 ROOM_NS = 86_400 * 10**9  # before the first stamp
@@ -72,6 +75,20 @@ class Scored(NamedTuple):
     stretch: Mapping[str, float]
 
 
+class _Known:
+    """Keeps what is found of streams, which trials that alter others have in common."""
+
+    def __init__(self) -> None:
+        self._found: dict[Hashable, tuple[object, object]] = {}
+
+    def once(self, streams: Sequence[Stream], key: Hashable, find: Callable[[], Found]) -> Found:
+        """Return what `find` finds of these very streams, under a key."""
+        entry = (*map(id, streams), key)
+        if entry not in self._found:
+            self._found[entry] = find(), streams  # which are kept, so that their ids stay theirs
+        return cast(Found, self._found[entry][0])
+
+
 @dataclass
 class Likelihood:
     """Computes the log-likelihood of trials that have the measurements of one run.
@@ -106,7 +123,7 @@ class Likelihood:
         """
         bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
-        later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
+        later = {topic: _moved(each, self.later_ns)[0] for topic, each in trial.source.streams.items()}
         self.starts = broad_starts(replace(trial.source, streams=later), bound)
         self.readings = {
             each.name: each.reading()
@@ -119,7 +136,7 @@ class Likelihood:
             for topic, kinds in reading.kinds.items()
             if topic not in reading.controls and len(trial.source.streams[topic])
         }
-        scored = self._scored(trial, bound)
+        scored = self._scored(trial, bound, _Known())
         [parts] = self._innovations([bound], [scored])
         found = max(parts, key=_stated)
         for name, reading in self.readings.items():
@@ -151,7 +168,8 @@ class Likelihood:
         found = np.full((len(trials), count), -np.inf)
         for alike in together.values():
             for places in self._parts(trials, alike):
-                scored = [self._scored(trials[place], bound[place]) for place in places]
+                known = _Known()
+                scored = [self._scored(trials[place], bound[place], known) for place in places]
                 outputs = self._innovations([bound[place] for place in places], scored)
                 for place, part, of_run in zip(places, scored, outputs, strict=True):
                     found[place] = self._totals(part, of_run, count)
@@ -173,34 +191,40 @@ class Likelihood:
             self._bound[key] = bind(self.label, [trial.source], trial.settings)
         return self._bound[key]
 
-    def _scored(self, trial: Trial, bound: Sequence[Bound]) -> Scored:
-        """Choose what of a trial can be scored: in the span of what drives it, after its prior."""
-        streams = dict(trial.source.streams)
+    def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
+        """Choose what of a trial can be scored: in the span of what drives it, after its prior.
+
+        `known` keeps what is found of streams that trials have in common.
+        """
+        given, streams = trial.source.streams, dict(trial.source.streams)
         left, count, stretch = dict[str, float](), dict[str, int](), dict[str, float]()
         begins = [np.iinfo(np.int64).max]
         for each in bound:
             reading = self.readings.get(each.name)
             if reading is None:
                 continue
-            begin_ns, end_ns, step_ns = _span(reading.controls, each, trial.source.streams)
+            drives = [given[topic] for topic in (*reading.controls, *each.priors) if topic in given]
+            span_ns = known.once(drives, each.name, partial(_span, reading.controls, each, given))
             for topic in each.streams:
-                stream = trial.source.streams[topic]
+                stream = given[topic]
                 if topic not in reading.controls and len(stream):
-                    stamps_ns = stream.publish_time_ns
-                    is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
-                    lost = int(len(stream) - is_in.sum())
-                    if stamps_ns.min() < begin_ns or lost:
-                        inside = stream.take(is_in)
-                        held_ns = np.maximum(inside.publish_time_ns, begin_ns)
-                        streams[topic] = replace(inside, publish_time_ns=held_ns)
+                    streams[topic] = known.once([stream], span_ns, partial(_within, stream, span_ns))
+                    lost = len(stream) - len(streams[topic])
                     left[each.name] = left.get(each.name, 0.0) + lost * self.broad[topic]
                     count[each.name] = count.get(each.name, 0) + lost
-                    added = trial.stretched.get(topic, 0.0) * int(is_in.sum())
+                    added = trial.stretched.get(topic, 0.0) * len(streams[topic])
                     stretch[each.name] = stretch.get(each.name, 0.0) + added
                 begins += streams[topic].publish_time_ns[:1].tolist()
-        if self.later_ns:
-            streams = {topic: _later(stream, self.later_ns) for topic, stream in streams.items()}
-        source = replace(trial.source, streams=streams)
+        moved = {
+            topic: known.once([stream], self.later_ns, partial(_moved, stream, self.later_ns))
+            for topic, stream in streams.items()
+        }
+        ends_ns = [end_ns for _, ends_ns in moved.values() for end_ns in ends_ns]
+        source = replace(
+            trial.source,
+            streams={topic: stream for topic, (stream, _) in moved.items()},
+            is_raw=trial.source.is_raw or max(ends_ns, default=0) - min(ends_ns, default=0) <= YEAR_NS,
+        )
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
@@ -358,8 +382,23 @@ def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
     return is_first
 
 
-def _later(stream: Stream, by_ns: int) -> Stream:
-    return replace(stream, publish_time_ns=stream.publish_time_ns + by_ns)
+def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
+    """Return the messages that can be scored in a span, see `_span`, none of them before it."""
+    (begin_ns, end_ns, step_ns), stamps_ns = span_ns, stream.publish_time_ns
+    is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
+    if is_in.all() and stamps_ns.min() >= begin_ns:
+        return stream
+    inside = stream.take(is_in)
+    return replace(inside, publish_time_ns=np.maximum(inside.publish_time_ns, begin_ns))
+
+
+def _moved(stream: Stream, by_ns: int) -> tuple[Stream, tuple[float, ...]]:
+    """Return a stream with later stamps, and their ends; infinite if it has impossible messages."""
+    later = replace(stream, publish_time_ns=stream.publish_time_ns + by_ns) if by_ns else stream
+    if possible(later, None)[1]:
+        return later, (-np.inf, np.inf)
+    stamps_ns = later.publish_time_ns
+    return later, (int(stamps_ns.min()), int(stamps_ns.max())) if len(later) else ()
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:

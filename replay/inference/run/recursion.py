@@ -209,7 +209,7 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     if isinstance(rows, slice):
         return results, kept
     made: Columns = type(results)
-    return made(kept[1:], *(column[rows] for column in columns)), kept
+    return made(kept[1:], *(column.take(rows, axis=0) for column in columns)), kept
 
 
 class ProcessEvent(Protocol):

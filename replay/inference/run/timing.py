@@ -72,7 +72,7 @@ def compensate_delays(
     waiting = select_events(events, ~settled)
     measured = select_events(events._replace(time_ns=time_ns), settled)
     order = np.lexsort((measured.time_ns, run[settled]))
-    columns: Columns = (column[order] for column in measured[1:])
+    columns: Columns = (column.take(order, axis=0) for column in measured[1:])
     measured = FilterEvents(measured.offsets, *columns)
     measured = measured._replace(wants_estimate=last_of_stamps(measured))
     return measured._replace(wants_estimate=where_wanted(stage, measured)), waiting
@@ -106,7 +106,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
     columns: Columns = (
-        np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
+        np.concatenate(both).take(order, axis=0) for both in zip(first[1:], second[1:], strict=True)
     )
     return FilterEvents(first.offsets + second.offsets, *columns)
 
@@ -126,7 +126,8 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
         events: n of them, of all runs.
         chosen: (n,).
     """
-    columns: Columns = (column[chosen] for column in events[1:])
+    places = np.flatnonzero(chosen)
+    columns: Columns = (column.take(places, axis=0) for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
 
 
