@@ -124,7 +124,14 @@ class Beside(NamedTuple):
 
 
 def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floats) -> Beside:
-    """Compute what it costs beside a point (k,), along m of its coordinates, by steps (m,)."""
+    """Compute what it costs beside a point.
+
+    Args:
+        cost: of points (n, k).
+        point: (k,).
+        places: the m coordinates along which it is moved.
+        steps: (m,) by how much.
+    """
     return _differences(cost, point, list(places), steps, [])[0]
 
 

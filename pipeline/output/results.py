@@ -80,7 +80,7 @@ class Outcome:
     kind: Kind = "run"
 
     def measure(self, key: str, number: Interval) -> None:
-        """Keep `number`, with its 95 % interval, as the metric `key`."""
+        """Keep the value of an Interval `number`, and its ends, as the metric `key`."""
         self.metrics[key], self.intervals[key] = float(number.value), (number.low, number.high)
 
 

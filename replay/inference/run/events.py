@@ -267,7 +267,13 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
 
 
 def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
-    """Compute the variances that a sensor gives messages without a covariance; NaN where it has none."""
+    """Compute the variances that a sensor gives messages without a covariance; NaN where it has none.
+
+    Args:
+        stage: the model and its sensors.
+        number: the sensor's.
+        settings: (p,) of the model, then of each sensor.
+    """
     sensor = stage.sensors[number]
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
     return np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
