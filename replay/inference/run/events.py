@@ -272,7 +272,7 @@ def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
     Args:
         stage: the model and its sensors.
         number: the sensor's.
-        settings: (p,) of the model, then of each sensor.
+        settings: (sensors + 1, p) numbers of the model, then of each sensor.
     """
     sensor = stage.sensors[number]
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
