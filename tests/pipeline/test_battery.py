@@ -128,8 +128,7 @@ def test_pairs_and_triples_are_of_faults_that_a_log_tells_apart() -> None:
     "faults",
     [
         ("turn rate's sign", "speed x .3048"),  # no fixes too far apart with another variance
-        ("fixes .3 s late", "lever (2, .6) m"),  # an early odometry is likelier than either alone
-        ("fixes .3 s late", "lever (2, .6) m", "gyro bias .02"),
+        ("fixes .3 s late", "lever (2, .6) m", "gyro bias .02"),  # noise, if not fitted together
         ("speed x 3.6", "degrees as radians"),  # either alone looks like outliers
         ("speed x 3.6", "fix variance / 16"),  # no fixes and speeds of another scale
     ],
