@@ -225,10 +225,10 @@ def of_filtered_sets() -> tuple[Chart, Wanted]:
 
 
 def of_clutter() -> tuple[Chart, Wanted]:
-    """Means over three runs with Student's interval."""
+    """Means over five runs with Student's interval."""
     levels: dict[str, list[Any]] = {"estimator": BOTH, "clutter_per_scan": [0.0, 10.0]}
-    table = made("gospa_m", detection_probability=[0.9, 0.5], run=[0, 1, 2], **levels)
-    half = t.ppf(0.975, 2) / np.sqrt(3)
+    table = made("gospa_m", detection_probability=[0.9, 0.5], run=[0, 1, 2, 3, 4], **levels)
+    half = t.ppf(0.975, 4) / np.sqrt(5)
     wanted: Wanted = {}
     for probability in (0.9, 0.5):
         own = wanted[
