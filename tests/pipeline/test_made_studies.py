@@ -71,13 +71,13 @@ def test_sets_are_counted_where_there_is_a_truth(monkeypatch: pytest.MonkeyPatch
 
 def test_filters_of_sets_beside_frames() -> None:
     """Areas by the geometric mean of their ratios, containment by the mean difference, over robots."""
-    keys = {"case": [f"robot{number}" for number in range(6)], "run": [0] * 6}
+    keys = {"case": ["robot1", "robot2"] * 3, "run": [0, 0, 1, 1, 2, 2]}
     summary = pd.concat(
         [
-            pd.DataFrame({"estimator": label, **keys, "area_m2": area, "inside": inside})
+            pd.DataFrame({"estimator": label, **keys, "area_m2": area * 3, "inside": inside * 3})
             for label, area, inside in (
-                (set_filter.FILTER, [1.0, 4.0] * 3, [0.9, 0.8] * 3),
-                (set_filter.EKF, [2.0] * 6, [0.5, 0.6] * 3),
+                (set_filter.FILTER, [1.0, 4.0], [0.9, 0.8]),
+                (set_filter.EKF, [2.0, 2.0], [0.5, 0.6]),
             )
         ]
     )
