@@ -45,8 +45,10 @@ MODULE = """
     columns = Columns(np.arange(3.0), np.zeros(3))
 """
 BY_NUMBA = f"""{MODULE}
+    import numba
     from fuselog.replay.engine.through_numba import numba_over_runs
 
+    numba.config.reload_config()  # it was imported before the folder of its cache was set
     loop = numba_over_runs(kernel(model))
     loop(3, columns)
     (made,) = loop.compiled_loop()._kernels.values()
@@ -348,6 +350,7 @@ def sorted_copy(run: int, values: np.ndarray, found: np.ndarray) -> None:
     found[run] = from_table(0, 1) * (np.sort(values[run])[:2] @ np.ones(2))
 
 
+@pytest.mark.paper
 def test_a_kernel_that_makes_arrays_is_numbas():
     values, found = np.array([[3.0, 1.0, 2.0]]), np.zeros(1)
     numba_over_runs(sorted_copy)(1, values, found)
