@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 from rosbags.interfaces import MessageDefinition
@@ -77,15 +78,19 @@ class SqliteFile:
         # Python's own errors, as of a text that is not UTF-8, have no code
         if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_CORRUPT:
             return ""
-        return f"; `sqlite3 {self.path.name} .recover | sqlite3 whole.db3` may get more of it back"
+        command = f"sqlite3 {quote(str(self.path))} .recover | sqlite3 whole.db3"
+        return f"; `{command}` may get more of it back"
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
         """Yield the messages of the wanted connections, some thousand rows at a time."""
         chosen = [number for number, each in self._by_id.items() if wanted(each)]
         with closing(self._open()) as database:
-            for found in _some_at_a_time(self._messages(database, chosen)):
+            rows = self._messages(database, chosen)
+            while found := list(islice(rows, _ROWS)):
                 for number in dict.fromkeys(row[0] for row in found):
-                    yield self._batch(number, [row for row in found if row[0] == number])
+                    own = [row for row in found if row[0] == number]
+                    stamps_ns = np.array([row[1] for row in own], np.int64)
+                    yield joined(self._by_id[number], [row[2] for row in own], stamps_ns)
 
     def _messages(self, database: sqlite3.Connection, chosen: Sequence[int]) -> Iterator[_Row]:
         """Yield the messages of some topics; rows that are no messages are counted."""
@@ -114,10 +119,6 @@ class SqliteFile:
             behind = "all messages are" if row is None else f"what follows the one of time {row[1]} is"
             self._losses["damage"] = f"is damaged ({error}); {behind} lost{self._mend(error)}"
 
-    def _batch(self, number: int, rows: list[_Row]) -> Batch:
-        stamps_ns = np.array([row[1] for row in rows], np.int64)
-        return joined(self._by_id[number], [row[2] for row in rows], stamps_ns)
-
 
 def _whole_pages(path: Path, scratch: Path) -> Path:
     """Return a database without a last page that was cut off: SQLite takes what is missing for zeros."""
@@ -132,11 +133,6 @@ def _whole_pages(path: Path, scratch: Path) -> Path:
     shutil.copyfile(path, place)
     os.truncate(place, size - partial)
     return place
-
-
-def _some_at_a_time(rows: Iterator[_Row]) -> Iterator[list[_Row]]:
-    while found := list(islice(rows, _ROWS)):
-        yield found
 
 
 def _connections(database: sqlite3.Connection) -> Iterator[tuple[int, Connection]]:
