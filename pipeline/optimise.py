@@ -124,7 +124,14 @@ class Beside(NamedTuple):
 
 
 def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floats) -> Beside:
-    """Compute what it costs beside a point (k,), along m of its coordinates, by steps (m,)."""
+    """Compute what it costs beside a point.
+
+    Args:
+        cost: of points (n, k).
+        point: (k,).
+        places: m of the k coordinates.
+        steps: how far along each of these, for all of them or (m,).
+    """
     return _differences(cost, point, list(places), steps, [])[0]
 
 
