@@ -129,8 +129,8 @@ def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floa
     Args:
         cost: of points (n, k).
         point: (k,).
-        places: the m coordinates along which it is moved.
-        steps: (m,) by how much.
+        places: m of the k coordinates.
+        steps: how far along each of these, for all of them or (m,).
     """
     return _differences(cost, point, list(places), steps, [])[0]
 

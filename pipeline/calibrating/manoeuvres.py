@@ -13,12 +13,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from fuselog.pipeline.calibrating.car import MOTIONS, NAMES, Motion, Steps, drive, recorded
+from fuselog.pipeline.calibrating.car import NAMES, WIDE, drive, recorded
 from fuselog.pipeline.tuning.information import information
 from fuselog.pipeline.tuning.objective import Run, in_memory
 from fuselog.pipeline.tuning.outcome import TUNED, Tuning
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Schema, Stream, schemas, topics_of
+from fuselog.recorders.simulators.car import MOTIONS
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import Source
@@ -26,7 +27,6 @@ from fuselog.replay.engine.streams.sources import Source
 Floats = NDArray[np.float64]
 DURATION_S = 20.0
 PRIOR = 10.0  # how far off a parameter may be before anything is recorded, in useful units
-START = (1000.0, 1000.0, 1.0)  # of a manoeuvre's start, in m and rad
 SIMULATED = {
     "/car/odometry": schemas.ODOMETRY,
     "/car/fix": schemas.POSITION_FIX,
@@ -86,8 +86,8 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
     log = found.logs[0]
     known = information(objective, values, useful, places) + np.eye(len(places)) / PRIOR**2
     gains = {"none": gain(known, 0.0 * known)}
-    for name, motion in MOTIONS.items():
-        run = _simulated(found, log, motion)
+    for name in MOTIONS:
+        run = _simulated(found, log, name)
         simulated = replace(objective, settings=found.settings[TUNED], runs=[run], pool=None)
         simulated.begin(values)
         gains[name] = gain(known, information(simulated, values, useful, places))
@@ -115,14 +115,24 @@ def advice(found: Tuning) -> list[str]:
     ]
 
 
-def _simulated(found: Tuning, log: Source, motion: Motion) -> Run:
+def _simulated(found: Tuning, log: Source, motion: str) -> Run:
     """Simulate a manoeuvre as a log of the same topics, with the values that were found."""
     streams = _of_kinds(log)
-    steps = [_step_s(streams.get(topic)) for topic in SIMULATED]
+    odometry_s, fix_s, compass_s = (_step_s(streams.get(topic)) for topic in SIMULATED)
     usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}
     held = {name: found.settings[TUNED].get(name) or value for name, value in usual.items()}
-    car = drive(None, motion, DURATION_S, _errors(held), Steps(*steps))
-    source = recorded(car, START)
+    car = drive(
+        None,
+        _errors(held),
+        motion=motion,
+        duration_s=DURATION_S,
+        odometry_step_s=odometry_s,
+        fix_step_s=fix_s,
+        first_fix_s=2.0 * fix_s,
+        compass_step_s=compass_s,
+        **WIDE,
+    )
+    source = recorded(car)
     made: dict[str, Stream] = {}
     for topic, stream in source.streams.items():
         if topic in streams:

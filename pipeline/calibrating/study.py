@@ -12,15 +12,15 @@ import pandas as pd
 from pydantic import NonNegativeInt
 
 from fuselog.pipeline.calibrating.calibrating import calibrate
-from fuselog.pipeline.calibrating.car import MOTIONS, NAMES, OURS, TRUTH, drive, recorded
+from fuselog.pipeline.calibrating.car import NAMES, OURS, TRUTH, WIDE, drive, recorded
 from fuselog.pipeline.output.charts import coverage
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.car import MOTIONS
 
-WIDE = (1000.0, 1000.0, 1.0)  # of a start, in m and rad
 # the car's noise is that of its motion, the model's that of the readings
 NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * TRUTH[1]}
 
@@ -96,7 +96,7 @@ def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> 
 
 def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[Any]:
     """Return the motion, and of each parameter whether it stays undetermined."""
-    found = calibrate(recorded(drive(None, MOTIONS[motion]), WIDE), {label: settings})
+    found = calibrate(recorded(drive(None, TRUTH, motion=motion, **WIDE)), {label: settings})
     held = set(found.found.held)
     return [motion, *(name in held for name in NAMES)]
 

@@ -17,10 +17,9 @@ from fuselog.recorders.common_streams import prior_stream, stated_numbers, truth
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.stamps import to_ns
 from fuselog.recorders.log import Stream, make_stream, schemas
+from fuselog.recorders.models.states import POSE
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Importer, Recording
-
-POSE = ("x_m", "y_m", "heading_rad")
 
 
 class MrclamParameters(Parameters):

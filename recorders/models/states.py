@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 # What moves in the plane with a velocity of its own.
+POSE = ("x_m", "y_m", "heading_rad")
 PLANE_MOTION = ("x_m", "vx_mps", "y_m", "vy_mps")
 ORIENTATION = tuple(f"orientation_{part}" for part in "wxyz")
 # What an inertial unit is navigated by: where it is, how it is turned, and its biases.

@@ -1,4 +1,4 @@
-"""Simulates robots among landmarks, and inertial units with a receiver; begin with `landmarks`.
+"""Simulates robots among landmarks, inertial units with a receiver, and a car; begin with `landmarks`.
 
 The scenarios of families are in `fuselog.recorders.families`.
 """

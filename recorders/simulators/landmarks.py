@@ -21,6 +21,7 @@ from fuselog.recorders.common_streams import (
 from fuselog.recorders.log import Schema, Stream, make_stream, schemas
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
+from fuselog.recorders.models.states import POSE
 from fuselog.recorders.recording import (
     SIMULATION_EPOCH_NS,
     Recording,
@@ -46,7 +47,6 @@ NUMBERS = {
     "relative_bearing": 5,
     "fix": 6,
 }
-POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Drive(NamedTuple):

@@ -10,16 +10,13 @@ import numpy as np
 
 import fuselog as fl
 from fuselog.pipeline.diagnosing.battery.car import (
-    NOISE,
-    TURN_DENSITY,
-    Noise,
     drive,
     late,
     lever,
     recorded,
-    stamps_ns,
 )
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.recorders.simulators.car import stamps_ns
 
 GYRO = "/car/turn_rate"
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
@@ -33,10 +30,10 @@ PLANTED = {
 
 
 def several(
-    seed: int, duration_s: float, noise: Noise = NOISE, *, has_gyro: bool, has_prior: bool = False
+    seed: int, duration_s: float, *, has_gyro: bool, has_prior: bool = False, **noise: float
 ) -> fl.MemorySource:
     """Wheels x 1.03, turn rates 0.01 rad/s too large, fixes 0.25 s late, a lever arm not given."""
-    car = late(0.25)(lever(0.40, -0.15)(drive(seed, noise=noise, duration_s=duration_s)))
+    car = late(0.25)(lever(0.40, -0.15)(drive(seed, duration_s=duration_s, **noise)))
     car = car._replace(speed_mps=1.03 * car.speed_mps, turn_radps=car.turn_radps + 0.01)
     log = recorded(car, has_compass=False, has_prior=has_prior)
     if not has_gyro:
@@ -46,7 +43,7 @@ def several(
         GYRO,
         fl.schemas.INERTIAL_SAMPLE,
         stamps_ns(car.odometry_s),
-        metadata={"turn_noise_density": repr(TURN_DENSITY)},
+        metadata={"turn_noise_density": repr(car.turn_density)},
         specific_force_mps2=np.zeros((len(zero), 3)),
         turn_rate_radps=np.stack([zero, zero, car.turn_radps], axis=1),
         magnetic_field_ut=np.empty((len(zero), 0)),

@@ -19,15 +19,10 @@ from fuselog.pipeline.diagnosing.battery import car as battery_car
 from fuselog.pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
-    Car,
-    Noise,
-    Truth,
-    arcs,
     drive,
     faulty,
     late,
     recorded,
-    stamps_ns,
 )
 from fuselog.pipeline.diagnosing.causes import find_causes, seek
 from fuselog.pipeline.diagnosing.consistency import judged_by_itself
@@ -39,6 +34,7 @@ from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.simulators.car import Car, Truth, arcs, stamps_ns
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.judging.consistency.consistency import CONSISTENT
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
@@ -95,7 +91,7 @@ def test_the_noise_of_the_wheels_is_no_cause(ratios: consistent.Ratios) -> None:
 @pytest.mark.paper
 def test_a_delay_beside_noisy_wheels_is_found() -> None:
     noise = consistent.Ratios(10.0, 10.0).noise
-    log = recorded(late(0.3)(drive(SEED, noise=noise)), has_prior=True)
+    log = recorded(late(0.3)(drive(SEED, **noise)), has_prior=True)
     cause = seek(log, "ekf", OPEN, 1).causes[0]
     assert (cause.hypothesis.kind, cause.hypothesis.topic) == ("delay", FIX)
     assert cause.value == pytest.approx(0.3, abs=0.02)
@@ -188,7 +184,7 @@ def test_several_ordinary_faults_are_fitted_together(*, has_gyro: bool) -> None:
 
     The fixes are so good that 80 s tell as much as 10 minutes.
     """
-    log = several(1, 80.0, Noise(fix_sigma_m=0.12), has_gyro=has_gyro, has_prior=True)
+    log = several(1, 80.0, has_gyro=has_gyro, has_prior=True, fix_sigma_m=0.12)
     turn = (GYRO, "turn_rate_z_radps") if has_gyro else (ODOMETRY, "turn_radps")
     planted = {
         ("factor or sign", ODOMETRY, "forward_mps"): 1.03,

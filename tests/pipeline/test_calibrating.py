@@ -17,20 +17,14 @@ from fuselog.pipeline.calibrating.car import (
     NAMES,
     OURS,
     TRUTH,
-    Floats,
-    Motion,
-    circle,
-    circles,
+    WIDE,
     drive,
     recorded,
-    rich,
-    slalom,
-    straight,
 )
 from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from fuselog.pipeline.calibrating.manoeuvres import _simulated, advice, gain
-from fuselog.pipeline.diagnosing.battery.car import arcs, late, stamps_ns
 from fuselog.pipeline.diagnosing.battery.car import drive as battery_drive
+from fuselog.pipeline.diagnosing.battery.car import late
 from fuselog.pipeline.diagnosing.battery.car import recorded as battery_recorded
 from fuselog.pipeline.tuning.command import progress_of
 from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
@@ -43,6 +37,7 @@ from fuselog.recorders.log import RunMetadata
 from fuselog.recorders.models.inertial import from_mounting
 from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.recording import Recording
+from fuselog.recorders.simulators.car import Floats, arcs, stamps_ns
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import memory_source
 from tests.goldens import keeping
@@ -63,7 +58,7 @@ USEFUL = np.array([0.01, 0.01, 0.01, 0.2, 0.2, 0.05, 0.02])
 @pytest.mark.paper
 def test_the_car_of_the_sheet() -> None:
     car = drive(1)
-    sums = [car.odometry[:, 0].sum(), car.odometry[:, 1].sum(), car.fix_m.sum(), car.compass_rad.sum()]
+    sums = [each.sum() for each in (car.speed_mps, car.turn_radps, car.fix_m, car.compass_rad)]
     assert sums == pytest.approx([10018.5904476, 14.594704982, 96427.5316865, 895.280996548], rel=1e-9)
     told = list[Best]()
     found = fl.calibrate(recorded(car), "ekf", set=OPEN, on_best=told.append)
@@ -86,17 +81,17 @@ def test_the_car_of_the_sheet() -> None:
 @pytest.mark.parametrize(
     ("motion", "eigenvalues", "held"),
     [
-        (rich, [3.276, 5.103, 28.15, 110.2, 123.3, 195.3, 466.0], []),
-        (straight, [123.3, 267.8, 566.3], ["turn_scale", "lever_x_m", "lever_y_m", "fix_delay_s"]),
-        (circle, [143.0, 150.0, 559.0], list(NAMES)),
-        (slalom, [0.142, 6.93, 11.5, 56.4, 123.0, 232.0, 534.0], ["lever_x_m", "fix_delay_s"]),
+        ("turns at changing speed", [3.276, 5.103, 28.15, 110.2, 123.3, 195.3, 466.0], []),
+        ("straight", [123.3, 267.8, 566.3], ["turn_scale", "lever_x_m", "lever_y_m", "fix_delay_s"]),
+        ("circle", [143.0, 150.0, 559.0], list(NAMES)),
+        ("slalom", [0.142, 6.93, 11.5, 56.4, 123.0, 232.0, 534.0], ["lever_x_m", "fix_delay_s"]),
     ],
 )
 @pytest.mark.paper
 def test_what_the_motion_does_not_determine_is_named_and_held(
-    motion: Motion, eigenvalues: list[float], held: list[str]
+    motion: str, eigenvalues: list[float], held: list[str]
 ) -> None:
-    log = recorded(drive(None, motion), (1000.0, 1000.0, 1.0))
+    log = recorded(drive(None, motion=motion, **WIDE))
     found = fl.calibrate(log, "ekf", set=OPEN)
     assert {*found.found.held} == {*held}
     rows = found.parameters.set_index("parameter")
@@ -169,30 +164,34 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         advice(replace(found, logs=[without]))
     for left_out in ("nothing", "/car/heading"):  # a manoeuvre has the sensors of the log
         streams = {name: log.streams[name] for name in log.streams if name != left_out}
-        made = _simulated(found, replace(log, streams=streams), circle).ensemble[0]
+        made = _simulated(found, replace(log, streams=streams), "circle").ensemble[0]
         assert {*made.topics} == {*streams}
 
 
 @pytest.mark.paper
 def test_the_next_manoeuvre_is_the_sheets() -> None:
     """The prior is the sheet's, in useful units; each manoeuvre has a start of its own."""
-    wide = (1000.0, 1000.0, 1.0)
-    found = fl.calibrate(recorded(drive(None, straight, 60.0), wide), "ekf", set=OPEN, next_motion=True)
+    log = recorded(drive(None, motion="straight", duration_s=60.0, **WIDE))
+    found = fl.calibrate(log, "ekf", set=OPEN, next_motion=True)
     names = [each.name for each in found.found.coordinates.free]
     order = [names.index(name) for name in NAMES]
     values, useful = np.empty(7), np.empty(7)
     values[order], useful[order] = OURS, USEFUL
     turned = BY_SHEET * USEFUL / USEFUL[:, None]
 
-    def told(motion: Motion, duration_s: float) -> Floats:
-        run = in_memory(log := recorded(drive(None, motion, duration_s), wide), bind("ekf", [log], OPEN))
+    def told(motion: str, duration_s: float) -> Floats:
+        log = recorded(drive(None, motion=motion, duration_s=duration_s, **WIDE))
+        run = in_memory(log, bind("ekf", [log], OPEN))
         objective = replace(found.objective, runs=[run])
         objective.begin(values)
         return turned.T @ information(objective, values, useful, order) @ turned
 
     prior = np.diag(np.square(USEFUL / [0.1, 0.1, 0.02, 2.0, 2.0, 0.5, 0.2]))
-    known = prior + told(straight, 60.0)
-    both, varied = (gain(known, told(motion, 20.0)) for motion in (circles, rich))
+    known = prior + told("straight", 60.0)
+    both, varied = (
+        gain(known, told(motion, 20.0))
+        for motion in ("circles in both senses", "turns at changing speed")
+    )
     assert (both.nats, both.widest) == pytest.approx((11.102931, 5.030), rel=0.02)
     assert (varied.nats, varied.widest) == pytest.approx((10.777415, 1.454), rel=0.02)
     assert varied.sigmas * USEFUL == pytest.approx(
@@ -360,7 +359,8 @@ def test_a_delay_can_be_tuned_by_the_error() -> None:
 def test_what_depends_on_a_value_that_is_held_is_said() -> None:
     """Fixes that are 0.3 s late, along a short straight line, are a scale of 0.95."""
     errors = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.3, 0.0])
-    log = recorded(drive(None, straight, 8.0, errors), (0.05, 0.05, 0.02))
+    prior = {"prior_sigma_m": 0.05, "prior_sigma_rad": 0.02}
+    log = recorded(drive(None, errors, motion="straight", duration_s=8.0, **prior))
     found = fl.calibrate(log, "ekf")
     assert "fix_delay_s" in found.found.held
     scale = found.parameters.set_index("parameter").loc["forward_scale"]

@@ -9,8 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from fuselog.pipeline.diagnosing.battery.car import FAULTS, Car, drive
+from fuselog.pipeline.diagnosing.battery.car import FAULTS, drive
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
+from fuselog.recorders.simulators.car import Car
 
 BERLIN = (52.5, 13.4, 40.0)
 FOOT_M = 0.3048

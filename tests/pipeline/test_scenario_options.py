@@ -54,6 +54,7 @@ CASES = {
     "acoustic-shots": Case({"shots": 2}),
     "axis": Case({"steps": 5}, {"start": [0.6, 0.8]}, _without_noise(2)),
     "biometric-scores": Case({"users": 40, "low_galleries": 4}, slow=frozenset({"users"})),
+    "car": Case({"duration_s": 15.0}, {"rest_s": 2.0}),
     "ispace": Case(
         {"steps": 20},
         {

@@ -17,6 +17,7 @@ from fuselog.recorders.recording import Simulator, record_run
 # What makes the runs short that are long.
 SHORT: dict[str, dict[str, Any]] = {
     "biometric-scores": {"users": 20},
+    "car": {"duration_s": 5.0},
     "crossing": {"duration_s": 8.0},
     "landmarks": {"duration_s": 5.0},
     "navigation": {"duration_s": 10.5},

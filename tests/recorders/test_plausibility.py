@@ -15,7 +15,6 @@ from fuselog.pipeline.diagnosing.battery.car import (
     FAULTS,
     UNIT_FAULTS,
     Unit,
-    arcs,
     faulty,
     recorded,
     recorded_unit,
@@ -30,6 +29,7 @@ from fuselog.recorders.plausibility.speeds import scatter
 from fuselog.recorders.plausibility.timing import Timing
 from fuselog.recorders.plausibility.turns import _by_forces
 from fuselog.recorders.recording import record_run
+from fuselog.recorders.simulators.car import arcs
 from tests.pipeline.test_planes import HERE, car
 
 FOUND = {  # of car D with its compass: cause, topic and setting that are named first

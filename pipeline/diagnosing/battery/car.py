@@ -1,133 +1,35 @@
-"""Simulates a car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; prior or none.
+"""Puts faults into logs of a car that drives after 10 s at rest, with a prior or without.
 
-Its faults by name, the inertial unit that may ride with it, with its own, and logs of both. Faults are
-put into the columns themselves, not by what a diagnosis undoes them with.
+They go by name, as do those of an inertial unit that rides with it. Faults are put into the columns
+themselves, not by what a diagnosis undoes them with.
 """
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fuselog.recorders.common_streams import fix_stream, prior_stream
 from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
+from fuselog.recorders.simulators.car import Car, CarParameters, Floats, philox, stamps_ns, streams_of
+from fuselog.recorders.simulators.car import drive as simulated
 from fuselog.replay.engine.streams.sources import MemorySource
 
-Floats = NDArray[np.floating]
-DURATION_S, REST_S, RAMP_S = 100.0, 10.0, 5.0
-FIX_SIGMA_M, COMPASS_SIGMA_RAD = 0.5, 0.03
-FIX_STEP_S, COMPASS_STEP_S = 0.5, 0.2
-FORWARD_DENSITY, TURN_DENSITY = 0.05, 0.01
 GRAVITY_MPS2 = 9.81
-START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
+CLEAN: dict[str, Any] = {
+    "duration_s": 100.0,
+    "rest_s": 10.0,
+    "begin": "any heading",
+    "prior_sigma_m": 1.0,
+    "first_fix_s": 0.0,
+    "fix_sigma_m": 0.5,
+    "compass_sigma_rad": 0.03,
+}
 
 
-class Truth(NamedTuple):
-    """Describes how the car drives: speeds, turn rates (n,) of each step, poses (n + 1, 3) between."""
-
-    step_s: float
-    speed_mps: Floats
-    turn_radps: Floats
-    pose: Floats
-
-    def at(self, times_s: Floats) -> Floats:
-        """Interpolate poses (m, 3) at any times, exactly; before the begin the car rests."""
-        step = np.clip(times_s // self.step_s, 0, len(self.speed_mps) - 1).astype(int)
-        since_s = np.maximum(times_s - step * self.step_s, 0.0)
-        return self.pose[step] + arcs(
-            self.pose[step, 2], self.speed_mps[step], self.turn_radps[step], since_s
-        )
-
-
-class Noise(NamedTuple):
-    """States the noise of the sensors: densities of the wheels, standard deviations of the others."""
-
-    forward_density: float = FORWARD_DENSITY
-    turn_density: float = TURN_DENSITY
-    fix_sigma_m: float = FIX_SIGMA_M
-    compass_sigma_rad: float = COMPASS_SIGMA_RAD
-
-
-NOISE = Noise()
-
-
-class Car(NamedTuple):
-    """Holds what a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
-
-    seed: int
-    truth: Truth
-    odometry_s: Floats
-    speed_mps: Floats
-    turn_radps: Floats
-    fix_s: Floats
-    fix_m: Floats
-    compass_s: Floats
-    compass_rad: Floats
-    fix_variance_m2: float = FIX_SIGMA_M**2
-    turn_density: float = TURN_DENSITY
-    forward_density: float = FORWARD_DENSITY
-    compass_sigma_rad: float = COMPASS_SIGMA_RAD
-    fix_late_s: float = 0.0
-    lever_m: tuple[float, float] = (0.0, 0.0)
-
-
-def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
-    """Compute how poses change along exact arcs.
-
-    Args:
-        heading_rad: (n,), before each step.
-        speed_mps: (n,), forward.
-        turn_radps: (n,), anticlockwise.
-        duration_s: (n,), of each step.
-
-    Returns:
-        (n, 3), what is added to x and y in m, and to the heading in rad.
-    """
-    turned = turn_radps * duration_s
-    chord = speed_mps * duration_s * np.sinc(0.5 * turned / np.pi)
-    about = heading_rad + 0.5 * turned
-    return np.stack([chord * np.cos(about), chord * np.sin(about), turned], axis=-1)
-
-
-def philox(key: int) -> np.random.Generator:
-    """Return the sheet's P(key)."""
-    return np.random.Generator(np.random.Philox(key=key))
-
-
-def drive(seed: int, step_s: float = 0.1, noise: Noise = NOISE, duration_s: float = DURATION_S) -> Car:
-    """Return the car without a fault."""
-    rng, n = philox(seed), round(duration_s / step_s)
-    fix_s = np.arange(round(duration_s / FIX_STEP_S) + 1) * FIX_STEP_S
-    compass_s = np.arange(round(duration_s / COMPASS_STEP_S) + 1) * COMPASS_STEP_S
-    start_rad = 2.0 * np.pi * rng.uniform()
-    odometry, fixes = rng.standard_normal((n, 2)), rng.standard_normal((len(fix_s), 2))
-    compass = rng.standard_normal(len(compass_s))
-    since_s = (np.arange(n) + 0.5) * step_s
-    ramp = np.clip((since_s - REST_S) / RAMP_S, 0.0, 1.0)
-    speed = ramp * (8.0 + 3.0 * np.sin(0.4 * (since_s - REST_S)))
-    turn = ramp * (0.25 * np.sin(0.21 * since_s) + 0.15 * np.sin(0.53 * since_s))
-    before_rad = start_rad + np.concatenate([[0.0], np.cumsum(turn * step_s)])
-    steps = arcs(before_rad[:-1], speed, turn, np.full(n, step_s))
-    start = np.array([[0.0, 0.0, start_rad]])
-    truth = Truth(step_s, speed, turn, start + np.concatenate([0.0 * start, np.cumsum(steps, axis=0)]))
-    of_wheels = np.array([noise.forward_density, noise.turn_density]) / step_s**0.5 * odometry
-    return Car(
-        seed,
-        truth,
-        np.arange(n) * step_s,
-        speed + of_wheels[:, 0],
-        turn + of_wheels[:, 1],
-        fix_s,
-        truth.at(fix_s)[:, :2] + noise.fix_sigma_m * fixes,
-        compass_s,
-        truth.at(compass_s)[:, 2] + noise.compass_sigma_rad * compass,
-        noise.fix_sigma_m**2,
-        noise.turn_density,
-        noise.forward_density,
-        noise.compass_sigma_rad,
-    )
+def drive(seed: int, **changed: float) -> Car:
+    """Return the car without a fault; `changed` are parameters of its own."""
+    return simulated(CarParameters(**{**CLEAN, **changed}), philox(seed))._replace(seed=seed)
 
 
 # Faults.
@@ -193,37 +95,9 @@ def faulty(seed: int, *names: str) -> Car:
     return reduce(lambda car, name: FAULTS[name](car), names, drive(seed))
 
 
-def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
-    """Return stamps (n,) in ns."""
-    return np.rint(1e9 * times_s).astype(np.int64)
-
-
 def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
     """Return the car as a log, which `fl.write` writes; a prior is about the true start."""
-    half = 0.5 * car.compass_rad
-    zero = np.zeros_like(half)
-    wheels = make_stream(
-        "/car/odometry",
-        schemas.ODOMETRY,
-        stamps_ns(car.odometry_s),
-        metadata={
-            "forward_noise_density": repr(car.forward_density),
-            "turn_noise_density": repr(car.turn_density),
-        },
-        forward_mps=car.speed_mps,
-        turn_radps=car.turn_radps,
-    )
-    fixes = fix_stream("/car/fix", stamps_ns(car.fix_s), car.fix_m, car.fix_variance_m2)
-    compass = make_stream(
-        "/car/heading",
-        schemas.ORIENTATION,
-        stamps_ns(car.compass_s),
-        metadata={"covariance_rad2": ",".join(3 * [repr(car.compass_sigma_rad**2)])},
-        quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
-    )
-    pose = ("x_m", "y_m", "heading_rad")
-    prior = prior_stream("/car/prior", 0, pose, car.truth.pose[0], np.diag(START_SIGMAS**2))
-    return source([wheels, fixes, *[compass] * has_compass, *[prior] * has_prior])
+    return source(streams_of(car, has_compass=has_compass, has_prior=has_prior))
 
 
 def source(streams: list[Stream]) -> MemorySource:
@@ -252,7 +126,7 @@ class Unit(NamedTuple):
 
 def ride(seed: int) -> Unit:
     """Return the unit without a fault."""
-    truth, rng = drive(seed, 0.02).truth, philox(seed + 500_000)
+    truth, rng = drive(seed, odometry_step_s=0.02).truth, philox(seed + 500_000)
     n = len(truth.speed_mps)
     force, turn = rng.standard_normal((n, 3)), rng.standard_normal(n)
     velocity = rng.standard_normal((500, 2))

@@ -10,20 +10,13 @@ from typing import Annotated, Any, NamedTuple
 import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from fuselog.pipeline.diagnosing.battery.car import (
-    COMPASS_STEP_S,
-    FIX_STEP_S,
-    FORWARD_DENSITY,
-    TURN_DENSITY,
-    Noise,
-    drive,
-    recorded,
-)
+from fuselog.pipeline.diagnosing.battery.car import drive, recorded
 from fuselog.pipeline.diagnosing.causes import seek
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.simulators.car import CarParameters
 from fuselog.replay.engine.streams.sources import MemorySource
 
 
@@ -52,16 +45,20 @@ class Ratios(NamedTuple):
     to_compass: float  # 0: there is no compass
 
     @property
-    def noise(self) -> Noise:
-        """Return the noise of the car's sensors."""
-        fix_sigma_m = FORWARD_DENSITY * FIX_STEP_S**0.5 / self.to_fix
-        compass_sigma_rad = TURN_DENSITY * COMPASS_STEP_S**0.5 / (self.to_compass or 1.0)
-        return Noise(fix_sigma_m=fix_sigma_m, compass_sigma_rad=compass_sigma_rad)
+    def noise(self) -> dict[str, float]:
+        """Return the noise of the car's fixes and compass, as parameters."""
+        usual = CarParameters()
+        to_fix = usual.forward_noise_density * usual.fix_step_s**0.5
+        to_compass = usual.turn_noise_density * usual.compass_step_s**0.5
+        return {
+            "fix_sigma_m": to_fix / self.to_fix,
+            "compass_sigma_rad": to_compass / (self.to_compass or 1.0),
+        }
 
 
 def log_of(ratios: Ratios, seed: int) -> MemorySource:
     """Return a log in which nothing is wrong."""
-    car = drive(seed, noise=ratios.noise)
+    car = drive(seed, **ratios.noise)
     return recorded(car, has_compass=ratios.to_compass > 0.0, has_prior=True)
 
 

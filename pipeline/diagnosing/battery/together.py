@@ -12,7 +12,7 @@ import pandas as pd
 from pydantic import Field
 
 from fuselog.pipeline.diagnosing.battery.battery import OPEN, RIGHT, Right, case_of
-from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, philox, recorded
+from fuselog.pipeline.diagnosing.battery.car import FAULTS, faulty, recorded
 from fuselog.pipeline.diagnosing.causes import Cause, seek
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import NOISES
 from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES
@@ -21,6 +21,7 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.judging.intervals import Interval
+from fuselog.recorders.simulators.car import philox
 
 PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"

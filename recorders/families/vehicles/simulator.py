@@ -19,7 +19,7 @@ from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.log.planes import FRAME, body_of
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.planar import into_frame
-from fuselog.recorders.models.states import PLANE_MOTION
+from fuselog.recorders.models.states import PLANE_MOTION, POSE
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_ns
 
@@ -38,7 +38,6 @@ PAPER_START: tuple[State, ...] = (
     (0.0, 1.5, 0.0, 1.0),
     (0.0, 1.5, 100.0, -1.0),
 )
-POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Delayed(Parameters):

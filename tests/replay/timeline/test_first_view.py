@@ -28,6 +28,7 @@ FIRST = {
     "axis": First({"steps": 5}, {"bingham-axis": {}, "kalman-axis": {}}),
     "batch-reactor": First({"steps": 10}, {"ekf": {}}),
     "biometric-scores": First({"users": 20}, {"score-rule": {}}),
+    "car": First({"duration_s": 20.0}, {"ekf": {}, "ukf": {}}),
     "crossing": First({"duration_s": 20.0}, {"tracker:jipda": {}}),
     "extended-target": First({"points": 10}, {"analytic": {}}),
     "ispace": First({"steps": 10}, {"network:naive": {}, "network:ci-trace": {}}),
