@@ -20,8 +20,8 @@ from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.recorders.parameters import Parameters
-from fuselog.replay.judging.intervals import Interval
 from fuselog.recorders.simulators.car import philox
+from fuselog.replay.judging.intervals import Interval
 
 PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"
