@@ -7,12 +7,12 @@ from typing import Any
 from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.output.terminal import print_json, say, warn
 from fuselog.pipeline.runs.settings import split_texts
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.lint import lint as lint_blocks
+from fuselog.recorders.checks.plausibility import BLOCK
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.recorders.linting.lint import lint as lint_blocks
 from fuselog.recorders.log import Stream, open_log
 from fuselog.recorders.log.impossible import main_span_of
-from fuselog.recorders.plausibility.checks import BLOCK
-from fuselog.recorders.plausibility.finding import Finding
 from fuselog.replay.engine.streams.sources import LogSource, is_sensed
 
 

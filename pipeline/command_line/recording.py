@@ -165,7 +165,7 @@ def _import(
     """Import data and write their log, which states its parameters with those that are `stated`."""
     from fuselog.pipeline.logs.information import worst
     from fuselog.pipeline.output.outputs import check_files, imported
-    from fuselog.recorders.linting.lint import lint_log
+    from fuselog.recorders.checks.lint import lint_log
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
     from fuselog.recorders.recording import import_log

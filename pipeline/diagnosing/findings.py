@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.advice import number
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.recorders.checks.finding import Cause
+from fuselog.recorders.checks.losses import MOST_LOST
+from fuselog.recorders.checks.plausibility import BLOCK, findings_in
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import field_of
-from fuselog.recorders.plausibility.checks import BLOCK, findings_in
-from fuselog.recorders.plausibility.finding import Cause
-from fuselog.recorders.plausibility.stamps import MOST_LOST
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from fuselog.replay.judging.consistency.divergence import find_divergence

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.lint import lint_log
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from fuselog.recorders.parameters import build, describe
-from fuselog.recorders.plausibility.finding import Finding
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.compiling.cache import cache_folder, kept_files

@@ -23,7 +23,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
-from fuselog.recorders.linting.lint import lint
+from fuselog.recorders.checks.lint import lint
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded

@@ -14,7 +14,7 @@ import fuselog as fl
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.diagnosing import diagnosis
 from fuselog.pipeline.diagnosing.causes import Sought
-from fuselog.recorders.plausibility.checks import BLOCK, findings_in
+from fuselog.recorders.checks.plausibility import BLOCK, findings_in
 
 CORRECTIONS = 2
 

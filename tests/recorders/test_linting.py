@@ -17,9 +17,10 @@ import pytest
 
 import fuselog as fl
 from fuselog.pipeline.command_line import main
-from fuselog.recorders.linting.lint import lint, lint_log
-from fuselog.recorders.linting.magnetic import FIELD, units
-from fuselog.recorders.linting.names import frames
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.lint import lint, lint_log
+from fuselog.recorders.checks.magnetic import FIELD, units
+from fuselog.recorders.checks.names import frames
 from fuselog.recorders.log import (
     LogWriter,
     RunMetadata,
@@ -30,7 +31,6 @@ from fuselog.recorders.log import (
     write_log,
 )
 from fuselog.recorders.log.impossible import YEAR_NS
-from fuselog.recorders.plausibility.finding import Finding
 from fuselog.recorders.recording import import_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
@@ -370,9 +370,9 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
         for part in (slice(0, 5000), slice(5000, None)):  # a chunk each
             writer.write([imu.take(part)])
         writer.describe(RunMetadata("test"))
-    for module in ("fuselog.recorders.linting.lint", "fuselog.pipeline.api.linting"):
+    for module in ("fuselog.recorders.checks.lint", "fuselog.pipeline.api.linting"):
         monkeypatch.setattr(f"{module}.BLOCK", 1000)
-    monkeypatch.setattr("fuselog.recorders.linting.lint.MOST", 0)
+    monkeypatch.setattr("fuselog.recorders.checks.lint.MOST", 0)
     for found in (fl.lint(tmp_path / "log.mcap"), lint_log(open_log(tmp_path / "log.mcap"))):
         [words] = [each.words for each in found if "years" in each.words]
         assert words.startswith(

@@ -21,14 +21,14 @@ from fuselog.pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
+from fuselog.recorders.checks.body import Series, bodies
+from fuselog.recorders.checks.motion import BodyMotion, Forces, Lag
+from fuselog.recorders.checks.plausibility import findings
+from fuselog.recorders.checks.speeds import scatter
+from fuselog.recorders.checks.timing import Timing
+from fuselog.recorders.checks.turns import _by_forces
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.models.orientation import compose
-from fuselog.recorders.plausibility.body import Series, bodies
-from fuselog.recorders.plausibility.checks import findings
-from fuselog.recorders.plausibility.motion import BodyMotion, Forces, Lag
-from fuselog.recorders.plausibility.speeds import scatter
-from fuselog.recorders.plausibility.timing import Timing
-from fuselog.recorders.plausibility.turns import _by_forces
 from fuselog.recorders.recording import record_run
 from tests.pipeline.test_planes import HERE, car
 

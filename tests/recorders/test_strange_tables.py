@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fuselog.recorders.linting.lint import lint
+from fuselog.recorders.checks.lint import lint
 from tests.recorders.strange_tables import draw, imported, judge
 
 

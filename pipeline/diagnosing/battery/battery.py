@@ -22,8 +22,8 @@ from fuselog.pipeline.diagnosing.causes import Cause, seek
 from fuselog.pipeline.diagnosing.findings import FIRST, without_filter
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
 from fuselog.pipeline.runs.ensemble import Progress
-from fuselog.recorders.plausibility.checks import findings
-from fuselog.recorders.plausibility.finding import Cause as Estimated
+from fuselog.recorders.checks.finding import Cause as Estimated
+from fuselog.recorders.checks.plausibility import findings
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"

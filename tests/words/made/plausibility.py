@@ -13,8 +13,8 @@ from fuselog.pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
+from fuselog.recorders.checks.plausibility import findings
 from fuselog.recorders.log import Stream
-from fuselog.recorders.plausibility.checks import findings
 
 
 def of_car() -> Iterator[str]:

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.losses import FEWEST, REGULARS
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import FEWEST, REGULARS
 
 Floats = NDArray[np.float64]
 LONG, TIMES = 10, 10.0  # rows, and times the usual run, that a value may stay

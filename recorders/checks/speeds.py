@@ -5,10 +5,10 @@ from itertools import chain
 
 import numpy as np
 
-from fuselog.recorders.plausibility.body import Floats, PlaceSeries, Series
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import LONG_S, BodyMotion
-from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
+from fuselog.recorders.checks.body import Floats, PlaceSeries, Series
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.motion import LONG_S, BodyMotion
+from fuselog.recorders.checks.windows import JUMP, jumps, travelled
 
 # By what a speed is too large that was logged in another unit and read as m/s.
 UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}

@@ -5,19 +5,19 @@ A check of motion takes a body's topics compared in pairs, one of stamps a topic
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
+from fuselog.recorders.checks import losses, speeds, turns
+from fuselog.recorders.checks.body import bodies
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.motion import BodyMotion
 from fuselog.recorders.log import Stream
 from fuselog.recorders.log.streams import concatenate
-from fuselog.recorders.plausibility import speeds, stamps, turns
-from fuselog.recorders.plausibility.body import bodies
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.motion import BodyMotion
 
 MOST = 1 << 19  # messages that are looked at: the first of a log, however long it is
 BLOCK = 1 << 16
 
 OF_STAMPS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] = (
-    stamps.losses,
-    stamps.repeats,
+    losses.losses,
+    losses.repeats,
 )
 OF_MOTION: tuple[Callable[[BodyMotion], Iterator[Finding]], ...] = (
     turns.gravity,
@@ -50,7 +50,7 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
         of_motion = [each for check in OF_MOTION for each in check(motion)]
         known = {(each.cause, each.topic) for each in found}
         found += [each for each in of_motion if (each.cause, each.topic) not in known]
-    return found + list(stamps.drifts(sensed))
+    return found + list(losses.drifts(sensed))
 
 
 def findings_in(blocks: Iterable[Mapping[str, Stream]]) -> list[Finding]:

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from fuselog.recorders.checks.body import FEWEST, Series
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.turns import quietest
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.body import FEWEST, Series
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.turns import quietest
 
 LARGEST_SHARE = 0.9
 UNITS = {each.full_name for each in (schemas.INERTIAL_SAMPLE, schemas.MAGNETIC_FIELD)}

@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from fuselog.recorders.checks.body import Floats, Series
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.motion import BodyMotion, Slope
+from fuselog.recorders.checks.windows import FEWEST, pairs
 from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.body import Floats, Series
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import BodyMotion, Slope
-from fuselog.recorders.plausibility.windows import FEWEST, pairs
 
 NEAR_DEGREES = 0.1
 TOO_FAST_RADPS = 35.0

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.body import bodies
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.motion import BodyMotion, Slope
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.body import bodies
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.motion import BodyMotion, Slope
 
 GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
 STEADY_M = 5.0

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.losses import FEWEST, REGULARS, losses
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.stamps import FEWEST, REGULARS, losses
 
 YEAR_2100_NS = 4_102_444_800 * 10**9
 JITTER = 0.2  # of the usual step

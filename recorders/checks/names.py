@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator, Mapping
 
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.losses import REGULARS
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import REGULARS
 
 SUFFIX = re.compile(r"_(ned|frd)$", re.IGNORECASE)
 

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 
-from fuselog.recorders.errors import BadInput
-from fuselog.recorders.linting import (
+from fuselog.recorders.checks import (
     columns,
     covariances,
     forces,
@@ -16,12 +15,13 @@ from fuselog.recorders.linting import (
     places,
     stamps,
 )
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.losses import losses
+from fuselog.recorders.checks.plausibility import BLOCK, MOST, OF_STAMPS, findings
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, Stream, read_blocks, read_empty, read_span
 from fuselog.recorders.log.impossible import main_span, main_span_of, possible
 from fuselog.recorders.log.streams import concatenate
-from fuselog.recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import losses
 
 Check = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]
 # Of all messages; the other checks look at what is possible.

@@ -6,8 +6,8 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding
 
 TOLERANCE = 1e-6  # of the largest entry
 SINGULAR, SINGULAR_BELOW = "singular", 1e-12  # the least eigenvalue of its correlations

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from fuselog.recorders.checks.finding import Finding, digits
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
 
 FEWEST = 50
 LOST, GAPS = 0.1, 0.01  # of the messages

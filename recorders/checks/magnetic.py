@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, digits
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
 
 Floats = NDArray[np.float64]
 FIELD = "magnetic_field_ut"

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Cause, Finding, Surety
+from fuselog.recorders.checks.losses import FEWEST
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.impossible import TIMELESS, YEAR_NS, impossible
-from fuselog.recorders.plausibility.finding import Cause, Finding, Surety
-from fuselog.recorders.plausibility.stamps import FEWEST
 
 TINIEST = float(np.finfo(np.float64).tiny)  # of the numbers that have all digits
 
