@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fuselog.pipeline.logs.linting import lint_source
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
 from fuselog.recorders.checks.finding import Finding
-from fuselog.recorders.checks.lint import lint_log
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from fuselog.recorders.parameters import build, describe
@@ -109,13 +109,13 @@ def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
     """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
     if found:
         others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
-        yield f"implausible: {found[0].mended}{others if len(found) > 1 else ''}"
+        yield f"implausible: {found[0].sentence}{others if len(found) > 1 else ''}"
 
 
 def _findings(log: Log) -> list[Finding]:
     """Find what the log says of its own faults; of one that is damaged nothing, and that it is."""
     try:
-        return lint_log(log, portions=1)
+        return lint_source(LogSource(log), portions=1)
     except BadInput as error:
         warn(f"{error}; what it holds is not looked at")
         return []
@@ -281,7 +281,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
-        "findings": [each._asdict() for each in _findings(log)],
+        "findings": [each.as_json for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "estimators": estimators_that_fit(log),
         "lost": log.loss_statement,

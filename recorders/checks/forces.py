@@ -40,7 +40,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(len(stream)),
                 f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
                 "not measured, and a filter that this topic drives takes them for measurements",
-                mapping="import only what was measured, a part of a unit as a VectorMeasurement",
+                otherwise="import only what was measured, a part of a unit as a VectorMeasurement",
             )
 
 
@@ -79,8 +79,7 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} "
         f"of {norm:.4g}, "
         "where specific force points up along z",
-        f"{stream.topic}.specific_force_z_scale" if is_down else "",
-        -1 if is_down else "",
+        f"{stream.topic}.specific_force_z_scale=-1" if is_down else "",
         f"mounting_deg = [{roll}, {pitch}, {yaw}] in the mapping",
         "likely" if is_down else "hint",
     )

@@ -212,8 +212,8 @@ def _places(stream: Stream) -> Floats:
 
 
 def _found(stream: Stream, field: str, value: float, words: str, mapping: str) -> Finding:
-    return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", mapping=mapping)
+    return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", otherwise=mapping)
 
 
 def _stamps(stream: Stream, words: str, mapping: str) -> Finding:
-    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", mapping=mapping)
+    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", otherwise=mapping)

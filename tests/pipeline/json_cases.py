@@ -175,7 +175,7 @@ def of_comparison(found: Any) -> Any:
 def of_diagnosis(found: Any) -> Any:
     metrics = metrics_of(found.metrics)
     assert metrics.pop("ekf.log_likelihood.robot1") > found.log_likelihood
-    assert found.sentences[0].topic == "sigma_range_m"
+    assert found.sentences[0].where == "sigma_range_m"
     return {
         "found": found.told,
         "hypotheses": found.hypotheses,
@@ -358,7 +358,7 @@ CASES = [
     ),
     Case(
         "lint grave.mcap",
-        lambda: {"path": "grave.mcap", "findings": rows_of(fl.lint("grave.mcap"))},
+        lambda: {"path": "grave.mcap", "findings": [each.as_json for each in fl.lint("grave.mcap")]},
     ),
     Case("run landmarks --runs 2 --set duration_s=2 --out again", lambda: of_result("again")),
     Case("run landmarks --set ukf.kappa=2 --parameters", of_parameters),

@@ -15,7 +15,6 @@ from fuselog.pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     SCALES,
     Hypothesis,
-    Kind,
     has,
     size_of,
     supposed,
@@ -23,6 +22,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from fuselog.pipeline.diagnosing.likelihood import Trial
 from fuselog.pipeline.tuning.objective import with_values
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.importers.units import unit_of
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import (

@@ -300,7 +300,7 @@ def _told(edge: Edge) -> str:
 
 def _words(edge: Edge, amount: float) -> str:
     return (
-        " / ".join(f"{each.mended} ({each.cause}, {each.value:.3g})" for each in edge.found(amount))
+        " / ".join(f"{each.sentence} ({each.kind}, {each.value:.3g})" for each in edge.found(amount))
         or "nothing"
     )
 
