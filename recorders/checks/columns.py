@@ -18,8 +18,8 @@ LOOKED_AT = 20_000  # rows by which a resolution is told
 LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
 SHARE, ROWS, NEAR = 1e-3, 5, 5e-3
 # Of an end at which values are clipped: its share of the rows, how many times more often it comes than
-# other values do, the number of values, how many times it is reached if no other column is measured,
-# and the share of the other rows that differ.
+# other values do, the number of values, how many times it is reached, and the share of the other rows
+# that differ.
 CLIPPED, MORE_OFTEN, MANY_LEVELS, RUNS, MEASURED = 5e-3, 5.0, 20, 3, 0.9
 # Of a code among values: times the usual step, part of its step that others differ by, and how often.
 ALONE, ALIKE, OFTEN = 20.0, 0.2, 3
@@ -179,9 +179,9 @@ def _is_clipped(
     usual = len(is_there) / len(levels)
     if len(levels) < MANY_LEVELS or count <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
         return False
-    if others:
-        return any(_changes(other[is_there]) > MOVING for other in others)
-    return int(np.sum(np.diff(is_there.astype(np.int8)) > 0)) >= RUNS
+    runs = int(is_there[0]) + int(np.sum(np.diff(is_there.astype(np.int8)) > 0))
+    moves = not others or any(_changes(other[is_there]) > MOVING for other in others)
+    return moves and runs >= RUNS
 
 
 def _varies(values: Floats) -> bool:

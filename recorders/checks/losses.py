@@ -77,6 +77,7 @@ def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]
         return
     usual_s = _pause_s(steps_s)
     longest = int(np.argmax(steps_s))
+    is_long = steps_s[longest] > LOST * float(steps_s.sum())
     if steps_s[longest] > SILENT * usual_s:
         yield Finding(
             "gap",
@@ -86,7 +87,7 @@ def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]
             f"{stream.topic}: is silent for {steps_s[longest]:.3g} s from "
             f"{_since(stream, int(begin_ns[longest]))} on, where the usual step is {usual_s:.3g} s",
             otherwise="look for what is missing where the log is recorded",
-            severity="hint",
+            severity="likely" if is_long and stream.schema.full_name in REGULARS else "hint",
             time_ns=int(begin_ns[longest]),
         )
 

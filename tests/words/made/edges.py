@@ -125,10 +125,7 @@ OF_STAMPS = (
     Edge("seconds of them", lambda s: losses.drifts({"/imu": gaining(0.1, span_s=s)}), (5.0, 20.0)),
     Edge("messages that lack, of 1000", lambda n: one(losses.losses, lossy(n)), (1, 50)),
     Edge("every n-th message lacks", lambda n: one(losses.losses, thinned_out(n)), (400, 4)),
-    *(
-        Edge("a gap of so many", lambda n: one(losses.losses, gap(n)), ends)
-        for ends in ((20, 300), (300, 1000), (1000, 1300), (1300, 3000))
-    ),
+    Edge("a gap of so many", lambda n: one(losses.silences, gap(n)), (10, 100)),
     Edge("longer steps, of the usual", lambda n: one(losses.losses, inertial(step_ns=steps(n))), (1, 2)),
     Edge("these", lambda n: one(losses.losses, inertial(step_ns=steps(n))), (2, 9)),
     Edge(
