@@ -42,9 +42,9 @@ from fuselog.pipeline.diagnosing.portion import Outputs, first_part, on_the_rest
 from fuselog.pipeline.diagnosing.sentences import (
     MOST_SENTENCES,
     cause_of,
-    hints_of,
     marks_of,
     notes_of,
+    notes_of_log,
     ranked,
 )
 from fuselog.pipeline.output.charts import Chart
@@ -298,7 +298,7 @@ def diagnose(
         least_gain(len(sought.tried)),
         [
             *notes,
-            *hints_of(seen),
+            *notes_of_log(seen, sentences),
             *no_judges.values(),
             *notes_of(done, sentences, sought.in_doubt),
         ],
@@ -356,7 +356,7 @@ def _of_recorded(
         component_table(innovations),
         tried_table([]),
         np.inf,
-        [note, *hints_of(seen), *notes_of(done, sentences)],
+        [note, *notes_of_log(seen, sentences), *notes_of(done, sentences)],
         np.nan,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from fuselog.pipeline.api.replays import Replay
 from fuselog.pipeline.diagnosing.advice import Trying
 from fuselog.pipeline.diagnosing.causes import Cause
-from fuselog.pipeline.diagnosing.findings import FIRST, is_told
+from fuselog.pipeline.diagnosing.findings import FIRST
 from fuselog.pipeline.output.results import split_metric
 from fuselog.recorders.checks.finding import Finding, Kind
 from fuselog.recorders.log import Stream, schemas
@@ -115,9 +115,13 @@ def marks_of(
     return marks
 
 
-def hints_of(of_log: Sequence[Finding]) -> list[str]:
-    """Return the hints of a log, which may be as intended, as a diagnosis notes them."""
-    return [f"hint: {each.sentence}" for each in of_log if not is_told(each)]
+def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
+    """Return what a log says and no sentence does: hints, and what a cause names in other words."""
+    return [
+        f"hint: {each.sentence}" if each.severity == "hint" else f"the log alone says: {each.evidence}"
+        for each in of_log
+        if each not in sentences
+    ]
 
 
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from fuselog.pipeline.exploring.curves import Case
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
+from fuselog.recorders.checks.finding import Finding
 
 LIKELIHOOD = "log-likelihood, open gate"
 Level = Literal["good", "doubtful", "failed"]
@@ -28,7 +28,7 @@ class Verdict(NamedTuple):
     detail: str
 
 
-def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Verdict:
+def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Verdict:
     """Judge one filter on one log, by the alarms of its replay; those of other cases do not count.
 
     Whether a filter is too sure of itself is what NIS and NEES say, see
@@ -36,12 +36,12 @@ def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> 
     """
     if failures:
         return Verdict("failed", "It stopped.", failures[0])
-    own = [each for each in alarms if each.case in ("", case.name)]
+    own = [each for each in alarms if each.part in ("", case.name)]
     if not own:
         return Verdict("good", "Nothing speaks against it.", _evidence(case))
     ratio, of_what = _ratio(case, {each.kind for each in own})
     if math.isnan(ratio):
-        return Verdict("doubtful", "Doubtful.", own[0].words)
+        return Verdict("doubtful", "Doubtful.", own[0].sentence)
     if ratio > 1.0:
         return Verdict(
             "doubtful", "Too sure of itself.", f"Its {of_what} are {ratio:.2g} times what it claims."

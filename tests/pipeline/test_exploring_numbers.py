@@ -13,7 +13,7 @@ from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_ti
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
 from fuselog.pipeline.exploring.verdict import mean_nis, verdict_of
-from fuselog.pipeline.output.alarms import Alarm
+from fuselog.recorders.checks.finding import Finding
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_a_verdict_goes_by_what_is_farther_from_one() -> None:
     assert mean_nis(case) == 4.0
 
     def said(*kinds: str, of: str = "robot1") -> str:
-        alarms = [Alarm(kind, "ekf", of, 1.0, f"{kind}!") for kind in kinds]  # type: ignore[arg-type]
+        alarms = [Finding(kind, "ekf", of, 1.0, f"{kind}!") for kind in kinds]  # type: ignore[arg-type]
         verdict = verdict_of(case, alarms, [])
         return f"{verdict.level}: {verdict.headline} {verdict.detail}"
 
