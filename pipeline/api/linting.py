@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from fuselog.pipeline.api.planning import Log, sources_of
-from fuselog.pipeline.logs.linting import lint_source
 from fuselog.pipeline.output.terminal import print_json, say, warn
 from fuselog.pipeline.runs.settings import split_texts
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
 
 NOTHING = "nothing found by looking at the log alone"

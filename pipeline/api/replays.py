@@ -34,6 +34,7 @@ from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, schemas, topics_of
 from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.linting import of_first_messages
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.evaluation import Errors, innovations_of
 from fuselog.replay.judging.judge import Judge
@@ -289,6 +290,7 @@ class Replay(Showing):
         }
         stated = {"arrival_order": self.arrival_order or None, "late": self.late}
         settings |= {name: value for name, value in stated.items() if value is not None}
+        settings |= {"notes": of_logs} if (of_logs := of_first_messages(self.logs)) else {}
         with result_folder(place) as part:
             outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
             outcome.input_sha256, outcome.timings = self.input_sha256, self.done.timings

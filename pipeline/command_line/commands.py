@@ -50,10 +50,13 @@ from fuselog.recorders.atomic import scratch_folder, whole_file
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Companions, Log, open_log
+from fuselog.replay.engine.streams.linting import lint_source, worst
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.differences import FEWEST_RUNS
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
+
+MOST_LOGS = 5  # whose findings are printed
 
 
 def replay_logs(
@@ -125,6 +128,13 @@ def replay_logs(
         "parameters_of_log": done.stated,
         "coverage": [row._asdict() for row in done.coverage],
     }
+    found = {
+        path: lint_source(source, portions=1) for path, source in zip(logs, plan.sources, strict=True)
+    }
+    details["findings"] = [each.as_json for of_log in found.values() for each in of_log]
+    if not as_json:
+        for path in [path for path, of_log in found.items() if of_log][:MOST_LOGS]:
+            say(next(worst(found[path], path)))
     alarms = alarms_of(done.judge, done.parameters, done.coverage)
     unused = sentences(done.coverage)
     _print_outcome(

@@ -163,12 +163,11 @@ def _import(
     stated: Mapping[str, object] | None = None,
 ) -> None:
     """Import data and write their log, which states its parameters with those that are `stated`."""
-    from fuselog.pipeline.logs.information import worst
-    from fuselog.pipeline.logs.linting import lint_source
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
     from fuselog.recorders.recording import import_log
+    from fuselog.replay.engine.streams.linting import lint_source, worst
     from fuselog.replay.engine.streams.sources import LogSource
 
     if len(paths) > 1 and source != "table":

@@ -10,11 +10,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.advice import number
-from fuselog.pipeline.logs.linting import lint_source
 from fuselog.recorders.checks.finding import Finding, Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import field_of
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.divergence import find_divergence
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness

@@ -2,14 +2,13 @@
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fuselog.pipeline.logs.linting import lint_source
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
 from fuselog.recorders.checks.finding import Finding
@@ -21,6 +20,7 @@ from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.compiling.cache import cache_folder, kept_files
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
 from fuselog.replay.engine.replaying.truth import truths_among
+from fuselog.replay.engine.streams.linting import lint_source, worst
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.foreign.naming import KINDS as PROGRAMS
 from fuselog.replay.inference.all_methods import METHODS
@@ -103,13 +103,6 @@ def _main_span(log: Log) -> tuple[int, int] | None:
         return LogSource(log).main_span
     except BadInput:
         return None
-
-
-def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
-    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
-    if found:
-        others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
-        yield f"implausible: {found[0].sentence}{others if len(found) > 1 else ''}"
 
 
 def _findings(log: Log) -> list[Finding]:

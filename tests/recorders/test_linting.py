@@ -370,7 +370,7 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
         for part in (slice(0, 5000), slice(5000, None)):  # a chunk each
             writer.write([imu.take(part)])
         writer.describe(RunMetadata("test"))
-    monkeypatch.setattr("fuselog.pipeline.logs.linting.BLOCK", 1000)
+    monkeypatch.setattr("fuselog.replay.engine.streams.linting.BLOCK", 1000)
     monkeypatch.setattr("fuselog.recorders.checks.lint.MOST", 0)
     found = fl.lint(tmp_path / "log.mcap")
     [words] = [each.evidence for each in found if "years" in each.evidence]

@@ -1,6 +1,8 @@
 """Asks the checks of a log about a source: a file, a recording, or either with alterations."""
 
-from collections.abc import Iterator, Mapping
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.checks.lint import BLOCK, lint
@@ -24,3 +26,20 @@ def lint_source(source: LogSource | MemorySource, *, portions: int | None = None
 
     span_ns = main_span_of(source.extent("publish_time"), blocks)
     return lint(blocks(), span_ns=span_ns, portions=portions)
+
+
+def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
+    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
+    if found:
+        others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
+        yield f"implausible: {found[0].sentence}{others if len(found) > 1 else ''}"
+
+
+def of_first_messages(sources: Sequence[LogSource | MemorySource]) -> list[str]:
+    """Return what the first portion of each source says of its own faults, for a report."""
+    many = len(sources) > 1
+    return [
+        f"{source.name}: {each.sentence}" if many else each.sentence
+        for source in sources
+        for each in lint_source(source, portions=1)
+    ]
