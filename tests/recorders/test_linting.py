@@ -295,6 +295,13 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "integers": (column(FIX, "latitude_deg", lambda x: 1e7 * x), FIX, "place", "integers of 1e-7"),
     "frozen": (force(setting(100, 300, 0.1, 0)), IMU, "values", "frozen at 0.1 for 200"),
     "saturated": (column(IMU, "turn_rate_radps", saturating), IMU, "values", "end of a range"),
+    "clipped": (
+        column(IMU, "turn_rate_radps", lambda w: np.clip(w, -0.015, 0.015)),
+        IMU,
+        "values",
+        "its greatest value",
+    ),
+    "silent": (rows(IMU, lambda n: np.r_[0:3000, 3100:n]), IMU, "gap", "is silent for 1.0"),
     "clock 1e-4 fast": (drifting, FIX, "clock drift", "gains 100 us a second"),
     "wheels, latitude 8": (exchanged, FIX, "place", "exchanged: so fixes move 1"),
     "sea and ellipsoid": (
