@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from scipy.stats import chi2
 
 import fuselog as fl
 from fuselog.pipeline.api.estimates import judge_estimates
-from fuselog.pipeline.output.alarms import NOT_TESTED
+from fuselog.pipeline.output.alarms import NOT_TESTED, as_alarm
 from fuselog.pipeline.sensing.foreign_files import explained
 from fuselog.recorders.log import open_log
 from tests.pipeline.json_of_files import (
@@ -90,7 +89,7 @@ def judged() -> tuple[Any, dict[str, Any]]:
     return done, {
         "metrics": metrics_of(done.metrics),
         "bounds": bounds_of(degrees_of(done)),
-        "alarms": [asdict(each) for each in done.alarms],
+        "alarms": [as_alarm(each) for each in done.alarms],
         "failures": [],
         "losses": done.losses,
         "worst": {"ekf": worst_of(done.errors)},
@@ -116,6 +115,7 @@ def of_replay() -> Any:
         "seconds": {"ekf": POSITIVE},
         "parameters": {"ekf": {name: fields[name].default for name in names} | {"sigma_range_m": 0.05}},
         "parameters_of_log": {"ekf": stated},
+        "findings": [each.as_json for each in fl.lint("run.mcap")],
     }
 
 
