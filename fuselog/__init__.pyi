@@ -52,6 +52,7 @@ from fuselog.pipeline.stressing.stressing import stress as stress
 from fuselog.pipeline.stressing.verdicts import Stress as Stress
 from fuselog.pipeline.tuning.outcome import Tuning as Tuning
 from fuselog.pipeline.tuning.tuning import tune as tune
+from fuselog.recorders.checks.finding import Finding as Finding
 from fuselog.recorders.compiling.compile import compiled as compiled
 from fuselog.recorders.errors import BadInput as BadInput
 from fuselog.recorders.errors import UnknownName as UnknownName
@@ -65,7 +66,6 @@ from fuselog.recorders.log import schemas as schemas
 from fuselog.recorders.parameters import MeasurementNoise as MeasurementNoise
 from fuselog.recorders.parameters import Parameters as Parameters
 from fuselog.recorders.parameters import ProcessNoise as ProcessNoise
-from fuselog.recorders.plausibility.finding import Finding as Finding
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS as SIMULATION_EPOCH_NS
 from fuselog.recorders.recording import Blocks as Blocks
 from fuselog.recorders.recording import Importer as Importer

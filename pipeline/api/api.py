@@ -118,7 +118,7 @@ class ResultFolder(Showing):
     def _shown(self) -> Shown:
         verdicts = Counter(claim.verdict for claim in self.result.claims)
         counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
-        sentences = [each.words for each in self.result.alarms[:1]]
+        sentences = [each.sentence for each in self.result.alarms[:1]]
         sentences += [f"claims: {counted}"] if counted else []
         title = f"Result of {self.result.experiment} in {self.folder}"
         return shown_metrics(title, sentences, self.result.metrics, self.result.bounds)

@@ -1,19 +1,19 @@
 """Lints a log: finds what is wrong with it as it is written, before any filter."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.output.terminal import print_json, say, warn
 from fuselog.pipeline.runs.settings import split_texts
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.recorders.linting.lint import lint as lint_blocks
-from fuselog.recorders.log import Stream, open_log
-from fuselog.recorders.log.impossible import main_span_of
-from fuselog.recorders.plausibility.checks import BLOCK
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.replay.engine.streams.sources import LogSource, is_sensed
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.linting import lint_source
+from fuselog.replay.engine.streams.sources import LogSource
+
+NOTHING = "nothing found by looking at the log alone"
 
 
 @without_warnings_of_numbers()
@@ -35,15 +35,7 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     >>> fl.lint(run)
     []
     """
-    source = sources_of([log], set)[0].as_written()
-    topics = [topic for topic in source.topics if is_sensed(source, topic)]
-    if not topics:
-        return []
-
-    def blocks() -> Iterator[Mapping[str, Stream]]:
-        return source.blocks(topics, "publish_time", BLOCK)
-
-    return lint_blocks(blocks(), span_ns=main_span_of(source.extent("publish_time"), blocks))
+    return lint_source(sources_of([log], set)[0])
 
 
 def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
@@ -54,12 +46,12 @@ def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bo
     log = open_log(path, recover=recover)
     found = lint(LogSource(log), set=alterations)
     if as_json:
-        print_json({"path": str(path), "findings": [each._asdict() for each in found]})
+        print_json({"path": str(path), "findings": [each.as_json for each in found]})
     else:
         for each in found:
-            say(f"{each.sure}: {each.mended}")
+            say(f"{each.severity}: {each.sentence}")
         if not found:
-            say(f"{path}: nothing found")
+            say(f"{path}: {NOTHING}")
     if log.loss_statement:
         warn(log.loss_statement)
-    return all(each.sure == "hint" for each in found)
+    return all(each.severity == "hint" for each in found)

@@ -21,7 +21,6 @@ from fuselog.pipeline.altering.sources import setting_of
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.planning import Log, Named, plan_replay
 from fuselog.pipeline.output.alarming import alarms_of
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.charts import draw
 from fuselog.pipeline.output.coverage import coverage_table, sentences
 from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -31,9 +30,11 @@ from fuselog.pipeline.output.summary import error_charts, summarise, summary_tab
 from fuselog.pipeline.runs.ensemble import Pass, Settings, judge_logs
 from fuselog.pipeline.runs.estimates import add_to_hash
 from fuselog.recorders.atomic import scratch_folder
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, schemas, topics_of
 from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.engine.streams.linting import of_first_messages
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.evaluation import Errors, innovations_of
 from fuselog.replay.judging.judge import Judge
@@ -154,7 +155,7 @@ class Replay(Showing):
     @property
     def _shown(self) -> Shown:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        sentences = [each.words for each in self.alarms[:1]]
+        sentences = [each.sentence for each in self.alarms[:1]]
         sentences += [*self.judge.components_without_truth, *self.failures, *self.losses]
         metrics = in_order(plain(self.judge.metrics), self.settings)
         title = f"Replay of {runs} by {', '.join(self.settings)}"
@@ -218,8 +219,8 @@ class Replay(Showing):
         return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
 
     @cached_property
-    def alarms(self) -> list[Alarm]:
-        """Return what makes the numbers doubtful, the worst first: each has a sentence, `words`."""
+    def alarms(self) -> list[Finding]:
+        """Return what makes the numbers doubtful, the worst first."""
         return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property
@@ -289,6 +290,7 @@ class Replay(Showing):
         }
         stated = {"arrival_order": self.arrival_order or None, "late": self.late}
         settings |= {name: value for name, value in stated.items() if value is not None}
+        settings |= {"notes": of_logs} if (of_logs := of_first_messages(self.logs)) else {}
         with result_folder(place) as part:
             outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
             outcome.input_sha256, outcome.timings = self.input_sha256, self.done.timings

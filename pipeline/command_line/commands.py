@@ -5,7 +5,7 @@ Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabula
 
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.api.planning import plan_replay
 from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.alarming import alarms_of
-from fuselog.pipeline.output.alarms import Alarm
+from fuselog.pipeline.output.alarms import as_alarm
 from fuselog.pipeline.output.coverage import sentences
 from fuselog.pipeline.output.outputs import (
     ESTIMATES,
@@ -47,11 +47,15 @@ from fuselog.pipeline.runs.estimates import source_of_estimates
 from fuselog.pipeline.runs.initial_states import span_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from fuselog.recorders.atomic import scratch_folder, whole_file
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Companions, Log, open_log
+from fuselog.replay.engine.streams.linting import lint_source, worst
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
+
+MOST_LOGS = 5  # whose findings are printed
 
 
 def replay_logs(
@@ -123,6 +127,13 @@ def replay_logs(
         "parameters_of_log": done.stated,
         "coverage": [row._asdict() for row in done.coverage],
     }
+    found = {
+        path: lint_source(source, portions=1) for path, source in zip(logs, plan.sources, strict=True)
+    }
+    details["findings"] = [each.as_json for of_log in found.values() for each in of_log]
+    if not as_json:
+        for path in [path for path, of_log in found.items() if of_log][:MOST_LOGS]:
+            say(next(worst(found[path], path)))
     alarms = alarms_of(done.judge, done.parameters, done.coverage)
     unused = sentences(done.coverage)
     _print_outcome(
@@ -274,7 +285,7 @@ def evaluate_trajectory(
 def _print_outcome(
     judge: Judge,
     estimators: Iterable[str],
-    alarms: Sequence[Alarm],
+    alarms: Sequence[Finding],
     *,
     as_json: bool,
     written: Sequence[Path],
@@ -292,7 +303,7 @@ def _print_outcome(
         outcome = {
             "metrics": values,
             "bounds": judge.bounds,
-            "alarms": [asdict(alarm) for alarm in alarms],
+            "alarms": [as_alarm(each) for each in alarms],
             "failures": failures,
             "losses": [*judge.notes_of_coverage, *unused],
             "worst": {

@@ -163,12 +163,12 @@ def _import(
     stated: Mapping[str, object] | None = None,
 ) -> None:
     """Import data and write their log, which states its parameters with those that are `stated`."""
-    from fuselog.pipeline.logs.information import worst
     from fuselog.pipeline.output.outputs import check_files, imported
-    from fuselog.recorders.linting.lint import lint_log
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
     from fuselog.recorders.recording import import_log
+    from fuselog.replay.engine.streams.linting import lint_source, worst
+    from fuselog.replay.engine.streams.sources import LogSource
 
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
@@ -181,7 +181,7 @@ def _import(
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target, stated)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
-    for sentence in worst(lint_log(open_log(target), portions=1), target):
+    for sentence in worst(lint_source(LogSource(open_log(target)), portions=1), target):
         click.echo(printable(sentence))
     say_written(target, messages)
 

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fuselog.pipeline.api.replays import Replay
-from fuselog.pipeline.diagnosing.findings import Finding
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.results import MetricValue, split_metric
 from fuselog.pipeline.output.words import listed
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.consistency import CONSISTENT
@@ -37,9 +37,12 @@ def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Fin
             yield Finding(
                 "unseen error",
                 _truth(case),
+                "",
+                value,
                 f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
                 f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
-                f"the state follows; {mend}",
+                "the state follows",
+                otherwise=mend,
             )
 
 
@@ -94,7 +97,7 @@ def unnamed(
                 f"NIS per component is {squares.sum() / counts.sum():.3g} ({of_each}), where a "
                 f"consistent filter is within {low / counts.sum():.3g} and {high / counts.sum():.3g}"
             )
-            yield _unnamed(topic, case, evidence, faults)
+            yield _unnamed(topic, case, float(squares.sum() / counts.sum()), evidence, faults)
     metrics = done.judge.metrics
     for key, (low, high) in done.judge.intervals(CONSISTENT).items():
         _, quantity, case = split_metric(key)
@@ -103,7 +106,7 @@ def unnamed(
             evidence = (
                 f"NEES is {value:.3g}, where a consistent filter is within {low:.3g} and {high:.3g}"
             )
-            yield _unnamed(_truth(case), case, evidence, faults)
+            yield _unnamed(_truth(case), case, value, evidence, faults)
 
 
 class _Seen(NamedTuple):
@@ -148,6 +151,8 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
             yield Finding(
                 "measurement noise",
                 topic,
+                listed([each.name for each in some]),
+                max(each.times for each in some),
                 f"{case}: the innovations of {listed([each.name for each in some])} are {times} times "
                 f"{less} than their variances say (NIS is {nis}, if consistent {low:.3g} to "
                 f"{high:.3g}): {mend}",
@@ -213,10 +218,12 @@ def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dic
     return found
 
 
-def _unnamed(topic: str, case: str, evidence: str, faults: str) -> Finding:
+def _unnamed(topic: str, case: str, value: float, evidence: str, faults: str) -> Finding:
     return Finding(
         "unnamed",
         topic,
+        "",
+        value,
         f"{case or 'the estimate'}: something is wrong that I cannot name: {evidence} in 999 of 1,000 "
         f"logs, and {faults}",
     )

@@ -30,17 +30,23 @@ from fuselog.pipeline.diagnosing.consistency import (
     unseen_errors,
 )
 from fuselog.pipeline.diagnosing.findings import (
-    Finding,
     component_table,
+    corrected_by,
+    is_told,
     of_estimates,
     of_innovations,
-    of_plausibility,
-    undone_by,
-    without_filter,
+    of_log,
 )
 from fuselog.pipeline.diagnosing.hypotheses.parameters import NEVER_S
 from fuselog.pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
-from fuselog.pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
+from fuselog.pipeline.diagnosing.sentences import (
+    MOST_SENTENCES,
+    cause_of,
+    marks_of,
+    notes_of,
+    notes_of_log,
+    ranked,
+)
 from fuselog.pipeline.output.charts import Chart
 from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
@@ -54,6 +60,7 @@ from fuselog.pipeline.runs.estimates import (
 )
 from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.pipeline.tuning.objective import for_likelihood
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.parameters import merge
@@ -84,7 +91,7 @@ class Diagnosis:
 
     label: str
     replay: Replay
-    sentences: Sequence[Sentence]
+    sentences: Sequence[Finding]
     components: pd.DataFrame
     tried: pd.DataFrame
     least_gain: float
@@ -107,7 +114,7 @@ class Diagnosis:
                 f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
             )
             return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]
-        return [f"{number}. {each.words}" for number, each in enumerate(self.sentences, start=1)]
+        return [f"{number}. {each.sentence}" for number, each in enumerate(self.sentences, start=1)]
 
     @property
     def causes(self) -> pd.DataFrame:
@@ -117,9 +124,10 @@ class Diagnosis:
         """
         rows = []
         for order, each in enumerate(self.sentences, start=1):
-            shared = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
+            shared = {"sentence_number": order, "kind": each.kind, "topic": each.where}
+            own_cause = cause_of(each)
             nothing = [Interval(np.nan)]
-            alike = (each.cause, *each.cause.others) if each.cause else ()
+            alike = (own_cause, *own_cause.others) if own_cause else ()
             for cause in alike or (None,):
                 about = cause.hypothesis if cause else None
                 own = {"kind": about.kind, "topic": about.topic} if about else {}
@@ -131,8 +139,8 @@ class Diagnosis:
                             "part": part.name,
                             **{name: getattr(part, name) for name in ("value", "low", "high")},
                             "gain": cause.gain if cause else np.nan,
-                            "setting": each.setting if cause is each.cause else "",
-                            "sentence": each.words,
+                            "setting": each.setting if cause is own_cause else "",
+                            "sentence": each.sentence,
                         }
                     )
         return pd.DataFrame(rows)
@@ -231,7 +239,7 @@ def diagnose(
 
     >>> from fuselog.pipeline.api.api import record
     >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
-    >>> found.sentences[0].kind, found.sentences[0].topic
+    >>> found.sentences[0].kind, found.sentences[0].where
     ('measurement noise', 'sigma_range_m')
     """
     alterations, given = split_settings(set or {})
@@ -265,9 +273,9 @@ def diagnose(
     named, beside = name_of(label, {"kind": label, **settings})
     trying = Trying(shlex.quote(named), alterations_of(source), "kind" in beside, gate)
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
-    sentences = [Sentence.of(each) for each in mended]
-    of_log = without_filter(source, streamed, undone_by(bound))
-    sentences += ranked(sought.causes, of_log, trying, rest)
+    seen = of_log(source, streamed, corrected_by(bound))
+    told = [each for each in seen if is_told(each)]
+    sentences = [*mended, *ranked(sought.causes, told, trying, rest)]
     no_judges = judged_by_itself(source, streamed)
     outliers = [each.value for each in sought.causes if each.hypothesis.kind == "outliers"]
     gating = {"has_outliers": bool(outliers), "in_stretches": NEVER_S in outliers}
@@ -277,12 +285,12 @@ def diagnose(
         *(
             each
             for each in unseen_errors(done, label, has_causes=bool(sought.causes))
-            if each.topic not in no_judges
+            if each.where not in no_judges
         ),
     ]
     if not sentences and all(each.kind == "gate" for each in findings):  # which names no cause
         findings += unnamed(done, innovations, len(sought.tried), no_judges)
-    sentences += [Sentence.of(each) for each in findings]
+    sentences += findings
     return Diagnosis(
         label,
         done,
@@ -290,7 +298,12 @@ def diagnose(
         component_table(innovations),
         tried_table(sought.tried),
         least_gain(len(sought.tried)),
-        [*notes, *no_judges.values(), *notes_of(done, sentences, sought.in_doubt)],
+        [
+            *notes,
+            *notes_of_log(seen, sentences),
+            *no_judges.values(),
+            *notes_of(done, sentences, sought.in_doubt),
+        ],
         sought.log_likelihood,
     )
 
@@ -330,13 +343,13 @@ def _of_recorded(
     if not innovations:
         raise BadInput(f"{source.name}: has no innovations of {label}; a diagnosis needs them")
     sensed = [topic for topic in source.topics if is_sensed(source, topic)]
-    findings = [
-        *of_plausibility(source, sensed),
+    seen = of_log(source, sensed)
+    sentences = [
+        *filter(is_told, seen),
         *of_each_component(innovations),
         *of_innovations(innovations, None, source.epoch_ns, has_outliers=False),
         *unseen_errors(done, label, has_causes=False),
     ]
-    sentences = [Sentence.of(each) for each in findings]
     note = f"{label} was recorded: no fault can be undone and tried; what its innovations say is said"
     return Diagnosis(
         label,
@@ -345,7 +358,7 @@ def _of_recorded(
         component_table(innovations),
         tried_table([]),
         np.inf,
-        [note, *notes_of(done, sentences)],
+        [note, *notes_of_log(seen, sentences), *notes_of(done, sentences)],
         np.nan,
     )
 
@@ -371,14 +384,14 @@ def _followed(
         source = until_last_measured(source, bind(label, [source], {"kind": label, **settings}))
         done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
         if done.failures:
-            why = next((f": {each.words}" for each in of_plausibility(source, source.topics)), "")
+            why = next((f": {each.sentence}" for each in of_log(source, source.topics)), "")
             raise BadInput(f"{done.failures[0]}; solve that first{why}")
         return _Followed(source, done)
 
     try:
         return replayed(source)
     except BadInput as error:
-        mended = [each for each in of_plausibility(source, source.topics) if each.setting]
+        mended = [each for each in of_log(source, source.topics) if each.setting and is_told(each)]
         if not mended:
             raise
         trying = Trying(label, alterations_of(source), is_own=False)

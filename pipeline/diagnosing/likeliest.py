@@ -7,11 +7,11 @@ from typing import Any
 
 from fuselog.pipeline.comparing.comparing import compare
 from fuselog.pipeline.diagnosing.diagnosis import diagnose
-from fuselog.pipeline.diagnosing.sentences import Sentence
 from fuselog.pipeline.output.alarms import Cause
 from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.results import RUNS, Result, read_table
 from fuselog.pipeline.output.words import count, meaning_alone, number, quantity, scale
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
 from fuselog.replay.judging.verdicts import Consistency
@@ -56,20 +56,20 @@ def _logs(folder: Path, result: Result) -> list[Path]:
     return kept or [Path(each) for each in files if Path(each).is_file()]
 
 
-def _cause(label: str, sentence: Sentence, mended: str) -> Cause:
-    words = sentence.words.partition("; try ")[0]
-    setting = sentence.setting
+def _cause(label: str, found: Finding, mended: str) -> Cause:
+    words = found.sentence.partition("; try ")[0]
+    setting = found.setting
     if setting and not setting.startswith("/"):
         setting = f"{label}.{setting}"
     short = meaning_alone(words.partition(";")[0].partition(", so that")[0])
     return Cause(label, f"{words}.", short, setting, mended)
 
 
-def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentence, main: str) -> str:
+def _mended(logs: list[Path], label: str, own: dict[str, Any], first: Finding, main: str) -> str:
     """Say what the same runs give with the mend; nothing where it is no parameter."""
-    if not sentence.setting or sentence.setting.startswith("/"):
+    if not first.setting or first.setting.startswith("/"):
         return ""
-    mend = merge(own, parse_settings([sentence.setting]))
+    mend = merge(own, parse_settings([first.setting]))
     table = compare(*logs, estimators=[{label: own}, {MENDED: mend}]).table
     effects, left = [], []
     for key in (main, "nees", "nis_per_component"):

@@ -1,16 +1,17 @@
 """Writes the sentences of a diagnosis in their order: causes, and what stands in the log by itself."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from fuselog.pipeline.api.replays import Replay
 from fuselog.pipeline.diagnosing.advice import Trying
 from fuselog.pipeline.diagnosing.causes import Cause
-from fuselog.pipeline.diagnosing.findings import FIRST, Finding
-from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.pipeline.diagnosing.findings import FIRST
 from fuselog.pipeline.output.results import split_metric
+from fuselog.recorders.checks.finding import Finding, Kind
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.impossible import Rejections
 from fuselog.replay.engine.streams.failures import reason_stream
@@ -27,65 +28,62 @@ MOST_SENTENCES = 5
 Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over the rest of a long log
 
 
-class Sentence(NamedTuple):
-    """Says what is wrong, and what to try; `topic` is the topic or parameter that it is of.
+# Kinds of what the log says, that a cause says as well.
+ALIKE: Mapping[Kind, Kind] = {"mounting": "bias or turned frame", "covariance": "measurement noise"}
 
-    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
-    and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
-    """
 
-    kind: Kind
-    topic: str
-    words: str
-    time_ns: int | None = None
-    cause: Cause | None = None
-    setting: str = ""
+@dataclass(frozen=True, kw_only=True)
+class CauseFinding(Finding):
+    """Represents a finding by likelihood: it is of the topic or parameter of its `cause`."""
+
+    cause: Cause
 
     @property
-    def names(self) -> list[tuple[Kind, str]]:
-        """Return what it names: a kind and a topic, and those that the log does not tell from it."""
-        others = self.cause.others if self.cause else ()
-        return [
-            (self.kind, self.topic),
-            *((each.hypothesis.kind, each.hypothesis.topic) for each in others),
-        ]
+    def fix(self) -> str:
+        """Return what to try."""
+        return self.otherwise
 
-    @classmethod
-    def of(cls, found: Finding) -> "Sentence":
-        """Return a finding that no likelihood is needed for."""
-        return cls(found.kind, found.topic, found.words, found.time_ns, None, found.setting)
+
+def cause_of(found: Finding) -> Cause | None:
+    """Return the cause that a finding is by its likelihood, if it is one."""
+    return found.cause if isinstance(found, CauseFinding) else None
+
+
+def names_of(found: Finding) -> list[tuple[Kind, str]]:
+    """Return what a finding names: a kind and a topic, and those that the log does not tell from it."""
+    cause = cause_of(found)
+    others = [each.hypothesis for each in cause.others] if cause else []
+    return [(found.kind, found.where), *((each.kind, each.topic) for each in others)]
 
 
 def ranked(
     causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
-) -> list[Sentence]:
-    """Order sentences: stamps, causes, and what else is seen without any filter.
+) -> list[Finding]:
+    """Order findings: stamps, causes, and what else is seen without any filter.
 
-    What has a setting that undoes it stands before causes that are but its consequence, such as noise.
-    What the causes advise is not said twice, nor what has no setting of a topic that they name.
+    What has a setting that corrects it comes before causes that are only its consequence, such as noise.
+    What a cause names or advises is not said twice.
     """
     mends = [cause.hypothesis.mend(cause.value) for cause in causes]
     advised = {key for mend in mends if mend is not None for key in mend.settings}
     of_stamps = [each for each in of_log if each.kind in FIRST]
     alike = [each.hypothesis for cause in causes for each in (cause, *cause.others)]
-    named = {each.topic for each in alike}
     kinds = {(each.kind, each.topic) for each in alike}
     others = [
         each
         for each in of_log
         if each.kind not in FIRST
-        and (each.kind, each.topic) not in kinds
-        and (not _is_advised(each.setting, advised) if each.setting else each.topic not in named)
+        and (ALIKE.get(each.kind, each.kind), each.where) not in kinds
+        and not (each.setting and _is_advised(each.setting, advised))
     ]
     is_consequence = bool(causes) and causes[0].hypothesis.kind not in OF_FORM
-    before = [
-        each for each in others if each.setting and is_consequence and each.kind != "measurement noise"
-    ]
+    before = [each for each in others if each.setting and is_consequence and each.kind != "covariance"]
     after = [each for each in others if each not in before]
     return [
-        *map(Sentence.of, [*of_stamps, *before]),
-        *(_sentence(each, trying, of_stamps, rest) for each in causes),
-        *map(Sentence.of, after),
+        *of_stamps,
+        *before,
+        *(_finding(each, trying, of_stamps, rest) for each in causes),
+        *after,
     ]
 
 
@@ -96,28 +94,37 @@ def _is_advised(setting: str, advised: Collection[str]) -> bool:
 
 
 def marks_of(
-    sentences: Sequence[Sentence], label: str, outputs: Sequence[str], first_ns: int
+    sentences: Sequence[Finding], label: str, outputs: Sequence[str], first_ns: int
 ) -> dict[str, Stream]:
     """Write sentences as messages by topic, for a timeline: at the stamp where each one began.
 
     `outputs` are the topics of what was estimated, `first_ns` is the first stamp of the log.
     """
     cases = list(dict.fromkeys(split_topic(topic)[1] for topic in outputs))
-    found: dict[str, list[Sentence]] = {}
+    found: dict[str, list[Finding]] = {}
     for each in sentences:
-        case = next((case for case in cases if case and each.topic.startswith(f"/{case}/")), cases[0])
+        case = next((case for case in cases if case and each.where.startswith(f"/{case}/")), cases[0])
         found.setdefault(case, []).append(each)
     marks = {}
     for case, own in found.items():
         own = sorted(own, key=lambda each: each.time_ns or first_ns)
         topic = "/".join(filter(None, ("/estimates", label, case, "diagnosis")))
         times_ns = np.array([each.time_ns or first_ns for each in own], np.int64)
-        words = [each.words for each in own]
+        words = [each.sentence for each in own]
         marks[topic] = reason_stream(topic, schemas.DIAGNOSED, times_ns, np.arange(len(own)), words)
     return marks
 
 
-def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cause] = ()) -> list[str]:
+def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
+    """Return what a log says and no sentence does: hints, and what a cause names in other words."""
+    return [
+        f"hint: {each.sentence}" if each.severity == "hint" else f"the log alone says: {each.evidence}"
+        for each in of_log
+        if each not in sentences
+    ]
+
+
+def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
     """Say what has to be known of a diagnosis: what is in doubt, not judged, or not said."""
     notes = [
         "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
@@ -138,24 +145,24 @@ def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cau
     return notes
 
 
-def _sentence(
+def _finding(
     cause: Cause,
     trying: Trying,
     before: Sequence[Finding],
     rest: Rest | None,
-) -> Sentence:
+) -> CauseFinding:
     """Say a cause, what to try against it, and whether that is good for the rest of a long log.
 
     `before` is what was found in the stamps, of which a cause may be a consequence.
     """
     of, words = cause.hypothesis, cause.words
     mend = of.mend(cause.value)
+    found = CauseFinding(of.kind, of.topic, of.part, cause.numbers[0].value, words, cause=cause)
     if mend is None or trying.is_set(mend):
-        words += "; the gate that is set keeps these out"
-        return Sentence(of.kind, of.topic, words, None, cause)
+        return replace(found, evidence=f"{words}; the gate that is set keeps these out")
     advice = trying.over(mend)
     words += rest(mend.settings) if rest is not None else ""
     if before and of.kind in CONSEQUENCES:
-        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].topic}"
-    words += f"; try {trying.words(advice)}"
-    return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
+        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].where}"
+    tried = f"try {trying.words(advice)}"
+    return replace(found, evidence=words, setting=advice.setting, otherwise=tried)

@@ -16,12 +16,13 @@ from pydantic import NonNegativeInt
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.battery import battery
 from fuselog.pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
-from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.sentences import cause_of, names_of
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters, merge
 from fuselog.recorders.recording import record_run
@@ -278,19 +279,20 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
 def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
     """Say what the diagnosis said, and whether it is right."""
     is_right = [
-        any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in each.names)
+        any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in names_of(each))
         for each in found.sentences
     ]
     first = found.sentences[0] if found.sentences else None
     named = next((each for each, right in zip(found.sentences, is_right, strict=True) if right), None)
     covers = np.nan
-    if named is not None and named.cause is not None and fault.value is not None:
-        low, high = named.cause.ends
+    cause = cause_of(named) if named else None
+    if cause is not None and fault.value is not None:
+        low, high = cause.ends
         covers = float(low <= fault.value <= high)
     return {
         "sentences": len(found.sentences),
         "first_kind": first.kind if first else "",
-        "first_topic": first.topic if first else "",
+        "first_topic": first.where if first else "",
         "is_first": any(is_right[:1]),
         "is_in_first_two": any(is_right[:2]),
         "covers": covers,

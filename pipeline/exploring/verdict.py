@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from fuselog.pipeline.exploring.curves import Case
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
+from fuselog.recorders.checks.finding import Finding
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.judging.verdicts import Consistency, Squares, decisive
@@ -31,16 +31,16 @@ class Summary(NamedTuple):
     detail: str
 
 
-def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Summary:
+def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Summary:
     """Judge one filter on one log, by NEES and NIS and by the alarms of its replay, if of this case."""
     if failures:
         return Summary("failed", "It stopped.", failures[0])
-    own = [each for each in alarms if each.case in ("", case.name)]
+    own = [each for each in alarms if each.part in ("", case.name)]
     by = decisive(_squares_of(case))
     has_other_cause = bool(own) and {"errors", "innovations"}.isdisjoint(each.kind for each in own)
     if by is None or by.verdict == Consistency.CONSISTENT or has_other_cause:
         if own:
-            return Summary("doubtful", "Doubtful.", own[0].words)
+            return Summary("doubtful", "Doubtful.", own[0].sentence)
         return Summary("good", "Nothing speaks against it.", _evidence(case))
     times = "times what" if by.verdict == Consistency.OVERCONFIDENT else "of what"
     detail = f"Its {by.name} are {by.factor:.2g} {times} it claims."

@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.compiling.cache import cache_folder, kept_files
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.linting.lint import lint_log
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from fuselog.recorders.parameters import build, describe
-from fuselog.recorders.plausibility.finding import Finding
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
 from fuselog.replay.engine.replaying.truth import truths_among
+from fuselog.replay.engine.streams.linting import lint_source, worst
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.foreign.naming import KINDS as PROGRAMS
 from fuselog.replay.inference.all_methods import METHODS
@@ -105,17 +105,10 @@ def _main_span(log: Log) -> tuple[int, int] | None:
         return None
 
 
-def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
-    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
-    if found:
-        others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
-        yield f"implausible: {found[0].mended}{others if len(found) > 1 else ''}"
-
-
 def _findings(log: Log) -> list[Finding]:
     """Find what the log says of its own faults; of one that is damaged nothing, and that it is."""
     try:
-        return lint_log(log, portions=1)
+        return lint_source(LogSource(log), portions=1)
     except BadInput as error:
         warn(f"{error}; what it holds is not looked at")
         return []
@@ -281,7 +274,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
-        "findings": [each._asdict() for each in _findings(log)],
+        "findings": [each.as_json for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "estimators": estimators_that_fit(log),
         "lost": log.loss_statement,

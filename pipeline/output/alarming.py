@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.results import split_metric
+from fuselog.recorders.checks.finding import Finding
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.replaying.usage import SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import LOST
@@ -67,7 +67,7 @@ class _Range(NamedTuple):
 
 def alarms_of(
     judge: Judge, parameters: Mapping[str, Mapping[str, Any]], coverage: Sequence[Row] = ()
-) -> list[Alarm]:
+) -> list[Finding]:
     """Return the alarms of a judged replay, the worst first.
 
     Args:
@@ -76,7 +76,7 @@ def alarms_of(
         coverage: what became of the measurements.
     """
     uninformed = [*_of_components(judge)]
-    explained = {(each.estimator, each.case) for each in uninformed}
+    explained = {(each.where, each.part) for each in uninformed}
     nis, nees = _beyond(judge, NIS), _beyond(judge, "nees")
     diverged = {
         what: nees[what]
@@ -89,24 +89,24 @@ def alarms_of(
     ]
     found = [
         *uninformed,
-        *(each for each in inconsistent if (each.estimator, each.case) not in explained),
+        *(each for each in inconsistent if (each.where, each.part) not in explained),
         *_of_costs(judge),
         *_of_digits(judge),
         *_of_measurements(coverage),
     ]
-    return [*sorted(found, key=lambda each: -each.excess), *_of_gates(judge, parameters)]
+    return [*sorted(found, key=lambda each: -each.value), *_of_gates(judge, parameters)]
 
 
-def _of_components(judge: Judge) -> Iterator[Alarm]:
+def _of_components(judge: Judge) -> Iterator[Finding]:
     """Find components that an estimator cannot estimate, for no measurement informs it of them."""
     for (estimator, case), names in judge.uninformed.items():
         them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
         words = (
             f"{_name(estimator, case)}: {', '.join(names)} {keep} start and prior uncertainty: no "
-            f"measurement informs this method of {them}; take another one that fits the log, by fuselog "
-            "info LOG"
+            f"measurement informs this method of {them}"
         )
-        yield Alarm("uninformed", estimator, case, LARGEST, words)
+        other = "take another one that fits the log, by fuselog info LOG"
+        yield Finding("uninformed", estimator, case, LARGEST, words, otherwise=other)
 
 
 def _beyond(judge: Judge, quantity: str) -> dict[tuple[str, str], _Range]:
@@ -124,7 +124,7 @@ def _of_innovations(
     parameters: Mapping[str, Mapping[str, Any]],
     nis: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
-) -> Iterator[Alarm]:
+) -> Iterator[Finding]:
     """Find a gate that keeps out too much, and NIS that is beyond its interval.
 
     With the NEES of those that diverged: what one of the two says holds of the other.
@@ -154,16 +154,15 @@ def _of_innovations(
                 facts.append(f"NEES {nees.fact}")
             facts[-1] += f": {OF_DIVERGENCE if nees else own.reason}"
         if facts:
-            words = f"{_name(estimator, case)}: {'; '.join(facts)}; "
-            words += f"fuselog diagnose LOG -e {estimator} says why"
-            yield Alarm("innovations", estimator, case, excess, words)
+            words = f"{_name(estimator, case)}: {'; '.join(facts)}"
+            yield Finding("innovations", estimator, case, excess, words, otherwise=_why(estimator))
 
 
 def _of_errors(
     judge: Judge,
     nees: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
-) -> Iterator[Alarm]:
+) -> Iterator[Finding]:
     """Find NEES beyond its interval, if none diverged; of positions whose error stays, that."""
     constants, positions = judge.constants, _beyond(judge, "position_nees")
     for topic in judge.judged:
@@ -180,9 +179,9 @@ def _of_errors(
                     f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "
                     "can, the setting estimate adds them to the state"
                 )
-            if any(split_topic(each)[0] == estimator for each in judge.innovations):
-                words += f"; fuselog diagnose LOG -e {estimator} says why"
-            yield Alarm("errors", estimator, case, own.excess, words)
+            has_innovations = any(split_topic(each)[0] == estimator for each in judge.innovations)
+            why = _why(estimator) if has_innovations else ""
+            yield Finding("errors", estimator, case, own.excess, words, otherwise=why)
 
 
 def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
@@ -205,7 +204,7 @@ def dominating_run(nees: "pd.Series[float]") -> str:
     return f"run {nees.index[place]} dominates it with {values[place]:.3g}: without that run {rest:.3g}"
 
 
-def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
+def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
     """Describe an error that stays."""
     offset = ", ".join(f"{each:.3g}" for each in constant.offset_m)
     name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
@@ -214,14 +213,15 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
         axes = "ahead, to the left, up" if len(constant.offset_m) > 2 else "ahead, to the left"
         words += (
             f"({offset}) m {axes}: the truth is of another point of the body (a lever arm), or a sensor "
-            "is off; state the one or the other in the model"
+            "is off"
         )
-        return Alarm("lever arm", estimator, case, excess, words)
+        state = "state the one or the other in the model"
+        return Finding("lever arm", estimator, case, excess, words, otherwise=state)
     words += f"({offset}) m: truth and estimate may have other origins: fuselog evaluate --align se2"
-    return Alarm("origin", estimator, case, excess, words)
+    return Finding("origin", estimator, case, excess, words)
 
 
-def _of_costs(judge: Judge) -> Iterator[Alarm]:
+def _of_costs(judge: Judge) -> Iterator[Finding]:
     """Find searches of a trajectory that ended at more than their residuals leave."""
     metrics = judge.metrics
     for topic, innovations in judge.innovations.items():
@@ -237,12 +237,13 @@ def _of_costs(judge: Judge) -> Iterator[Alarm]:
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
                 f"{numbers / judge.runs:.4g} measured numbers leave up to {high:.4g}: a minimum that is "
-                "not the least one; compare other starts, such as --set start=motion"
+                "not the least one"
             )
-            yield Alarm("minimum", estimator, case, cost / high, words)
+            starts = "compare other starts, such as --set start=motion"
+            yield Finding("minimum", estimator, case, cost / high, words, otherwise=starts)
 
 
-def _of_digits(judge: Judge) -> Iterator[Alarm]:
+def _of_digits(judge: Judge) -> Iterator[Finding]:
     """Find covariances, of estimates or innovations, of which rounding left next to nothing."""
     for topic, found in judge.conditioning.items():
         if not found.lost:
@@ -261,12 +262,12 @@ def _of_digits(judge: Judge) -> Iterator[Alarm]:
                 f"its Cholesky factor is {max(found.least, 0.0):.2g} of a variance, where {LOST:g} "
                 "leaves four digits"
             )
-        words += "; give a prior that is surer, or noise to what is known too well, or try sqrt:ekf"
+        surer = "give a prior that is surer, or noise to what is known too well, or try sqrt:ekf"
         share = found.lost / found.sampled
-        yield Alarm("digits", estimator, case, 1.0 + share / RARE, words)
+        yield Finding("digits", estimator, case, 1.0 + share / RARE, words, otherwise=surer)
 
 
-def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
+def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
     """Find measurements that came to nothing for a reason; what a tracker leaves over has none."""
     measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
@@ -275,10 +276,10 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
             continue
         if row.unused > UNUSED * row.messages:
             excess = row.unused / (UNUSED * row.messages)
-            yield Alarm("unused", row.estimator, "", excess, row.sentence)
+            yield Finding("unused", row.estimator, "", excess, row.sentence)
 
 
-def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
+def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
     """Find estimators with different gates, where one kept something out: they are judged unlike."""
     gates = {
         label: float(values["gate_probability"])
@@ -289,11 +290,8 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
     is_closed = any(each.total.accepted < each.total.messages for each in judge.innovations.values())
     if is_closed and len({*gates.values()}) > 1:
         own = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
-        words = (
-            f"gate_probability is {own}: their likelihoods are of different measurements; compare with "
-            "--set gate_probability=1"
-        )
-        yield Alarm("gates", "", "", 1.0, words)
+        words = f"gate_probability is {own}: their likelihoods are of different measurements"
+        yield Finding("gates", "", "", 1.0, words, otherwise="compare with --set gate_probability=1")
 
 
 def _percent(share: float) -> str:
@@ -302,3 +300,7 @@ def _percent(share: float) -> str:
 
 def _name(estimator: str, case: str) -> str:
     return f"{estimator} {case}".strip()
+
+
+def _why(estimator: str) -> str:
+    return f"fuselog diagnose LOG -e {estimator} says why"

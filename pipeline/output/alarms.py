@@ -1,4 +1,4 @@
-"""Defines what makes a replay's numbers doubtful, and why: alarms, causes, verdicts of stress.
+"""Defines what results store of doubts about their numbers: alarms, causes, verdicts of stress.
 
 `fuselog.pipeline.output.alarming` finds alarms, `fuselog run --diagnose` causes, and `--stress` its
 verdicts.
@@ -6,37 +6,33 @@ verdicts.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-Kind = Literal[
-    "innovations",
-    "errors",
-    "uninformed",
-    "origin",
-    "lever arm",
-    "minimum",
-    "digits",
-    "unused",
-    "gates",
-]
+from pydantic import BeforeValidator, PlainSerializer
+
+from fuselog.recorders.checks.finding import Finding
 
 
-@dataclass(frozen=True)
-class Alarm:
-    """Represents one reason to doubt the numbers of a replay.
+def as_alarm(found: Finding) -> dict[str, Any]:
+    """Return a finding about a judged replay as results and `--json` have it, an alarm."""
+    return {
+        "kind": found.kind,
+        "estimator": found.where,
+        "case": found.part,
+        "excess": found.value,
+        "words": found.sentence,
+    }
 
-    Attributes:
-        kind: what it is about.
-        estimator, case: whose; empty where it is of several.
-        excess: how many times a number is beyond what a consistent filter leaves; worse ones are larger.
-        words: the sentence.
-    """
 
-    kind: Kind
-    estimator: str
-    case: str
-    excess: float
-    words: str
+def _of_alarm(value: Any) -> Any:
+    """Return the fields of a finding for those of an alarm."""
+    if not isinstance(value, dict):
+        return value
+    names = {"estimator": "where", "case": "part", "excess": "value", "words": "evidence"}
+    return {names.get(name, name): each for name, each in value.items()}
+
+
+Alarm = Annotated[Finding, BeforeValidator(_of_alarm), PlainSerializer(as_alarm)]  # in result.json
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
 from fuselog.pipeline.output.charts import Chart, draw, show_names_as_they_are
 from fuselog.pipeline.output.claims import Claim, known
 from fuselog.recorders.atomic import whole_file, whole_folder
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
@@ -73,7 +74,7 @@ class Outcome:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     bounds: dict[str, Bounds] = field(default_factory=dict)
     intervals: dict[str, Bounds] = field(default_factory=dict)
-    alarms: list[Alarm] = field(default_factory=list)
+    alarms: list[Finding] = field(default_factory=list)
     causes: list[Cause] = field(default_factory=list)
     stress: list[Stressing] = field(default_factory=list)
     timings: dict[str, dict[str, float]] = field(default_factory=dict)

@@ -20,7 +20,6 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.results import (
     Bounds,
@@ -31,6 +30,7 @@ from fuselog.pipeline.output.results import (
     split_metric,
 )
 from fuselog.pipeline.output.words import MISSING
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import printable
 from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 from fuselog.replay.judging.verdicts import Claimed
@@ -321,16 +321,16 @@ def print_parameters(
         print_parameters({f"{label}, from the log": values for label, values in stated.items()})
 
 
-def print_worst(alarms: Sequence[Alarm]) -> None:
+def print_worst(alarms: Sequence[Finding]) -> None:
     """Print the worst of what makes the numbers below doubtful."""
     for alarm in alarms[:1]:
-        say(f"doubtful: {alarm.words}")
+        say(f"doubtful: {alarm.sentence}")
 
 
-def print_others(alarms: Sequence[Alarm]) -> None:
+def print_others(alarms: Sequence[Finding]) -> None:
     """Print a few of the others."""
     for alarm in alarms[1:MOST_ALARMS]:
-        say(f"also doubtful: {alarm.words}")
+        say(f"also doubtful: {alarm.sentence}")
     if len(alarms) > MOST_ALARMS:
         say(f"and {len(alarms) - MOST_ALARMS} more, which --json lists")
 

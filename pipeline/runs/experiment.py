@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, Self
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
 from fuselog.pipeline.altering.changes import by_topic, is_of_topic
+from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
 from fuselog.pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from fuselog.pipeline.runs.checkpoints import Checkpoints, checkpoints_of
@@ -18,12 +19,15 @@ from fuselog.pipeline.runs.executors import PoolFactory
 from fuselog.pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
 from fuselog.pipeline.runs.settings import named_by, parameters_by_label
 from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.log import open_log
 from fuselog.recorders.parameters import Parameters, build, merge
 from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import foreign_code, load
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.replaying.late import parse_late
+from fuselog.replay.engine.streams.linting import of_first_messages
+from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.foreign.naming import allowed_in
 from fuselog.replay.judging.metrics.measuring import find_metrics
 
@@ -414,4 +418,9 @@ def run_experiment(
             label: parameters.model_dump(mode="json", exclude_none=True)
             for label, (_, parameters) in configured.items()
         }
+        if experiment.logs is not None:
+            alterations = experiment.alterations or {}
+            sources = [alter(LogSource(open_log(each)), alterations) for each in experiment.files]
+            of_logs = of_first_messages(sources)
+            settings |= {"notes": of_logs} if of_logs else {}
         return write_outcome(part, name, settings, outcome)

@@ -113,8 +113,8 @@ def of_outcome(outcome: Outcome) -> Quantities:
                 if not BY_THE_CLOCK.search(panel.y.label):
                     found.update(_of_panel(Name(f"figure {name}", f"panel {place}"), panel))
     for alarm in outcome.alarms:
-        name = " ".join(filter(None, (alarm.kind, alarm.estimator, alarm.case)))
-        found[Name("alarms", name)] = {"excess": _number(alarm.excess), **_numbers_in(alarm.words)}
+        name = " ".join(filter(None, (alarm.kind, alarm.where, alarm.part)))
+        found[Name("alarms", name)] = {"excess": _number(alarm.value), **_numbers_in(alarm.sentence)}
     for cause in outcome.causes:
         found[Name("causes", cause.estimator)] = _numbers_in(f"{cause.setting} {cause.words}")
     for stress in outcome.stress:

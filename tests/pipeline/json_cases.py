@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from scipy.stats import chi2
 
 import fuselog as fl
 from fuselog.pipeline.api.estimates import judge_estimates
-from fuselog.pipeline.output.alarms import NOT_TESTED
+from fuselog.pipeline.output.alarms import NOT_TESTED, as_alarm
 from fuselog.pipeline.sensing.foreign_files import explained
 from fuselog.recorders.log import open_log
 from tests.pipeline.json_of_files import (
@@ -90,7 +89,7 @@ def judged() -> tuple[Any, dict[str, Any]]:
     return done, {
         "metrics": metrics_of(done.metrics),
         "bounds": bounds_of(degrees_of(done)),
-        "alarms": [asdict(each) for each in done.alarms],
+        "alarms": [as_alarm(each) for each in done.alarms],
         "failures": [],
         "losses": done.losses,
         "worst": {"ekf": worst_of(done.errors)},
@@ -116,6 +115,7 @@ def of_replay() -> Any:
         "seconds": {"ekf": POSITIVE},
         "parameters": {"ekf": {name: fields[name].default for name in names} | {"sigma_range_m": 0.05}},
         "parameters_of_log": {"ekf": stated},
+        "findings": [each.as_json for each in fl.lint("run.mcap")],
     }
 
 
@@ -175,7 +175,7 @@ def of_comparison(found: Any) -> Any:
 def of_diagnosis(found: Any) -> Any:
     metrics = metrics_of(found.metrics)
     assert metrics.pop("ekf.log_likelihood.robot1") > found.log_likelihood
-    assert found.sentences[0].topic == "sigma_range_m"
+    assert found.sentences[0].where == "sigma_range_m"
     return {
         "found": found.told,
         "hypotheses": found.hypotheses,
@@ -358,7 +358,7 @@ CASES = [
     ),
     Case(
         "lint grave.mcap",
-        lambda: {"path": "grave.mcap", "findings": rows_of(fl.lint("grave.mcap"))},
+        lambda: {"path": "grave.mcap", "findings": [each.as_json for each in fl.lint("grave.mcap")]},
     ),
     Case("run landmarks --runs 2 --set duration_s=2 --out again", lambda: of_result("again")),
     Case("run landmarks --set ukf.kappa=2 --parameters", of_parameters),

@@ -69,7 +69,7 @@ def of_log() -> Any:
         "last_log_time_ns": summary.statistics.message_end_time,
         "run": asdict(log.run),
         "topics": topics,
-        "findings": [finding._asdict()],
+        "findings": [finding.as_json],
         "models": printed,
         "estimators": estimators,
         "lost": None,

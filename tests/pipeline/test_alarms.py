@@ -56,23 +56,25 @@ def test_a_run_that_dominates_the_mean_nees_is_named(log: MemorySource) -> None:
     ]
     late = _truth_moved(logs[1], lambda _, time: (np.where(time > 0.9, 0.5, 0.0), 0.0 * time))
     [found] = [each for each in replay([logs[0], late, logs[2]], "ekf").alarms if each.kind == "errors"]
-    assert "; run 1 dominates it with " in found.words
-    assert not any("dominates" in each.words for each in replay([late], "ekf").alarms)
+    assert "; run 1 dominates it with " in found.sentence
+    assert not any("dominates" in each.sentence for each in replay([late], "ekf").alarms)
 
 
 def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -> None:
     """Points all about a target tell a UKF nothing of its size, and the analytic moments all."""
     found = replay(record("extended-target", seed=1), ["ukf", "lrkf", "analytic"]).alarms
-    assert [(each.kind, each.estimator) for each in found] == [
+    assert [(each.kind, each.where) for each in found] == [
         ("uninformed", "ukf"),
         ("uninformed", "lrkf"),
     ]
-    assert found[0].words.startswith(
+    assert found[0].sentence.startswith(
         "ukf: half_x_m, half_y_m keep their start and prior uncertainty: no"
     )
     [biased, *_] = replay(record("moving-los", seed=1, duration_s=10.0), ["ekf"]).alarms
     assert biased.kind == "errors"
-    assert "the truth has sensor_1_yaw_bias_rad and 11 more, which it does not estimate" in biased.words
+    assert (
+        "the truth has sensor_1_yaw_bias_rad and 11 more, which it does not estimate" in biased.sentence
+    )
 
 
 def test_the_worst_is_said_first(
@@ -104,7 +106,7 @@ def test_the_worst_is_said_first(
     assert "<li>ekf robot1: the gate keeps out 9" in page.read_text(encoding="utf-8")
     assert "<li>ekf robot1: NEES is" in page.read_text(encoding="utf-8")
     done = replay(log, "ekf", set={"sigma_range_m": 1e-4})
-    assert done.alarms[0].words in repr(done)
+    assert done.alarms[0].sentence in repr(done)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,7 @@ def test_the_worst_is_said_first(
 def test_an_error_that_stays(log: MemorySource, by: Any, kind: str, offset: str) -> None:
     [alarm] = replay(_truth_moved(log, by), "ekf").alarms
     assert alarm.kind == kind
-    assert offset in alarm.words
+    assert offset in alarm.sentence
 
 
 def test_an_aligned_estimate_has_no_other_origin(
@@ -141,27 +143,27 @@ def test_measurements_before_a_late_prior_are_counted(log: MemorySource) -> None
     before = int((stamps_ns < late_ns[0]).sum())
     assert (
         f"ekf: {SIGHTINGS}: {before} of {len(stamps_ns)} not used: {before} come before the prior"
-        in [alarm.words for alarm in done.alarms if alarm.kind == "unused"]
+        in [alarm.sentence for alarm in done.alarms if alarm.kind == "unused"]
     )
 
 
 def test_a_likelihood_of_nothing(log: MemorySource) -> None:
     far = replace(log[PRIOR], columns={**log[PRIOR].columns, "mean": log[PRIOR]["mean"] + 100.0})
     worst = replay(_with(log, far), "ekf").alarms[0]
-    assert "the gate keeps out 100 % of" in worst.words
-    assert "its log-likelihood is that of no measurement" in worst.words
+    assert "the gate keeps out 100 % of" in worst.sentence
+    assert "its log-likelihood is that of no measurement" in worst.sentence
 
 
 def test_gates_that_differ(log: MemorySource) -> None:
     opened = {"open": {"kind": "ekf", "gate_probability": 1.0}}
     last = replay(log, ["ekf", opened], set={"sigma_range_m": 0.05}).alarms[-1]
     assert last.kind == "gates"
-    assert "gate_probability is 0.999 of ekf, 1 of open" in last.words
+    assert "gate_probability is 0.999 of ekf, 1 of open" in last.sentence
 
 
 def test_a_minimum_that_is_not_the_least(log: MemorySource) -> None:
     """By the cost itself, whose residuals leave about half a unit for each measured number."""
     far = replay(log, "smoother:iterated", set={"start": "prior"})
     [alarm] = [each for each in far.alarms if each.kind == "minimum"]
-    assert "compare other starts, such as --set start=motion" in alarm.words
-    assert alarm.excess > 10.0
+    assert "compare other starts, such as --set start=motion" in alarm.sentence
+    assert alarm.value > 10.0

@@ -68,7 +68,7 @@ def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
     assert value > high
     told = fl.diagnose(faulty, "ekf", set=OPEN).sentences[0]
     assert told.setting.partition("=")[0] == undone
-    assert f"; try --set {told.setting}" in told.words
+    assert f"; try --set {told.setting}" in told.sentence
     value, low, high = nis(faulty, **parse_settings([told.setting]))
     assert low < value < high
 
@@ -335,7 +335,7 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
     mine = {"mine": fl.modelled(robot(), "ekf")}
     before = {f"{SEEN}.delay_s": 0.1}
     told = fl.diagnose(faulty, mine, set={**OPEN, **before}).sentences[0]
-    found = re.search(r"try set=(\{.*\})", told.words)
+    found = re.search(r"try set=(\{.*\})", told.sentence)
     assert found is not None
     settings = json.loads(found[1])
     assert settings == {f"{SEEN}.delay_s": pytest.approx(0.3, abs=0.01)}

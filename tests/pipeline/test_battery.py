@@ -26,7 +26,7 @@ from fuselog.pipeline.diagnosing.battery.car import (
 )
 from fuselog.pipeline.diagnosing.causes import find_causes, seek
 from fuselog.pipeline.diagnosing.consistency import judged_by_itself
-from fuselog.pipeline.diagnosing.findings import undone_by, without_filter
+from fuselog.pipeline.diagnosing.findings import corrected_by, of_log
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Supposed, fit
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
@@ -256,7 +256,7 @@ def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
     shifted = replace(log, streams={**log.streams, FIX: fixes})
     [found] = fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0}).sentences
     assert found.cause is not None
-    assert "the origin of the plane is another one" in found.words
+    assert "the origin of the plane is another one" in found.sentence
     for told, planted in zip(found.cause.numbers, (40.0, -25.0), strict=True):
         assert told.low < planted < told.high
         assert told.value == pytest.approx(planted, abs=3.0)
@@ -309,7 +309,7 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)
     found = fl.diagnose(log, "ekf", set={"gate_probability": 1.0})
-    words = found.sentences[0].words
+    words = found.sentences[0].sentence
     assert "turn_radps has the wrong sign" in words
     assert "x and y of position_m are exchanged" in words
     assert "which this log does not tell from it" in words
@@ -325,7 +325,7 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
 def test_what_a_parameter_undoes_is_not_said_of_the_log(fault: str, settings: dict[str, float]) -> None:
     log = recorded(faulty(SEED, fault), has_compass=False)
     found = {
-        name: without_filter(log, [ODOMETRY, FIX], undone_by(bind("ekf", [log], {**OPEN, **given})))
+        name: of_log(log, [ODOMETRY, FIX], corrected_by(bind("ekf", [log], {**OPEN, **given})))
         for name, given in (("as it is", {}), ("mended", settings))
     }
     assert len(found["as it is"]) == 1
@@ -527,7 +527,7 @@ def test_causes_of_a_part_are_tried_on_the_rest(monkeypatch: pytest.MonkeyPatch)
     log = recorded(car._replace(turn_radps=turn), has_compass=False, has_prior=True)
     monkeypatch.setattr(portion, "MOST_MESSAGES", 600)
     found = fl.diagnose(log, "ekf", set={"gate_probability": 1.0})
-    words = found.sentences[0].words
+    words = found.sentences[0].sentence
     assert "turn_radps is too large by 0.0" in words
     assert "over the rest of the log it loses" in words
     assert found.notes[0].startswith("causes were sought in the first 50 s")

@@ -277,7 +277,7 @@ def test_a_lever_arm_is_found_from_a_start_at_which_the_filter_diverges() -> Non
         assert lever["low"] < 0.3 < lever["high"]
         assert lever["high"] - lever["low"] < 0.05
     first = fl.diagnose(log, "ekf").sentences[0]
-    assert (first.kind, first.topic) == ("parameter", "lever_x_m")
+    assert (first.kind, first.where) == ("parameter", "lever_x_m")
 
 
 @pytest.mark.paper

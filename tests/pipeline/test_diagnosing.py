@@ -19,13 +19,14 @@ from fuselog.pipeline.diagnosing import diagnosis, study
 from fuselog.pipeline.diagnosing import likelihood as trials_of
 from fuselog.pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from fuselog.pipeline.diagnosing.consistency import of_each_component
-from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
+from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import Gains, Peak, peak
+from fuselog.pipeline.diagnosing.sentences import cause_of
 from fuselog.pipeline.optimise import end, side_by_side
-from fuselog.recorders.linting.lint import lint
+from fuselog.recorders.checks.lint import lint
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
@@ -177,15 +178,15 @@ def test_nothing_is_found_where_nothing_is_wrong(run: fl.MemorySource) -> None:
 @pytest.mark.paper
 def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySource) -> None:
     told = first(run, sigma_range_m=0.025)
-    assert (told.kind, told.topic) == ("measurement noise", "sigma_range_m")
+    assert (told.kind, told.where) == ("measurement noise", "sigma_range_m")
     low, high = np.exp(told.cause.ends)
     assert 3.5 < low < 4.0 < high < 4.5
-    assert "so that R is too small" in told.words
-    assert "try --set sigma_range_m=0.09" in told.words
-    assert "fuselog tune LOG -e ekf --free sigma_range_m" in told.words
+    assert "so that R is too small" in told.sentence
+    assert "try --set sigma_range_m=0.09" in told.sentence
+    assert "fuselog tune LOG -e ekf --free sigma_range_m" in told.sentence
     told = first(run, turn_noise_density=0.1)
-    assert (told.kind, told.topic) == ("process noise", "turn_noise_density")
-    assert "so that Q is too large" in told.words
+    assert (told.kind, told.where) == ("process noise", "turn_noise_density")
+    assert "so that Q is too large" in told.sentence
 
 
 @pytest.mark.parametrize(
@@ -199,7 +200,7 @@ def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySo
         (lambda rng: 1 + 9 * (rng.random(600) < 0.03), True),
     ],
 )
-def test_lint_and_diagnose_agree_on_lost_messages(
+def test_messages_are_lost_of_a_regular_topic_alone(
     steps: Callable[[np.random.Generator], Any], is_lossy: bool
 ) -> None:
     """Lost at random or in a row; not of an irregular topic whose stamps are of a clock's ticks."""
@@ -212,9 +213,8 @@ def test_lint_and_diagnose_agree_on_lost_messages(
         forward_mps=rng.normal(size=600),
         turn_radps=rng.normal(size=600),
     )
-    told = [each.words for each in of_messages([stream], 0) if "are lost" in each.words]
-    linted = [each.words for each in lint([{"/odometry": stream}]) if each.cause == "lost messages"]
-    assert (bool(told), bool(linted)) == (is_lossy, is_lossy), told + linted
+    told = [each.evidence for each in lint([{"/odometry": stream}]) if each.kind == "lost messages"]
+    assert bool(told) == is_lossy, told
 
 
 @pytest.mark.paper
@@ -223,7 +223,7 @@ def test_lint_and_diagnose_agree_on_lost_messages(
     [
         (alter.shifted("range_m"), 0.2, "bias or turned frame", SEEN, "range_m is too large by"),
         (alter.shifted("bearing_rad"), 0.05, "bias or turned frame", SEEN, "or the sensor's frame is"),
-        (alter.thinned(5), 0.3, "lost messages", SEEN, "of its messages are lost"),
+        (alter.thinned(5), 0.3, "lost messages", SEEN, "loses 27 % of its messages"),
         (alter.shifted("mean", 2), 0.6, "start", "/robot1/prior", "heading_rad at the start is"),
         (
             alter.renumbered("landmark_id", 3, 9),
@@ -238,10 +238,11 @@ def test_a_fault_of_the_log_is_named_first(
     run: fl.MemorySource, alteration: alter.Alteration, by: float, kind: str, topic: str, said: str
 ) -> None:
     told = first(alter.altered(run, topic, alteration, by))
-    assert (told.kind, told.topic) == (kind, topic)
-    assert said in told.words
-    if told.cause is not None and len(told.cause.hypothesis.tried) > 1:
-        low, high = told.cause.ends
+    assert (told.kind, told.where) == (kind, topic)
+    assert said in told.sentence
+    cause = cause_of(told)
+    if cause is not None and len(cause.hypothesis.tried) > 1:
+        low, high = cause.ends
         assert low - 0.02 < by < high + 0.02
 
 
@@ -253,10 +254,10 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     exact = {"rate_hz": 5.0, "maximum_range_m": 60.0}
     late = fl.record("landmarks", seed=5, **scenario, range_bearing={**exact, "stamp_offset_s": 0.05})
     told = first(late)
-    assert (told.kind, told.topic) == ("delay", SEEN)
+    assert (told.kind, told.where) == ("delay", SEEN)
     assert told.cause.ends[0] < 0.05 < told.cause.ends[1]
     assert told.setting == f"{SEEN}.delay_s={told.cause.value:.4g}"
-    assert told.words.endswith(f"try --set {told.setting}")
+    assert told.sentence.endswith(f"try --set {told.setting}")
     wild = fl.record(
         "landmarks", seed=5, **scenario, range_bearing={**exact, "outlier_probability": 0.02}
     )
@@ -264,7 +265,7 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     clean = fl.record("landmarks", seed=5, **scenario, range_bearing=exact)
     clock = alter.drifted(clean.extent("publish_time")[0])
     told = first(alter.altered(clean, SEEN, clock, 2e-3))
-    assert (told.kind, told.topic) == ("clock drift", SEEN)
+    assert (told.kind, told.where) == ("clock drift", SEEN)
 
 
 @pytest.mark.paper
@@ -277,12 +278,12 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
     moved = right["position_m"] + np.outer((since_s > 25.0) & (since_s < 33.0), (6.0, -4.0))
     glitch = replace(right, columns={**right.columns, "position_m": moved})
     found = fl.diagnose(replace(log, streams={**log.streams, right.topic: glitch}), "ekf").sentences
-    assert [(each.kind, each.topic) for each in found] == [
+    assert [(each.kind, each.where) for each in found] == [
         ("outliers", "gate_probability"),
-        ("values", "/robot1/fix"),
+        ("place", "/robot1/fix"),
     ]
     assert not found[0].setting
-    assert "the gate that is set keeps these out" in found[0].words
+    assert "the gate that is set keeps these out" in found[0].sentence
 
 
 @pytest.mark.paper
@@ -400,14 +401,14 @@ def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> No
     assert found.kind == "divergence"
     assert found.time_ns is not None
     assert 245e9 < found.time_ns < 260e9
-    assert "after range_m of 7" in found.words
+    assert "after range_m of 7" in found.sentence
     locked = well & ~((np.arange(400) >= 100) & (np.arange(400) < 160))
     told = list(of_innovations(innovations(rng.chisquare(1, 400), locked), 0.999, 0, has_outliers=True))
     assert [each.kind for each in told] == ["gate"]
-    assert "keeps out all 60 measurements from 100 s to 159 s" in told[0].words
+    assert "keeps out all 60 measurements from 100 s to 159 s" in told[0].sentence
     rare = np.arange(400) % 10 > 0
     told = list(of_innovations(innovations(rng.chisquare(1, 400), rare), 0.999, 0, has_outliers=False))
-    assert "keeps out 10 % of the measurements, where 0.1 % are expected" in told[0].words
+    assert "keeps out 10 % of the measurements, where 0.1 % are expected" in told[0].sentence
 
 
 def fixes(position: np.ndarray, **stamps: Any) -> fl.Stream:
@@ -425,31 +426,37 @@ def fixes(position: np.ndarray, **stamps: Any) -> fl.Stream:
 def test_what_is_wrong_with_messages_is_said() -> None:
     rng = np.random.default_rng(2)
     place = np.cumsum(rng.normal(size=(300, 2)), axis=0)
-    assert not list(of_messages([fixes(place)], 0))
+    assert not lint([{"/robot1/fix": fixes(place)}])
 
     def told(stream: fl.Stream) -> str:
-        [found] = of_messages([stream], 0)
-        return found.words
+        [found] = lint([{stream.topic: stream}])
+        return found.sentence
 
     twice = np.repeat(np.arange(300), 1 + (np.arange(300) % 30 == 0))
-    assert "10 messages are there twice" in told(fixes(place).take(twice))
-    assert "saturates: " in told(fixes(np.minimum(place, [np.quantile(place[:, 0], 0.9), 99.0])))
+    assert "10 of its 310 messages are there twice" in told(fixes(place).take(twice))
+    clipped = np.minimum(place, [np.quantile(place[:, 0], 0.9), 99.0])
+    assert "position_m x is saturated: 30 of 300 messages are at" in told(fixes(clipped))
     rounded = np.cumsum(rng.normal(size=(3000, 2)), axis=0)
     rounded[:, 0] = np.round(rounded[:, 0] / 2.0) * 2.0
-    assert "position_m[0] is rounded to 2, more than half of its noise" in told(fixes(rounded))
+    assert "position_m x is rounded to 2, and its noise is" in told(fixes(rounded))
     late_ns = np.arange(300) * 10**9 + (np.arange(300) % 10 == 0) * 2_500_000_000
-    assert "30 messages came after newer ones, up to 2 s behind" in told(
-        fixes(place, log_time_ns=late_ns)
-    )
+    late = told(fixes(place, log_time_ns=late_ns))
+    assert late.endswith("and are up to 2 s behind; replay them as they came, with --late rewind:2")
     silent = np.arange(300) + 60 * (np.arange(300) > 100)
-    assert "silent for 61 s from 100 s on" in told(fixes(place, publish_time_ns=silent * 10**9))
-    for step_ns in (200_000_000, 10**6):  # bursts of a sensor, as ranges to four anchors or eight
-        count = 8 if step_ns < 10**8 else 4
-        bursts_ns = np.arange(300) // count * 10**9 + np.arange(300) % count * step_ns
-        assert not list(of_messages([fixes(place, publish_time_ns=bursts_ns)], 0))
+    assert "is silent for 61 s from 100 s after its first stamp on" in told(
+        fixes(place, publish_time_ns=silent * 10**9)
+    )
+
+    def ranges(stamps_ns: np.ndarray) -> fl.Stream:
+        ids = {"anchor_id": np.ones(300, int), "tag_id": np.ones(300, int)}
+        return fl.make_stream("/r", fl.schemas.ANCHOR_RANGE, stamps_ns, **ids, range_m=place[:, 0])
+
+    for step_ns in (200_000_000, 10**6):  # bursts of a sensor, as ranges to four anchors
+        bursts_ns = np.arange(300) // 4 * 10**9 + np.arange(300) % 4 * step_ns
+        assert not lint([{"/r": ranges(bursts_ns)}])
     bursts_ns[160:] += 60 * 10**9
-    assert "silent for 61 s from 19.01 s on, where the usual step is 0.993 s" in told(
-        fixes(place, publish_time_ns=bursts_ns)
+    assert "is silent for 61 s from 39 s after its first stamp on, where the usual step is 0.997 s" in (
+        told(ranges(bursts_ns))
     )
 
 
@@ -472,12 +479,12 @@ def test_components_of_which_the_same_is_true_are_one_sentence() -> None:
         log_likelihood=np.zeros(400),
     )
     small, biased = of_each_component({stream.topic: stream})
-    assert small.words == (
+    assert small.evidence == (
         "vehicle/fix: the innovations of x_m and y_m are 1.92 to 1.96 times smaller than their "
         "variances say (NIS is 0.26 to 0.27, if consistent 0.784 to 1.25): its noise (EKF2_GPS_P) is "
         "stated too large"
     )
-    assert biased.words == (
+    assert biased.evidence == (
         "vehicle/fix: the innovations of z_m are 2.98 times larger than their variances say (NIS is "
         "8.9, if consistent 0.784 to 1.25): on average they are 2.94 standard deviations: it is biased"
     )
@@ -502,7 +509,7 @@ def test_a_floor_of_the_covariance_is_told_from_a_steady_state() -> None:
     assert not list(of_estimates(estimates(settles)))
     [found] = of_estimates(estimates(np.maximum(0.97 ** np.arange(200), 0.2)))
     assert found.kind == "covariance floor"
-    assert "is 0.2 in 7" in found.words
+    assert "is 0.2 in 7" in found.sentence
 
 
 @pytest.mark.paper

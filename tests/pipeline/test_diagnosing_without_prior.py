@@ -64,9 +64,9 @@ def test_a_covariance_stated_wrongly_is_named_with_its_factor(
 ) -> None:
     """The factor is told to .036, the sheet's standard deviation of its logarithm."""
     found = fl.diagnose(car(2000, stated), "ekf").sentences[0]
-    assert (found.kind, found.topic) == ("measurement noise", "/car/fix")
+    assert (found.kind, found.where) == ("measurement noise", "/car/fix")
     assert found.setting.startswith("/car/fix.covariance_scale=")
-    assert f"so that R is too {size}" in found.words
+    assert f"so that R is too {size}" in found.sentence
     assert found.cause is not None
     low, high = np.exp(np.abs(found.cause.ends))
     assert min(low, high) < factor < max(low, high)
@@ -101,10 +101,10 @@ def test_what_is_inconsistent_and_has_no_name_is_said_to_be(monkeypatch: pytest.
     values = np.concatenate([simulate(seed) for seed in range(4)])
     [found] = fl.diagnose(source(0.5 * values), {"level": fl.modelled(model, "ekf")}).sentences
     assert found.kind == "unnamed"
-    assert found.words.startswith(
+    assert found.sentence.startswith(
         "the estimate: something is wrong that I cannot name: NIS per component"
     )
-    assert "in 999 of 1,000 logs, and none of" in found.words
+    assert "in 999 of 1,000 logs, and none of" in found.sentence
     well = fl.diagnose(source(values), {"level": fl.modelled(model, "ekf")})
     assert well.sentences == []
 

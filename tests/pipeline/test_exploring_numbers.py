@@ -14,9 +14,9 @@ from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_ti
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
 from fuselog.pipeline.exploring.verdict import verdict_of
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.words import quantity
 from fuselog.pipeline.sensing.preparing import _STILL
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.importers.tables.columns import _ENDINGS, _WRITTEN
 from fuselog.recorders.log.impossible import LIMITS
 from fuselog.recorders.parameters import Parameter
@@ -165,7 +165,7 @@ def test_a_verdict_goes_by_errors_and_then_by_innovations() -> None:
         squares = np.array([nees - 0.01, np.nan, nees + 0.01])
         errors = SimpleNamespace(nees=squares, components=("x_m", "y_m"))
         case: Any = SimpleNamespace(name="robot1", whiteness=white, errors=errors)
-        alarms = [Alarm(kind, "ekf", of, 1.0, f"{kind}!") for kind in kinds]  # type: ignore[arg-type]
+        alarms = [Finding(kind, "ekf", of, 1.0, f"{kind}!") for kind in kinds]  # type: ignore[arg-type]
         verdict = verdict_of(case, alarms, [])
         assert verdict_of(case, alarms, ["it stopped"])[0::2] == ("failed", "it stopped")
         return f"{verdict.level}: {verdict.headline} {verdict.detail}"

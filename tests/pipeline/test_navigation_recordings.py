@@ -14,7 +14,7 @@ import fuselog as fl
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.diagnosing import diagnosis
 from fuselog.pipeline.diagnosing.causes import Sought
-from fuselog.recorders.plausibility.checks import BLOCK, findings_in
+from fuselog.recorders.checks.lint import compared
 
 CORRECTIONS = 2
 
@@ -68,8 +68,7 @@ def test_what_is_planted_into_a_walk_is_found_without_a_filter(navigation: Path)
     walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
     topics = ["/fix", "/velocity", "/inertial"]
     for planted, wanted in PLANTED.values():
-        blocks = alter(walk, planted).blocks(topics, "publish_time", BLOCK)
-        assert [f"{each.key}={each.setting}" for each in findings_in(blocks)] == wanted
+        assert [each.setting for each in compared(alter(walk, planted).read(topics))] == wanted
 
 
 @pytest.mark.paper
@@ -92,7 +91,7 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
         planted, [setting] = PLANTED[name]
         found = fl.diagnose(walk, "ekf", set=planted)
         assert found.sentences[0].setting == setting
-        assert re.search(words, found.sentences[0].words)
+        assert re.search(words, found.sentences[0].sentence)
         assert found.replay.failures == []
         assert found.notes[0].startswith("all else is said of the log with --set /")
     for mended in sought:
@@ -125,9 +124,9 @@ def test_what_is_planted_into_a_walk_is_named_first(
     }
     assert first["nothing"].kind == "unnamed"
     assert first["turn rate's sign"].setting == "/inertial.turn_rate_scale=1.0"
-    assert "turn_rate_radps has the wrong sign" in first["turn rate's sign"].words
+    assert "turn_rate_radps has the wrong sign" in first["turn rate's sign"].sentence
     assert re.search(
-        r"/velocity: velocity_mps is 3\.[56]\d* times .* too large", first["velocity x 3.6"].words
+        r"/velocity: velocity_mps is 3\.[56]\d* times .* too large", first["velocity x 3.6"].sentence
     )
 
 

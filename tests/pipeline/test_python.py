@@ -488,7 +488,7 @@ def test_replays_results_and_entries_are_short_and_tables_in_a_notebook(world: P
         for nees in shown.metrics.pivot_table("value", "quantity", "estimator", "median").loc["nees"]:
             assert f" {nees:.4g} (" in text
             assert f"<td>{nees:.4g} (" in page
-    assert done.alarms[0].words in repr(done)
+    assert done.alarms[0].sentence in repr(done)
     assert "<i>" not in saved._repr_html_()
     robot = fl.models["robot"]
     assert repr(robot) == f"robot: {robot.what}"

@@ -33,9 +33,9 @@ def test_its_estimates_are_judged_by_its_own_truth(recording: Path):
 def test_its_innovations_say_which_noise_is_wrong(recording: Path):
     found = fl.diagnose(recording, "theirs")
     first = found.sentences[0]
-    assert (first.kind, first.topic) == ("measurement noise", "/estimates/theirs/robot1/innovation")
-    assert "range_m are" in first.words
-    assert first.words.endswith("its noise is stated too large")
+    assert (first.kind, first.where) == ("measurement noise", "/estimates/theirs/robot1/innovation")
+    assert "range_m are" in first.sentence
+    assert first.sentence.endswith("its noise is stated too large")
     assert run_here("diagnose", str(recording)).code == 0  # its only one
     with pytest.raises(BadInput, match="theirs was recorded and takes no settings"):
         fl.diagnose(recording, "theirs", set={"sigma_range_m": 1.0})

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps
 from fuselog.pipeline.output.report.evidence import findings
@@ -21,6 +20,7 @@ from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
 from fuselog.pipeline.output.report.story import Story, gauge, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result
 from fuselog.pipeline.output.words import MINUS, is_error
+from fuselog.recorders.checks.finding import Finding
 from fuselog.replay.judging.errors.differences import dominating
 from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.judging.verdicts import Squares
@@ -30,7 +30,7 @@ def _told(
     runs: dict[str, dict[str, list[float]]],
     bounds: dict[str, tuple[float, float]] | None = None,
     timings: dict[str, dict[str, float]] | None = None,
-    alarms: Sequence[Alarm] = (),
+    alarms: Sequence[Finding] = (),
 ) -> Story:
     """The story of estimators whose quantities in every run are given."""
     rows = pd.concat(
@@ -393,9 +393,9 @@ def test_what_the_checks_of_a_replay_find_is_doubtful_in_words() -> None:
     """Each kind with its estimators, once; of few runs what they leave open."""
     rows = {label: {"position_rmse_m": [1.0 + size] * 2} for size, label in enumerate("ab")}
     alarms = [
-        Alarm("origin", "a", "robot1", 9.0, "..."),
-        Alarm("origin", "a", "robot2", 8.0, "..."),
-        Alarm("unused", "b", "", 2.0, "..."),
+        Finding("origin", "a", "robot1", 9.0, "..."),
+        Finding("origin", "a", "robot2", 8.0, "..."),
+        Finding("unused", "b", "", 2.0, "..."),
     ]
     assert _told(rows, alarms=alarms).doubts == [
         "the error of a, most of which is constant: truth and estimate may have other origins",

@@ -17,20 +17,20 @@ import pytest
 
 import fuselog as fl
 from fuselog.pipeline.command_line import main
-from fuselog.recorders.linting.lint import lint, lint_log
-from fuselog.recorders.linting.magnetic import FIELD, units
-from fuselog.recorders.linting.names import frames
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.lint import lint
+from fuselog.recorders.checks.magnetic import FIELD, units
+from fuselog.recorders.checks.names import frames
 from fuselog.recorders.log import (
     LogWriter,
     RunMetadata,
     Stream,
     make_stream,
-    open_log,
     schemas,
     write_log,
 )
 from fuselog.recorders.log.impossible import YEAR_NS
-from fuselog.recorders.plausibility.finding import Finding
+from fuselog.recorders.parameters import parse_settings
 from fuselog.recorders.recording import import_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
@@ -220,7 +220,7 @@ def test_a_field_at_the_ends_of_the_earths_is_the_earths() -> None:
         (0.671, "is in no unit"),
     ):
         level = replace(stream, columns={**stream.columns, FIELD: np.tile([norm, 0.0, 0.0], (600, 1))})
-        told = [each.words for each in units(level, {})]
+        told = [each.evidence for each in units(level, {})]
         assert [words in each for each in told] == [True] * bool(words), norm
 
 
@@ -251,7 +251,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "",
     ),
     "jitter": (stamps(IMU, scattered), IMU, "stamps", "scatter"),
-    "clock 2 % fast": (stamps(IMU, lambda t: 1.02 * t, logged=False), IMU, "clock", "gains"),
+    "clock 2 % fast": (stamps(IMU, lambda t: 1.02 * t, logged=False), IMU, "clock drift", "gains"),
     "leap seconds": (stamps(FIX, lambda t: t + 18 * 10**9, logged=False), FIX, "delay", "18 s ahead of"),
     "TAI": (stamps(FIX, lambda t: t + 37 * 10**9, logged=False), FIX, "delay", "TAI"),
     "time zone": (
@@ -295,7 +295,14 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "integers": (column(FIX, "latitude_deg", lambda x: 1e7 * x), FIX, "place", "integers of 1e-7"),
     "frozen": (force(setting(100, 300, 0.1, 0)), IMU, "values", "frozen at 0.1 for 200"),
     "saturated": (column(IMU, "turn_rate_radps", saturating), IMU, "values", "end of a range"),
-    "clock 1e-4 fast": (drifting, FIX, "clock", "gains 100 us a second"),
+    "clipped": (
+        column(IMU, "turn_rate_radps", lambda w: np.clip(w, -0.015, 0.015)),
+        IMU,
+        "values",
+        "its greatest value",
+    ),
+    "silent": (rows(IMU, lambda n: np.r_[0:3000, 3100:n]), IMU, "gap", "is silent for 1.0"),
+    "clock 1e-4 fast": (drifting, FIX, "clock drift", "gains 100 us a second"),
     "wheels, latitude 8": (exchanged, FIX, "place", "exchanged: so fixes move 1"),
     "sea and ellipsoid": (
         lambda s: column("/second", "altitude_m", lambda h: h - 47.0)(driving(s)),
@@ -337,8 +344,8 @@ def missed(name: str, seed: int) -> str:
     """What is said of a fault that is put in, where it is not what is to be said; else nothing."""
     _, topic, cause, words = FAULTS[name]
     found = found_of(name, seed)
-    is_told = any((each.cause, each.topic) == (cause, topic) and words in each.words for each in found)
-    return "" if is_told else f"{name}, seed {seed}: {[each.words for each in found]}"
+    is_told = any((each.kind, each.where) == (cause, topic) and words in each.evidence for each in found)
+    return "" if is_told else f"{name}, seed {seed}: {[each.evidence for each in found]}"
 
 
 def test_clean_logs_have_no_finding() -> None:
@@ -370,14 +377,11 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
         for part in (slice(0, 5000), slice(5000, None)):  # a chunk each
             writer.write([imu.take(part)])
         writer.describe(RunMetadata("test"))
-    for module in ("fuselog.recorders.linting.lint", "fuselog.pipeline.api.linting"):
-        monkeypatch.setattr(f"{module}.BLOCK", 1000)
-    monkeypatch.setattr("fuselog.recorders.linting.lint.MOST", 0)
-    for found in (fl.lint(tmp_path / "log.mcap"), lint_log(open_log(tmp_path / "log.mcap"))):
-        [words] = [each.words for each in found if "years" in each.words]
-        assert words.startswith(
-            f"{IMU}: 1000 of its 1000 stamps are years from most messages of the log"
-        )
+    monkeypatch.setattr("fuselog.replay.engine.streams.linting.BLOCK", 1000)
+    monkeypatch.setattr("fuselog.recorders.checks.lint.MOST", 0)
+    found = fl.lint(tmp_path / "log.mcap")
+    [words] = [each.evidence for each in found if "years" in each.evidence]
+    assert words.startswith(f"{IMU}: 1000 of its 1000 stamps are years from most messages of the log")
     assert main(["info", str(tmp_path / "log.mcap")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years from these" in said
@@ -385,16 +389,16 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
 
 def test_rows_that_are_there_twice_are_counted() -> None:
     twice = np.r_[0:50, 49, 50:70, 69, 70:80]
-    [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.cause == "stamps"]
+    [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.kind == "stamps"]
     assert found.value == 2.0
-    assert "2 of its 82 messages are there twice" in found.words
+    assert "2 of its 82 messages are there twice" in found.evidence
 
 
 def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
     """Ten samples get one stamp: they repeat, and their unit is right."""
     [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
-    assert "have the stamp of the one before" in found.words
-    assert "estimators take the mean of both; deployed filters and those of others" in found.words
+    assert "have the stamp of the one before" in found.evidence
+    assert "estimators take the mean of both; deployed filters and those of others" in found.evidence
     unit = clean(1)[IMU]
     stamps_ns = unit.publish_time_ns // 10**8 * 10**8
     wheels = make_stream(
@@ -405,7 +409,7 @@ def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
         turn_radps=unit["turn_rate_radps"][:, 1],
     )
     [found] = lint([{"/odometry": wheels}])
-    assert "the first of both holds for no time, and has no effect" in found.words
+    assert "the first of both holds for no time, and has no effect" in found.evidence
 
 
 def test_what_is_missing_is_not_frozen() -> None:
@@ -416,7 +420,7 @@ def test_what_is_missing_is_not_frozen() -> None:
 
     stopping = column(IMU, "turn_rate_radps", stop)
     streams = stopping(clean(1))
-    assert not [each for each in lint([streams]) if "frozen" in each.words]
+    assert not [each for each in lint([streams]) if "frozen" in each.evidence]
 
 
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:
@@ -425,8 +429,8 @@ def test_a_frames_name_says_how_its_axes_are_turned() -> None:
         ("odom_ned", "east, north, up", "exchange north and east"),
     ):
         [found] = frames(replace(clean(1)[IMU], metadata={"frame_id": frame}), {})
-        assert found.words.endswith(f"fuselog have {ours}"), frame
-        assert mend in found.mapping, frame
+        assert found.evidence.endswith(f"fuselog have {ours}"), frame
+        assert mend in found.otherwise, frame
 
 
 def test_the_share_that_is_lost_is_the_sheets() -> None:
@@ -434,7 +438,7 @@ def test_the_share_that_is_lost_is_the_sheets() -> None:
     rng = np.random.Generator(np.random.Philox(key=901))
     rng.standard_normal(6000), rng.standard_normal((6000, 3))
     [found] = lint([{IMU: streams[IMU].take(rng.random(6000) < 0.5)}])
-    assert (found.cause, round(found.value, 6)) == ("lost messages", 0.512641)
+    assert (found.kind, round(found.value, 6)) == ("lost messages", 0.512641)
 
 
 @pytest.mark.paper
@@ -442,15 +446,15 @@ def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None
     """From the file, as the command's --set reads it."""
     advised = 0
     for name, (put, topic, cause, words) in FAULTS.items():
-        of_fault = [each for each in found_of(name, 1) if each.cause == cause and words in each.words]
-        told = [each for each in of_fault if each.key]
+        of_fault = [each for each in found_of(name, 1) if each.kind == cause and words in each.evidence]
+        told = [each for each in of_fault if each.setting]
         if not told:
             continue
         path = tmp_path / f"{advised}.mcap"
         write_log(path, list(put(clean(1)).values()), RunMetadata("made", epoch_ns=BEGIN_NS))
         advised += 1
-        mended = fl.lint(path, set={told[0].key: told[0].setting})
-        assert not [each for each in mended if each.cause == cause and each.topic == topic], name
+        mended = fl.lint(path, set=parse_settings([told[0].setting]))
+        assert not [each for each in mended if each.kind == cause and each.where == topic], name
     assert advised == 14
 
 
@@ -486,14 +490,14 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
 def test_every_line_of_a_mapping_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     advised = []
     for name, (put, topic, cause, words) in FAULTS.items():
-        told = [each for each in found_of(name, 1) if each.cause == cause and words in each.words]
-        advice = told[0].mapping
+        told = [each for each in found_of(name, 1) if each.kind == cause and words in each.evidence]
+        advice = told[0].otherwise
         if "in the mapping" not in advice or name == "a frame's name":  # whose bag's mapping it is of
             continue
         advised.append(name)
         run = put(clean(1))
         mended = lint([{**run, topic: imported(tmp_path, run[topic], advice)}])
-        assert not [each for each in mended if (each.cause, each.topic) == (cause, topic)], name
+        assert not [each for each in mended if (each.kind, each.where) == (cause, topic)], name
     assert len(advised) == 22
 
 
@@ -506,7 +510,8 @@ def test_the_command_says_by_its_exit_code_what_it_found(
     assert (main(["lint", str(good)]), main(["lint", str(tmp_path / "no.mcap")])) == (0, 2)
     capsys.readouterr()
     assert main(["lint", str(bad), "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["findings"][0]["setting"] == 9.807
+    [found] = json.loads(capsys.readouterr().out)["findings"]
+    assert found["setting"] == "/imu.specific_force_scale=9.807"
     assert main(["info", str(bad)]) == 0
     assert "implausible: /imu: specific_force_mps2 is in g" in capsys.readouterr().out
 
@@ -514,7 +519,7 @@ def test_the_command_says_by_its_exit_code_what_it_found(
 if __name__ == "__main__":
     for seed in range(1, 101):
         for each in lint([clean(seed)]):
-            print("clean", seed, each.words)
+            print("clean", seed, each.evidence)
     for name in FAULTS:
         misses = list(filter(None, (missed(name, seed) for seed in range(1, 101))))
         print(f"{name}: {100 - len(misses)} of 100 {misses[:1]}")

@@ -20,14 +20,14 @@ from fuselog.pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
+from fuselog.recorders.checks.body import Series, bodies
+from fuselog.recorders.checks.lint import compared
+from fuselog.recorders.checks.motion import BodyMotion, Forces, Lag
+from fuselog.recorders.checks.speeds import scatter
+from fuselog.recorders.checks.timing import Timing
+from fuselog.recorders.checks.turns import _by_forces
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.models.orientation import compose
-from fuselog.recorders.plausibility.body import Series, bodies
-from fuselog.recorders.plausibility.checks import findings
-from fuselog.recorders.plausibility.motion import BodyMotion, Forces, Lag
-from fuselog.recorders.plausibility.speeds import scatter
-from fuselog.recorders.plausibility.timing import Timing
-from fuselog.recorders.plausibility.turns import _by_forces
 from fuselog.recorders.recording import record_run
 from fuselog.recorders.simulators.car import arcs
 from tests.pipeline.test_planes import HERE, car
@@ -47,7 +47,7 @@ FOUND = {  # of car D with its compass: cause, topic and setting that are named 
     "degrees as radians": ("unit", "/car/odometry", "/car/odometry.turn_scale"),
     "gyro bias .02": None,
     "gyro bias .0004 t": None,
-    "odometry clock 6 % fast": ("clock", "/car/odometry", "/car/odometry.clock_gain"),
+    "odometry clock 6 % fast": ("clock drift", "/car/odometry", "/car/odometry.clock_gain"),
     "fixes 18 s late": ("delay", "/car/fix", "/car/fix.delay_s"),
     "half of the odometry lost": ("lost messages", "/car/odometry", ""),
     "gyro density / 5": None,
@@ -80,7 +80,7 @@ def test_a_winding_road_at_a_steady_speed_says_nothing() -> None:
     """
     for seed in (0, 1, 4, 7, 18, 24):
         odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
-        assert not findings({each.topic: each for each in (odometry, fix)})
+        assert not compared({each.topic: each for each in (odometry, fix)})
 
 
 def winding(seed: int, period_s: float, late_s: float, speed_period_s: float) -> dict[str, Stream]:
@@ -129,11 +129,11 @@ def test_no_delay_is_named_that_is_a_period_off(
     """Nor one that is off by more than is stated; at random, most drives tell theirs."""
     named = 0
     for seed in range(4):
-        found = findings(winding(seed, period_s, late_s, speed_period_s))
-        assert {each.cause for each in found} <= {"delay"}
+        found = compared(winding(seed, period_s, late_s, speed_period_s))
+        assert {each.kind for each in found} <= {"delay"}
         for each in found:
-            [spread_s] = re.findall(r"give or take (\S+) s:", each.words)
-            value_s = each.value if each.topic == "/fix" else -each.value
+            [spread_s] = re.findall(r"give or take (\S+) s:", each.evidence)
+            value_s = each.value if each.where == "/fix" else -each.value
             assert value_s == pytest.approx(late_s, abs=float(spread_s))
             assert float(spread_s) < 0.5
             named += 1
@@ -160,12 +160,12 @@ def test_a_receiver_that_jumps_is_named_and_not_the_wheels(
     since_s = 1e-9 * (right.publish_time_ns - right.publish_time_ns[0])
     moved = right["position_m"] + np.outer((since_s > 25.0) & (since_s < 33.0), off_m)
     streams[right.topic] = replace(right, columns={**right.columns, "position_m": moved})
-    assert {(each.cause, each.topic) for each in findings(streams)} <= {("place", right.topic)}
-    assert not findings({**streams, right.topic: right})
+    assert {(each.kind, each.where) for each in compared(streams)} <= {("place", right.topic)}
+    assert not compared({**streams, right.topic: right})
     if np.hypot(*off_m) > 5.0:
-        [found] = findings(streams)
+        [found] = compared(streams)
         assert found.value == pytest.approx(np.hypot(*off_m), abs=1.5)
-        assert "at 25.2 s" in found.words or "at 33.0 s" in found.words
+        assert "at 25.2 s" in found.evidence or "at 33.0 s" in found.evidence
 
 
 @pytest.mark.parametrize("name", SHEET)
@@ -188,8 +188,8 @@ def test_ratios_slopes_scatter_and_lags_are_those_of_the_sheet(name: str) -> Non
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_of_car_d_is_named_first_or_none(name: str) -> None:
-    told = findings(recorded(faulty(2003, name)).streams)
-    found = [(each.cause, each.topic, each.key) for each in told]
+    told = compared(recorded(faulty(2003, name)).streams)
+    found = [(each.kind, each.where, each.setting.partition("=")[0]) for each in told]
     wanted = FOUND[name]
     if name != "sd written as variance":
         assert found == ([] if wanted is None else [wanted])
@@ -209,7 +209,7 @@ def test_each_fault_of_the_inertial_unit_is_all_that_is_named(name: str, seed: i
 @pytest.mark.parametrize("scenario", ["landmarks", "navigation", "orientation", "vehicles"])
 def test_scenarios_have_no_findings(scenario: str) -> None:
     recording, _ = record_run(scenario, {}, seed=5)
-    assert findings({each.topic: each for each in recording.streams}) == []
+    assert compared({each.topic: each for each in recording.streams}) == []
 
 
 def inertial(stamps_s: np.ndarray, force: np.ndarray) -> dict[str, Stream]:
@@ -231,9 +231,9 @@ def test_loss_is_told_from_jitter() -> None:
         stamps = 1.0 + 0.01 * np.arange(6000) + 1e-4 * rng.standard_normal(6000)
         force = [0.0, 0.0, 9.81] + 0.05 * rng.standard_normal((6000, 3))
         kept = rng.random(6000) < 0.5
-        assert findings(inertial(stamps, force)) == []
-        [found] = findings(inertial(stamps[kept], force[kept]))
-        assert (found.cause, found.value) == ("lost messages", pytest.approx(lost, abs=1e-6))
+        assert compared(inertial(stamps, force)) == []
+        [found] = compared(inertial(stamps[kept], force[kept]))
+        assert (found.kind, found.value) == ("lost messages", pytest.approx(lost, abs=1e-6))
 
 
 def test_quaternions_in_another_order_are_told_by_turn_rates() -> None:
@@ -262,9 +262,9 @@ def test_quaternions_in_another_order_are_told_by_turn_rates() -> None:
         streams["/orientation"] = make_stream(
             "/orientation", schemas.ORIENTATION, stamps_ns, quaternion=factor * quaternion[:, order]
         )
-        found = findings(streams)
+        found = compared(streams)
         assert len(found) == len(told)
-        assert all(words in each.words for words, each in zip(told, found, strict=True))
+        assert all(words in each.evidence for words, each in zip(told, found, strict=True))
 
 
 def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
@@ -272,10 +272,10 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
     twice = wheels.take(np.sort(np.concatenate([np.arange(len(wheels)), [7, 7]])))
     slow = replace(wheels, log_time_ns=(1.01 * wheels.publish_time_ns).astype(np.int64))
     rest = {each.topic: each for each in others}
-    [found] = findings({wheels.topic: twice, **rest})
-    assert found.words.startswith("/car/odometry: 2 of its 1002 messages are there twice")
-    [found] = findings({wheels.topic: slow, **rest})
-    assert (found.cause, found.topic) == ("clock", "/car/odometry")
+    [found] = compared({wheels.topic: twice, **rest})
+    assert found.evidence.startswith("/car/odometry: 2 of its 1002 messages are there twice")
+    [found] = compared({wheels.topic: slow, **rest})
+    assert (found.kind, found.where) == ("clock drift", "/car/odometry")
 
 
 def test_a_topic_is_moved_onto_the_clock_that_fits_it() -> None:
@@ -354,7 +354,7 @@ def test_errors_that_are_not_white_say_nothing_of_their_variance() -> None:
     place = slow["position_m"].copy()
     place[rows] = np.cumsum(place[rows] * 0.15, axis=0)
     drifting = replace(slow, columns={**slow.columns, "position_m": place})
-    assert findings({**clean.streams, "/car/fix": drifting}) == []
+    assert compared({**clean.streams, "/car/fix": drifting}) == []
 
 
 def test_the_bias_of_forces_is_what_they_say_at_rest() -> None:
@@ -407,11 +407,11 @@ def test_a_unit_upside_down_is_one_finding() -> None:
         ),
         make_stream("/odometry", schemas.ODOMETRY, stamps_ns, forward_mps=0.8 + zero, turn_radps=turn),
     ]
-    [found] = findings({each.topic: each for each in streams})
-    assert (found.cause, found.topic, found.key) == ("gravity", "/imu", "/imu.turn_rate_z_scale")
+    [found] = compared({each.topic: each for each in streams})
+    assert (found.kind, found.where, found.setting) == ("gravity", "/imu", "/imu.turn_rate_z_scale=-1")
     streams[1] = replace(streams[1], columns={**streams[1].columns, "turn_rate_radps": rate})
-    [alone] = findings({each.topic: each for each in streams})
-    assert (alone.cause, alone.key) == ("gravity", "/imu.specific_force_z_scale")
+    [alone] = compared({each.topic: each for each in streams})
+    assert (alone.kind, alone.setting) == ("gravity", "/imu.specific_force_z_scale=-1")
 
 
 def test_fixes_that_go_astray_slowly_and_jump_back_tell_no_delay() -> None:
@@ -425,4 +425,4 @@ def test_fixes_that_go_astray_slowly_and_jump_back_tell_no_delay() -> None:
         np.where(since_s < 33.0, np.clip((since_s - 25.0) / 8.0, 0.0, 1.0), 0.0), [12, 5]
     )
     streams["/robot1/fix"] = replace(fix, columns={**fix.columns, "position_m": place})
-    assert [each.cause for each in findings(streams)] == ["place"]
+    assert [each.kind for each in compared(streams)] == ["place"]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from fuselog.recorders.linting.lint import lint
+from fuselog.recorders.checks.lint import lint
 from tests.recorders.strange_tables import draw, imported, judge
 
 
@@ -71,7 +71,7 @@ def _linted(folder: Path, columns: dict[str, Any], table: str, *streams: str) ->
     pd.DataFrame({**COLUMNS, **columns}).to_csv(path, index=False)
     stream = "".join(f"[[tables.streams]]\n{each}\n" for each in streams)
     mapping.write_text(f"[[tables]]\nfiles = 'own.csv'\n{table}\n{stream}")
-    return "\n".join(each.mended for each in lint([imported(path, mapping)]))
+    return "\n".join(each.sentence for each in lint([imported(path, mapping)]))
 
 
 TIME = "time = { column = 't' }"

@@ -19,11 +19,10 @@ from fuselog.pipeline.diagnosing.battery.car import (
     ride,
 )
 from fuselog.pipeline.diagnosing.causes import Cause, seek
-from fuselog.pipeline.diagnosing.findings import FIRST, without_filter
-from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Kind
+from fuselog.pipeline.diagnosing.findings import FIRST, is_told, of_log
 from fuselog.pipeline.runs.ensemble import Progress
-from fuselog.recorders.plausibility.checks import findings
-from fuselog.recorders.plausibility.finding import Cause as Estimated
+from fuselog.recorders.checks.finding import Kind
+from fuselog.recorders.checks.lint import compared
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
@@ -88,7 +87,7 @@ SPREADS: dict[str, tuple[float, float]] = {
     "compass + 4.5 deg": (0.00165, np.nan),
 }
 # Of the unit's faults: what is told, of which topic, and the number.
-UNIT_RIGHT: dict[str, tuple[Estimated, str, float] | None] = {
+UNIT_RIGHT: dict[str, tuple[Kind, str, float] | None] = {
     "nothing": None,
     "accelerometer in g": ("gravity", UNIT, 1.0 / 9.80665),
     "gravity's sign": ("gravity", UNIT, -1.0),
@@ -136,13 +135,13 @@ def cells(*, has_prior: bool = False) -> Iterator[Cell]:
 def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     """Plant a fault, and look for the likeliest causes, so many at most."""
     log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
-    of_log = without_filter(log, list(log.streams))
+    seen = [each for each in of_log(log, list(log.streams)) if is_told(each)]
     found = seek(log, "ekf", OPEN, most)
     causes = [list(named_by(cause)) for cause in found.causes]
     known = {one.topic for each in causes for one in each}
-    lost = [[Right(each.kind, each.topic)] for each in of_log if each.kind in FIRST]
-    others = [each for each in of_log if each.kind not in FIRST and each.topic not in known]
-    named = [*lost, *causes, *([Right(each.kind, each.topic)] for each in others)]
+    lost = [[Right(each.kind, each.where)] for each in seen if each.kind in FIRST]
+    others = [each for each in seen if each.kind not in FIRST and each.where not in known]
+    named = [*lost, *causes, *([Right(each.kind, each.where)] for each in others)]
     right = [each[:3] for each in RIGHT[cell.fault]]
     places = [any(one[:3] in right for one in each) for each in named]
     value, gain = np.nan, np.nan
@@ -171,9 +170,9 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
 
 def unit_tried(fault: str, seed: int) -> dict[str, Any]:
     """Plant a fault into the unit's log, and see whether it is what is told without a filter."""
-    found = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
+    found = compared(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
     right = UNIT_RIGHT[fault]
-    named = [(each.cause, each.topic) for each in found]
+    named = [(each.kind, each.where) for each in found]
     return {
         "fault": fault,
         "seed": seed,

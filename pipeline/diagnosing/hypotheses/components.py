@@ -12,12 +12,12 @@ from fuselog.pipeline.altering.entries import Entry, entries_of
 from fuselog.pipeline.diagnosing.advice import Advice, number, precise, rounded
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     Hypothesis,
-    Kind,
     in_sense,
     in_topic,
     supposed,
     value_of,
 )
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.units import mistaken, unit_of

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,33 +11,11 @@ from numpy.typing import NDArray
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.advice import Advice, number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters, field_of
 from fuselog.replay.engine import chi2
 
-Kind = Literal[
-    "measurement noise",
-    "process noise",
-    "factor or sign",
-    "bias or turned frame",
-    "drifting bias",
-    "parameter",
-    "exchanged axes",
-    "convention",
-    "delay",
-    "clock drift",
-    "exchanged numbers",
-    "start",
-    "outliers",
-    "lost messages",
-    "stamps",
-    "values",
-    "gate",
-    "covariance floor",
-    "divergence",
-    "unseen error",
-    "unnamed",
-]
 Number = Any  # a float; of a fault of several numbers a tuple of floats
 NOISES = ("measurement noise", "process noise")
 COMPONENTS = 3  # of a measurement, hardly more

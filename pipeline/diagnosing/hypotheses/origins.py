@@ -6,8 +6,9 @@ import numpy as np
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.advice import Advice, number, precise
-from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind
+from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.log.planes import Origin, stated_in
 from fuselog.recorders.models.geodesy import out_of_tangent_plane

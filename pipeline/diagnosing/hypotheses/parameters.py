@@ -15,7 +15,6 @@ from fuselog.pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     SCALES,
     Hypothesis,
-    Kind,
     has,
     size_of,
     supposed,
@@ -24,6 +23,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 from fuselog.pipeline.diagnosing.likelihood import Trial
 from fuselog.pipeline.tuning.objective import with_values
 from fuselog.pipeline.tuning.tuning import value_at_start
+from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 from fuselog.pipeline.output.alarming import dominating_run
-from fuselog.pipeline.output.alarms import Alarm, Cause, Stressing
+from fuselog.pipeline.output.alarms import Cause, Stressing
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
     Evidence,
@@ -29,6 +29,7 @@ from fuselog.pipeline.output.words import (
     quantity,
     scale,
 )
+from fuselog.recorders.checks.finding import Finding
 from fuselog.replay.judging.diagnostics import LEAST_SHARE
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
@@ -130,7 +131,7 @@ def story(
     found: Findings,
     causes: Sequence[Cause] = (),
     timings: Timings | None = None,
-    alarms: Sequence[Alarm] = (),
+    alarms: Sequence[Finding] = (),
     *,
     at_best: bool = False,
 ) -> Story:
@@ -509,7 +510,7 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
 # What is doubtful
 
 
-def doubts_of(found: Findings, alarms: Sequence[Alarm], take: str, equal: Sequence[str]) -> list[str]:
+def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequence[str]) -> list[str]:
     """Return what is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
@@ -531,7 +532,7 @@ def named(labels: Sequence[str], among: int = 0) -> str:
     return listed(list(labels))
 
 
-def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
+def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
     """Say whose covariances are not right, by what."""
     verdicts = {label: each.verdict for label, each in found.of.items()}
     sentences = []
@@ -544,7 +545,7 @@ def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
             of = named(whose, len(found.labels))
             sentences.append(f"the covariances of {of}, which are too {size}")
     for kind, what in _OF_COVARIANCES.items():
-        whose = [each.estimator for each in alarms if each.kind == kind]
+        whose = [each.where for each in alarms if each.kind == kind]
         little = [
             label for label in dict.fromkeys(whose) if verdicts.get(label) == Consistency.CONSISTENT
         ]
@@ -555,12 +556,12 @@ def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
     return sentences
 
 
-def _of_checks(alarms: Sequence[Alarm]) -> list[str]:
+def _of_checks(alarms: Sequence[Finding]) -> list[str]:
     """Say what else the checks of a replay found."""
     whose: dict[str, list[str]] = {}
     for each in alarms:
         if each.kind in _CHECKS:
-            whose.setdefault(each.kind, []).append(each.estimator)
+            whose.setdefault(each.kind, []).append(each.where)
     return [_CHECKS[kind](named(list(dict.fromkeys(filter(None, of))))) for kind, of in whose.items()]
 
 

@@ -96,6 +96,6 @@ def test_a_replay_says_what_rounding_has_left(variance: float, is_lost: bool, un
     done = fl.replay(
         fl.Recording([prior, seen], epoch_ns=10**9), {"ekf": fl.modelled(sum_of_two(variance), "ekf")}
     )
-    digits = [each.words for each in done.alarms if each.kind == "digits"]
+    digits = [each.sentence for each in done.alarms if each.kind == "digits"]
     assert bool(digits) == is_lost
     assert all("covariance" in each and "samples" in each for each in digits)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from fuselog.pipeline.output.alarming import NIS, alarms_of
-from fuselog.pipeline.output.alarms import Alarm
 from fuselog.pipeline.output.coverage import sentences
 from fuselog.pipeline.output.terminal import print_others, print_worst
+from fuselog.recorders.checks.finding import Finding
 from fuselog.replay.engine.replaying.usage import EARLY, SILENT, UNTAKEN, Row
 from fuselog.replay.judging.consistency.conditioning import Conditioning
 from fuselog.replay.judging.errors.constant import Constant
@@ -126,14 +126,14 @@ def measurements() -> Iterator[str]:
 def many() -> Iterator[str]:
     """How many alarms are printed."""
     for count in (0, 1, 5, 6):
-        alarms = [Alarm("errors", "ekf", "", 1.0, f"alarm {number}") for number in range(1, count + 1)]
+        alarms = [Finding("errors", "ekf", "", 1.0, f"alarm {number}") for number in range(1, count + 1)]
         yield f"{count}:"
         yield from printed(lambda given: (print_worst(given), print_others(given)), alarms)
 
 
 def _words(judge: Any, parameters: Any = None, coverage: Any = ()) -> Iterator[str]:
     for alarm in alarms_of(judge, parameters or {}, coverage):
-        yield f"  {alarm.kind}, {alarm.excess:.4g} times: {alarm.words}"
+        yield f"  {alarm.kind}, {alarm.value:.4g} times: {alarm.sentence}"
 
 
 def _sums(messages: int, accepted: int, squared: float) -> Any:

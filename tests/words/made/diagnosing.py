@@ -12,13 +12,15 @@ from fuselog.pipeline.diagnosing.battery.car import faulty, recorded
 from fuselog.pipeline.diagnosing.causes import Cause
 from fuselog.pipeline.diagnosing.consistency import unnamed, unseen_errors
 from fuselog.pipeline.diagnosing.diagnosis import Diagnosis
-from fuselog.pipeline.diagnosing.findings import Finding, of_estimates, of_innovations, of_messages
+from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.components import of_components
 from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.sentences import notes_of, ranked
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.lint import lint
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.replay.engine.replaying.estimator import bind
 
@@ -89,10 +91,10 @@ def advice() -> Iterator[str]:
 
 def order() -> Iterator[str]:
     """What stands before what: stamps, then causes, or what they are a consequence of, then the rest."""
-    stamps = Finding("stamps", "/fix", "/fix: stamps")
-    unit = Finding("values", "/odometry", "/odometry: a unit", None, "/odometry.x_scale=2.0")
-    known = Finding("values", "/odometry", "/odometry: a value")
-    other = Finding("values", "/other", "/other: a value")
+    stamps = Finding("stamps", "/fix", "", 1.0, "/fix: stamps")
+    unit = Finding("unit", "/odometry", "x", 2.0, "/odometry: a unit", "/odometry.x_scale=2.0")
+    known = Finding("values", "/odometry", "x", 1.0, "/odometry: a value")
+    other = Finding("values", "/other", "x", 1.0, "/other: a value")
     for kind in ("measurement noise", "process noise", "delay", "factor or sign", "outliers"):
         hypothesis = Hypothesis(
             kind,
@@ -111,7 +113,7 @@ def order() -> Iterator[str]:
             rest = None if len(of_log) > 1 else lambda _: ", and 12 over the rest of the log"
             said = ranked([cause], of_log, TRYING, rest)
             yield from (
-                f"  {place}. {each.words} [{each.setting}]" for place, each in enumerate(said, 1)
+                f"  {place}. {each.sentence} [{each.setting}]" for place, each in enumerate(said, 1)
             )
     yield "in one half alone:"
     for of_halves in ((-11.6, 250.0), (250.0, -1.93), (250.0, -1.91)):
@@ -122,12 +124,16 @@ def order() -> Iterator[str]:
     yield from (f"  {each}" for each in notes_of(judge, [], [doubt]))
     yield "advised already:"
     found = ranked([], [unit, other], TRYING, None)
-    yield from (f"  {each.words}" for each in found)
+    yield from (f"  {each.sentence}" for each in found)
 
 
 def told() -> Iterator[str]:
     """Nothing found: with faults that were tried, and with none; something found."""
-    for tried, sentences in ((range(28), []), ([], []), ([], [SimpleNamespace(words="a sentence")] * 2)):
+    for tried, sentences in (
+        (range(28), []),
+        ([], []),
+        ([], [SimpleNamespace(sentence="a sentence")] * 2),
+    ):
         made: Any = SimpleNamespace(sentences=sentences, tried=tried, least_gain=6.37)
         made.hypotheses = Diagnosis.hypotheses.fget(made)  # type: ignore[attr-defined]
         yield from Diagnosis.told.fget(made)  # type: ignore[attr-defined]
@@ -151,7 +157,7 @@ def innovations() -> Iterator[str]:
     ):
         stream = _innovations(nis, kept, np.full(400, 7))
         found = of_innovations({stream.topic: stream}, 0.999, -SECOND_NS, has_outliers=has_outliers)
-        yield f"{name}: {' / '.join(each.words for each in found) or 'nothing'}"
+        yield f"{name}: {' / '.join(each.sentence for each in found) or 'nothing'}"
 
 
 def messages() -> Iterator[str]:
@@ -172,7 +178,8 @@ def messages() -> Iterator[str]:
         ("coarse", _fixes(np.round(_walk(3000) / 2.0) * 2.0)),
         ("fine", _fixes(np.round(_walk(3000) * 20.0) / 20.0)),
     ):
-        yield f"{name}: {' / '.join(each.words for each in of_messages([stream], 0)) or 'nothing'}"
+        found = lint([{stream.topic: stream}])
+        yield f"{name}: {' / '.join(each.sentence for each in found) or 'nothing'}"
 
 
 def floors() -> Iterator[str]:
@@ -189,7 +196,7 @@ def floors() -> Iterator[str]:
             mean=np.zeros((200, 1)),
             covariance=variance[:, None],
         )
-        said = [each.words for each in of_estimates({stream.topic: stream})]
+        said = [each.sentence for each in of_estimates({stream.topic: stream})]
         yield f"{name}: {' / '.join(said) or 'nothing'}"
 
 
@@ -204,11 +211,15 @@ def unexplained() -> Iterator[str]:
         done: Any = SimpleNamespace(judge=judge)
         yield f"NEES {nees:g}, NIS {nis:g}:"
         for has_causes in (False, True):
-            yield from (f"  {each.words}" for each in unseen_errors(done, "ekf", has_causes=has_causes))
+            yield from (
+                f"  {each.sentence}" for each in unseen_errors(done, "ekf", has_causes=has_causes)
+            )
         stream = _innovations(np.full(400, nis), np.ones(400), np.full(400, 7))
         for tried in (28, 0):
-            yield from (f"  {each.words}" for each in unnamed(done, {stream.topic: stream}, tried, []))
-        yield from (f"  no judge: {each.words}" for each in unnamed(done, {}, 28, ["/robot1/truth"]))
+            yield from (
+                f"  {each.sentence}" for each in unnamed(done, {stream.topic: stream}, tried, [])
+            )
+        yield from (f"  no judge: {each.sentence}" for each in unnamed(done, {}, 28, ["/robot1/truth"]))
 
 
 def _walk(count: int) -> Any:

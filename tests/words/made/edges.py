@@ -10,11 +10,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fuselog.recorders.linting import columns, covariances, forces, magnetic, places, stamps
+from fuselog.recorders.checks import (
+    columns,
+    covariances,
+    forces,
+    losses,
+    magnetic,
+    places,
+    speeds,
+    stamps,
+    turns,
+)
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream
-from fuselog.recorders.plausibility import speeds, turns
-from fuselog.recorders.plausibility import stamps as clocks
-from fuselog.recorders.plausibility.finding import Finding
 from tests.words.made.faulty import (
     ROWS,
     UPRIGHT,
@@ -112,21 +120,18 @@ OF_STAMPS = (
     Edge(
         "messages of a clock that gains", lambda n: one(stamps.drift, gaining(1e-4, count=n)), (20, 100)
     ),
-    Edge("the rate of all clocks", lambda g: clocks.drifts({"/imu": gaining(g)}), (1e-4, 1e-2)),
-    Edge("messages of them", lambda n: clocks.drifts({"/imu": gaining(0.1, count=n)}), (20, 100)),
-    Edge("seconds of them", lambda s: clocks.drifts({"/imu": gaining(0.1, span_s=s)}), (5.0, 20.0)),
-    Edge("messages that lack, of 1000", lambda n: one(clocks.losses, lossy(n)), (1, 50)),
-    Edge("every n-th message lacks", lambda n: one(clocks.losses, thinned_out(n)), (400, 4)),
-    *(
-        Edge("a gap of so many", lambda n: one(clocks.losses, gap(n)), ends)
-        for ends in ((20, 300), (300, 1000), (1000, 1300), (1300, 3000))
-    ),
-    Edge("longer steps, of the usual", lambda n: one(clocks.losses, inertial(step_ns=steps(n))), (1, 2)),
-    Edge("these", lambda n: one(clocks.losses, inertial(step_ns=steps(n))), (2, 9)),
+    Edge("the rate of all clocks", lambda g: losses.drifts({"/imu": gaining(g)}), (1e-4, 1e-2)),
+    Edge("messages of them", lambda n: losses.drifts({"/imu": gaining(0.1, count=n)}), (20, 100)),
+    Edge("seconds of them", lambda s: losses.drifts({"/imu": gaining(0.1, span_s=s)}), (5.0, 20.0)),
+    Edge("messages that lack, of 1000", lambda n: one(losses.losses, lossy(n)), (1, 50)),
+    Edge("every n-th message lacks", lambda n: one(losses.losses, thinned_out(n)), (400, 4)),
+    Edge("a gap of so many", lambda n: one(losses.silences, gap(n)), (10, 100)),
+    Edge("longer steps, of the usual", lambda n: one(losses.losses, inertial(step_ns=steps(n))), (1, 2)),
+    Edge("these", lambda n: one(losses.losses, inertial(step_ns=steps(n))), (2, 9)),
     Edge(
-        "steps that are not regular", lambda n: one(clocks.losses, inertial(step_ns=uneven(n))), (1, 120)
+        "steps that are not regular", lambda n: one(losses.losses, inertial(step_ns=uneven(n))), (1, 120)
     ),
-    Edge("messages of which some lack", lambda n: one(clocks.losses, lossy(5, count=n)), (30, 90)),
+    Edge("messages of which some lack", lambda n: one(losses.losses, lossy(5, count=n)), (30, 90)),
 )
 
 
@@ -292,7 +297,7 @@ def _told(edge: Edge) -> str:
 
 def _words(edge: Edge, amount: float) -> str:
     return (
-        " / ".join(f"{each.mended} ({each.cause}, {each.value:.3g})" for each in edge.found(amount))
+        " / ".join(f"{each.sentence} ({each.kind}, {each.value:.3g})" for each in edge.found(amount))
         or "nothing"
     )
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.body import Body, PlaceSeries, Series
+from fuselog.recorders.checks.motion import BodyMotion, Forces, Lag, Slope
+from fuselog.recorders.checks.timing import Timing
 from fuselog.recorders.log import Stream, make_stream, schemas
-from fuselog.recorders.plausibility.body import Body, PlaceSeries, Series
-from fuselog.recorders.plausibility.motion import BodyMotion, Forces, Lag, Slope
-from fuselog.recorders.plausibility.timing import Timing
 
 BEGIN_NS = 1_700_000_000 * 10**9
 

@@ -13,8 +13,8 @@ from fuselog.pipeline.diagnosing.battery.car import (
     recorded_unit,
     ride,
 )
+from fuselog.recorders.checks.lint import compared
 from fuselog.recorders.log import Stream
-from fuselog.recorders.plausibility.checks import findings
 
 
 def of_car() -> Iterator[str]:
@@ -54,7 +54,7 @@ def _logged(stream: Stream, rate: float) -> Stream:
 
 
 def _said(streams: dict[str, Stream]) -> str:
-    return " / ".join(each.mended for each in findings(streams)) or "nothing"
+    return " / ".join(each.sentence for each in compared(streams)) or "nothing"
 
 
 FOUND = (of_car, of_car_without_compass, of_unit, of_stamps)

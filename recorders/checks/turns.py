@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from fuselog.recorders.checks.body import Floats, Series
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.motion import BodyMotion, Slope
+from fuselog.recorders.checks.windows import FEWEST, pairs
 from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.body import Floats, Series
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import BodyMotion, Slope
-from fuselog.recorders.plausibility.windows import FEWEST, pairs
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 
 NEAR_DEGREES = 0.1
@@ -75,7 +75,7 @@ def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) ->
             -1.0,
             f"{course.topic}: its frame is mirrored, as where east and north are exchanged: the course "
             f"turns {ratio.value:.3g} rad for each rad of {source.topic}, which another sensor confirms",
-            mapping=f"in the mapping exchange the columns of {field}",
+            otherwise=f"in the mapping exchange the columns of {field}",
         )
         return
     unless = "" if witness else f", unless the frame of {course.topic} has east and north exchanged"
@@ -92,8 +92,7 @@ def _sign(source: Series, evidence: str) -> Finding:
         -1.0,
         f"{source.topic}: {source.field} has the wrong sign, anticlockwise from above is positive: "
         f"{evidence}",
-        f"{source.topic}.{what}_scale",
-        -1,
+        f"{source.topic}.{what}_scale=-1",
         f"factors.{source.field} = -1 in the mapping",
     )
 
@@ -106,7 +105,7 @@ def _compass(orientation: Series, others: str) -> Finding:
         -1.0,
         f"{orientation.topic}: its heading goes clockwise, as a compass has it, and ours anticlockwise "
         f"from east: {others} the other way round",
-        mapping="in the mapping make it of attitude = { heading = ... }",
+        otherwise="in the mapping make it of attitude = { heading = ... }",
     )
 
 
@@ -134,8 +133,7 @@ def degrees(motion: BodyMotion) -> Iterator[Finding]:
             source.field,
             1.0 / factor,
             f"{source.topic}: {source.field} is {taken}: {evidence}",
-            f"{source.topic}.{what}_scale",
-            digits(factor),
+            f"{source.topic}.{what}_scale={digits(factor)}",
             f'units.{source.field} = "{given}" in the mapping',
         )
 
@@ -166,7 +164,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
                 f"{orientation.topic}: its heading is {np.degrees(mean):.3g} deg anticlockwise of the "
                 f"course ({len(rest)} windows, spread {np.degrees(spread):.2g} deg): by the sensor's "
                 "mounting, or north is magnetic",
-                mapping="in the mapping turn it back, by mounting_deg",
+                otherwise="in the mapping turn it back, by mounting_deg",
             )
 
 
@@ -187,7 +185,7 @@ def mounting(motion: BodyMotion) -> Iterator[Finding]:
                 found.angle_rad,
                 f"{force.topic}: it is mounted turned about the vertical: its horizontal forces are "
                 f"those of the course if turned by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
-                mapping=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
+                otherwise=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
             )
 
 
@@ -211,8 +209,7 @@ def gravity(motion: BodyMotion) -> Iterator[Finding]:
                 force.field,
                 1.0 / scale,
                 f"{force.topic}: {force.field} is in {given}: at rest its length is {norm:.4g}",
-                f"{force.topic}.specific_force_scale",
-                digits(scale),
+                f"{force.topic}.specific_force_scale={digits(scale)}",
                 f'units.{force.field} = "{given}" in the mapping',
             )
         moves = motion.places is not None or motion.courses is not None
@@ -229,8 +226,7 @@ def gravity(motion: BodyMotion) -> Iterator[Finding]:
             -1.0,
             f"{force.topic}: its z axis is down{either}: at rest the force along z is {mean[2]:.4g}, "
             f"where specific force points up{also}",
-            f"{force.topic}.{what}_z_scale",
-            -1,
+            f"{force.topic}.{what}_z_scale=-1",
             f"mounting_deg = [180, 0, 0] in the mapping{more}, if its axes are forward, right, down",
         )
 
@@ -282,7 +278,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
                 off,
                 f"{orientation.topic}: its quaternions are no unit ones: half of their lengths differ "
                 f"from 1 by {off:.3g} and more",
-                mapping="normalise them where the log is written",
+                otherwise="normalise them where the log is written",
             )
             continue
         rates = next(iter(motion.body.rates), None)
@@ -305,7 +301,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
                 errors[stated] / errors[best],
                 f"{orientation.topic}: its quaternions are {best}, read as {stated}: so they turn as "
                 f"{rates.topic} does but for {errors[best]:.2g} rad/s, as they are {errors[stated]:.2g}",
-                mapping="in the mapping name its four columns in the order w, x, y, z",
+                otherwise="in the mapping name its four columns in the order w, x, y, z",
             )
 
 

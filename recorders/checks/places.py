@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.body import bodies
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.motion import BodyMotion, Slope
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.body import bodies
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.motion import BodyMotion, Slope
 
 GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
 STEADY_M = 5.0
@@ -126,7 +126,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             worst_m,
             f"{stream.topic}: its altitude leaps {len(leaps)} times, by up to {abs(worst_m):.4g} m from "
             f"one fix to the next, the first {first_s:.4g} s after its first stamp",
-            mapping="take one altitude throughout, above the ellipsoid or above the sea",
+            otherwise="take one altitude throughout, above the ellipsoid or above the sea",
         )
 
 
@@ -181,9 +181,8 @@ def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                     f"{other.topic}: its altitudes are {abs(by_m):.4g} m "
                     f"{'below' if by_m > 0 else 'above'} "
                     f"those of {stream.topic}: one is above the sea, the other above the ellipsoid",
-                    f"{other.topic}.altitude_bias",
-                    round(-by_m, 3),
-                    sure="hint",
+                    f"{other.topic}.altitude_bias={round(-by_m, 3)}",
+                    severity="hint",
                 )
         if other.schema.full_name in _PLACED and other["position_m"].shape[1] == 3:
             z, height = other["position_m"][:, 2], _at(stream, other.publish_time_ns)
@@ -198,8 +197,7 @@ def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                     -1.0,
                     f"{other.topic}: its z points down (NED), ours up: it falls as the altitude of "
                     f"{stream.topic} rises (correlation {likeness:.3f})",
-                    f"{other.topic}.position_z_scale",
-                    -1,
+                    f"{other.topic}.position_z_scale=-1",
                     "factors.position_m = [1, 1, -1] in the mapping, of north and east exchanged",
                 )
 
@@ -227,6 +225,6 @@ def _place(stream: Stream, value: float, words: str, mapping: str, *, is_fact: b
         "latitude_deg",
         value,
         f"{stream.topic}: {words}",
-        mapping=mapping,
-        sure="fact" if is_fact else "likely",
+        otherwise=mapping,
+        severity="fact" if is_fact else "likely",
     )

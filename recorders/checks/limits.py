@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.geodesy import local_metres
 from fuselog.recorders.models.orientation import heading
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.finding import Finding
 
 FEWEST = 10
 HIGHEST_M, LOWEST_M = 50_000.0, -12_000.0
@@ -212,8 +212,8 @@ def _places(stream: Stream) -> Floats:
 
 
 def _found(stream: Stream, field: str, value: float, words: str, mapping: str) -> Finding:
-    return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", mapping=mapping)
+    return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", otherwise=mapping)
 
 
 def _stamps(stream: Stream, words: str, mapping: str) -> Finding:
-    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", mapping=mapping)
+    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", otherwise=mapping)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.body import Body, Floats, PlaceSeries, Series
 from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.body import Body, Floats, PlaceSeries, Series
 
 SPANS_S = (2.0, 5.0, 10.0)
 FEWEST = 12  # windows, below which nothing is said

@@ -1,14 +1,14 @@
 """Checks single columns: values that freeze, are rounded, or end where the sensor's range does."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.losses import FEWEST, REGULARS, is_measured
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import FEWEST, REGULARS
 
 Floats = NDArray[np.float64]
 LONG, TIMES = 10, 10.0  # rows, and times the usual run, that a value may stay
@@ -17,6 +17,10 @@ MOVING = 0.5  # of the rows of a span, in which another column changes
 LOOKED_AT = 20_000  # rows by which a resolution is told
 LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
 SHARE, ROWS, NEAR = 1e-3, 5, 5e-3
+# Of an end at which values are clipped: its share of the rows, how many times more often it comes than
+# other values do, the number of values, how many times it is reached, and the share of the other rows
+# that differ.
+CLIPPED, MORE_OFTEN, MANY_LEVELS, RUNS, MEASURED = 5e-3, 5.0, 20, 3, 0.9
 # Of a code among values: times the usual step, part of its step that others differ by, and how often.
 ALONE, ALIKE, OFTEN = 20.0, 0.2, 3
 RANGES = {
@@ -57,7 +61,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(length),
                 f"{stream.topic}: {name} is frozen at {column[begin]:.6g} for {length} messages, from "
                 f"{first_s:.4g} s after its first stamp on, where {usual:.3g} are usual and others move",
-                mapping="leave these messages out: fuselog cut LOG --start ... --end ...",
+                otherwise="leave these messages out: fuselog cut LOG --start ... --end ...",
             )
 
 
@@ -91,7 +95,7 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             code,
             f"{stream.topic}: {name} is {code:.6g} in {counts.max()} messages, each far from those "
             "before and after it: a code of a missing value, which is taken for one",
-            mapping="missing = { COLUMN = [...] } in the table of the mapping",
+            otherwise="missing = { COLUMN = [...] } in the table of the mapping",
         )
 
 
@@ -118,38 +122,71 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 f"{stream.topic}: {name} is rounded to {step:.3g}, and its noise is "
                 f"{noise:.2g}: what is "
                 "smaller is lost, and its errors are not white",
-                mapping="write it with more digits, or state a noise of at least "
+                otherwise="write it with more digits, or state a noise of at least "
                 f"{step / np.sqrt(12.0):.2g}",
-                sure="hint",
+                severity="hint",
             )
 
 
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find inertial columns that stand at the end of a usual range."""
-    for field, name, column in _entries(stream):
-        ranges = RANGES.get(field)
-        if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
-            continue
-        for end in (column.max(), column.min()):
-            count = int(np.sum(column == end))
-            if count < max(ROWS, SHARE * len(column)):
+    """Find columns that stand at the end of a usual range, or clipped at an end that is theirs alone.
+
+    What rests at its end rests in all of its columns; exact zeros are standstills.
+    """
+    entries = list(_entries(stream, is_regular=False))
+    for field, name, column in entries:
+        levels, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+        for at in (-1, 0) if len(levels) > 1 else ():
+            end, count = float(levels[at]), int(counts[at])
+            if count < max(ROWS, SHARE * len(column)) or end == 0.0:
                 continue
-            step = resolution(column[:LOOKED_AT])
-            is_end = np.abs(abs(end) / ranges - 1.0).min() < NEAR
-            if is_end or (step and COUNTS - 1.5 < abs(end) / step < COUNTS + 0.5):
-                first_s = 1e-9 * float(
-                    stream.publish_time_ns[int(np.argmax(column == end))] - stream.publish_time_ns[0]
-                )
-                yield Finding(
-                    "values",
-                    stream.topic,
-                    field,
-                    float(count),
-                    f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
-                    f"{end:.6g}, the end of a range, the first {first_s:.4g} s after its first stamp",
-                    mapping="set the sensor to a larger range; leave these messages out",
-                )
-                break
+            is_there = column == end
+            others = [other for of, which, other in entries if (of, which) != (field, name)]
+            is_end = _is_end_of_range(stream, field, column, end)
+            if not is_end and not _is_clipped(is_there, levels, counts[at], others):
+                continue
+            first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
+            first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
+            what = "the end of a range" if is_end else f"its {'greatest' if at else 'least'} value"
+            yield Finding(
+                "values",
+                stream.topic,
+                field,
+                float(count),
+                f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
+                f"{end:.6g}, {what}, the first {first_s:.4g} s after its first stamp",
+                otherwise="set the sensor to a larger range; leave these messages out",
+                severity="likely" if is_end or _varies(column[~is_there]) else "hint",
+                time_ns=first_ns,
+            )
+            break
+
+
+def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> bool:
+    """Tell whether an inertial value is the last of a usual range, or of 16 bits."""
+    ranges = RANGES.get(field)
+    if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
+        return False
+    step = resolution(column[:LOOKED_AT])
+    is_last = step > 0.0 and COUNTS - 1.5 < abs(end) / step < COUNTS + 0.5
+    return is_last or bool(np.abs(abs(end) / ranges - 1.0).min() < NEAR)
+
+
+def _is_clipped(
+    is_there: NDArray[np.bool_], levels: Floats, count: int, others: Sequence[Floats]
+) -> bool:
+    """Tell whether an end comes far more often than other values do, while other columns move."""
+    usual = len(is_there) / len(levels)
+    if len(levels) < MANY_LEVELS or count <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
+        return False
+    runs = int(is_there[0]) + int(np.sum(np.diff(is_there.astype(np.int8)) > 0))
+    moves = not others or any(_changes(other[is_there]) > MOVING for other in others)
+    return moves and runs >= RUNS
+
+
+def _varies(values: Floats) -> bool:
+    """Tell whether values are measured ones, which differ nearly always, or follow commands."""
+    return _changes(values) > MEASURED
 
 
 def resolution(values: Floats) -> float:
@@ -168,9 +205,9 @@ def resolution(values: Floats) -> float:
     return step if (np.abs(places - np.rint(places)) < tolerance).all() else 0.0
 
 
-def _entries(stream: Stream) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of every measured component; of what is regular alone."""
-    if stream.schema.full_name not in REGULARS:
+def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
+    """Yield field, name and values (n,) of every measured component; of regular topics, or all."""
+    if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:
         column = stream.columns[entry.name]

@@ -10,11 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.recorders.models.orientation import heading
-from fuselog.recorders.models.planar import wrap_angle
-from fuselog.recorders.plausibility.body import Body, Floats, Series
-from fuselog.recorders.plausibility.timing import SURE, Timing, timing
-from fuselog.recorders.plausibility.windows import (
+from fuselog.recorders.checks.body import Body, Floats, Series
+from fuselog.recorders.checks.timing import SURE, Timing, timing
+from fuselog.recorders.checks.windows import (
     FEWEST,
     Windows,
     chords,
@@ -26,6 +24,8 @@ from fuselog.recorders.plausibility.windows import (
     travelled,
     turned,
 )
+from fuselog.recorders.models.orientation import heading
+from fuselog.recorders.models.planar import wrap_angle
 
 LEAST_LAG_S = 0.15
 LONG_S = 1.0  # a lag that no body makes whose course is not where it heads

@@ -5,10 +5,10 @@ from itertools import chain
 
 import numpy as np
 
-from fuselog.recorders.plausibility.body import Floats, PlaceSeries, Series
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.motion import LONG_S, BodyMotion
-from fuselog.recorders.plausibility.windows import JUMP, jumps, travelled
+from fuselog.recorders.checks.body import Floats, PlaceSeries, Series
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.motion import LONG_S, BodyMotion
+from fuselog.recorders.checks.windows import JUMP, jumps, travelled
 from fuselog.recorders.units import mistaken
 
 NEAR = 0.05  # of a factor
@@ -51,7 +51,7 @@ def leaps(motion: BodyMotion) -> Iterator[Finding]:
             f"{fixes.topic}: its position jumps {times if len(places) > 1 else ''}by up to "
             f"{lengths_m[largest]:.3g} m at {at_s[largest]:.1f} s, while {source.topic} moves "
             f"{moved[places][largest]:.2g} m",
-            mapping="cut these messages out, or keep a gate (gate_probability) that rejects them",
+            otherwise="cut these messages out, or keep a gate (gate_probability) that rejects them",
         )
 
 
@@ -79,8 +79,7 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
             f"{topic}: its stamps are {abs(value):.3g} s {'late' if value > 0 else 'early'}, "
             f"give or take {spread_s:.2g} s: the motion of {lag.source} is most like that of "
             f"{lag.against} (correlation {abs(lag.timing.likeness):.3f}) so{why}",
-            f"{topic}.delay_s",
-            digits(value),
+            f"{topic}.delay_s={digits(value)}",
         )
 
 
@@ -89,14 +88,13 @@ def clocks(motion: BodyMotion) -> Iterator[Finding]:
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
         yield Finding(
-            "clock",
+            "clock drift",
             topic,
             "",
             gain,
             f"{topic}: its clock {'gains' if gain > 0 else 'loses'} {100 * abs(gain):.2g} s in 100 s on "
             f"that of {against}: only so their speeds stay alike",
-            f"{topic}.clock_gain",
-            digits(gain),
+            f"{topic}.clock_gain={digits(gain)}",
         )
 
 
@@ -130,8 +128,7 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
             source.field,
             factor,
             f"{of} {what}: {moved}",
-            f"{source.topic}.{source.field.rpartition('_')[0]}_scale",
-            digits(1.0 / factor),
+            f"{source.topic}.{source.field.rpartition('_')[0]}_scale={digits(1.0 / factor)}",
             mapping,
         )
 
@@ -158,8 +155,7 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
             ratio,
             f"{fixes.topic}: at rest its errors are white and have {ratio:.3g} times the variance that "
             f"it states ({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
-            f"{fixes.topic}.covariance_scale",
-            digits(ratio),
+            f"{fixes.topic}.covariance_scale={digits(ratio)}",
         )
 
 

@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator, Mapping
 
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.losses import REGULARS
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import REGULARS
 
 SUFFIX = re.compile(r"_(ned|frd)$", re.IGNORECASE)
 
@@ -25,10 +25,10 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 f"{stream.topic}: its {key} {stream.metadata[key]} says {kind}, where REP "
                 f"103 and fuselog "
                 f"have {ours}",
-                mapping="mounting_deg = [180, 0, 0] in the mapping"
+                otherwise="mounting_deg = [180, 0, 0] in the mapping"
                 if kind == "FRD"
                 else "in the mapping exchange north and east, and give down the factor -1",
-                sure="hint",
+                severity="hint",
             )
 
 
@@ -45,8 +45,8 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         0.0,
         f"{stream.topic}: by REP 145 it is {raw.topic} again, beside an orientation that a filter made: "
         "who uses both counts one unit twice",
-        mapping=f"--set topics.inertial={raw.topic} at the replay takes one alone",
-        sure="hint",
+        otherwise=f"--set topics.inertial={raw.topic} at the replay takes one alone",
+        severity="hint",
     )
 
 
@@ -70,8 +70,8 @@ def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}: it is alone in its namespace, while {other.topic}, which says the "
         f"same, is with "
         f"{spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
-        mapping=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
+        otherwise=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
         f"them; at the import "
         f"""--set 'names={{"{stream.topic}" = "{used}"}}'""",
-        sure="hint",
+        severity="hint",
     )

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from fuselog.recorders.checks.body import FEWEST, Series
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.turns import quietest
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.body import FEWEST, Series
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.turns import quietest
 
 LARGEST_SHARE = 0.9
 UNITS = {each.full_name for each in (schemas.INERTIAL_SAMPLE, schemas.MAGNETIC_FIELD)}
@@ -40,7 +40,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(len(stream)),
                 f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
                 "not measured, and a filter that this topic drives takes them for measurements",
-                mapping="import only what was measured, a part of a unit as a VectorMeasurement",
+                otherwise="import only what was measured, a part of a unit as a VectorMeasurement",
             )
 
 
@@ -79,8 +79,7 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} "
         f"of {norm:.4g}, "
         "where specific force points up along z",
-        f"{stream.topic}.specific_force_z_scale" if is_down else "",
-        -1 if is_down else "",
+        f"{stream.topic}.specific_force_z_scale=-1" if is_down else "",
         f"mounting_deg = [{roll}, {pitch}, {yaw}] in the mapping",
         "likely" if is_down else "hint",
     )

@@ -6,8 +6,8 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding
 
 TOLERANCE = 1e-6  # of the largest entry
 SINGULAR, SINGULAR_BELOW = "singular", 1e-12  # the least eigenvalue of its correlations
@@ -46,11 +46,11 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                     f"{stream.topic}: {entry.name} is {words} in {int(share)} of "
                     f"{len(column)} messages, "
                     f"the first {first_s:.4g} s after its first stamp",
-                    mapping="missing = [-1] in the mapping"
+                    otherwise="missing = [-1] in the mapping"
                     if is_unknown
                     else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, a number "
                     f"for each axis",
-                    sure="hint" if words == SINGULAR else "fact",
+                    severity="hint" if words == SINGULAR else "fact",
                 )
                 break
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fuselog.recorders.plausibility.body import Floats, Series
-from fuselog.recorders.plausibility.windows import FEWEST, Windows, thinned
+from fuselog.recorders.checks.body import Floats, Series
+from fuselog.recorders.checks.windows import FEWEST, Windows, thinned
 
 Account = Callable[[Series, Floats, Floats], Floats]  # of windows, from their begin to their end
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01

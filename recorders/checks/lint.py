@@ -4,29 +4,49 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 
-from fuselog.recorders.errors import BadInput
-from fuselog.recorders.linting import (
+from fuselog.recorders.checks import (
     columns,
     covariances,
     forces,
     impossible,
     limits,
+    losses,
     magnetic,
     names,
     places,
+    speeds,
     stamps,
+    turns,
 )
-from fuselog.recorders.log import Log, Stream, read_blocks, read_empty, read_span
-from fuselog.recorders.log.impossible import main_span, main_span_of, possible
+from fuselog.recorders.checks.body import bodies
+from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.motion import BodyMotion
+from fuselog.recorders.log import Stream
+from fuselog.recorders.log.impossible import main_span, possible
 from fuselog.recorders.log.streams import concatenate
-from fuselog.recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
-from fuselog.recorders.plausibility.finding import Finding
-from fuselog.recorders.plausibility.stamps import losses
 
-Check = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]
-# Of all messages; the other checks look at what is possible.
-OF_IMPOSSIBLE: tuple[Check, ...] = (impossible.beyond, impossible.integers)
-CHECKS: tuple[Check, ...] = (
+MOST = 1 << 19  # messages of a portion
+BLOCK = 1 << 16
+
+OfTopic = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]  # a topic, beside all of them
+OfMotion = Callable[[BodyMotion], Iterator[Finding]]  # topics of one body, compared in pairs
+# The checks by what they look at, in the order in which findings are named.
+OF_ALL_MESSAGES: tuple[OfTopic, ...] = (impossible.beyond, impossible.integers)
+OF_STAMPS: tuple[OfTopic, ...] = (losses.losses, losses.silences, losses.repeats)
+OF_MOTION: tuple[OfMotion, ...] = (
+    turns.gravity,
+    turns.quaternions,
+    speeds.leaps,
+    speeds.clocks,
+    speeds.delays,
+    speeds.factors,
+    turns.degrees,
+    turns.signs,
+    turns.mounting,
+    turns.headings,
+    speeds.rest,
+)
+OF_TOPIC: tuple[OfTopic, ...] = (
     impossible.apart,
     impossible.restated,
     stamps.units,
@@ -50,13 +70,24 @@ CHECKS: tuple[Check, ...] = (
     magnetic.units,
     magnetic.iron,
     columns.codes,
-    columns.frozen,
     columns.saturated,
+    columns.frozen,
     columns.rounded,
     names.frames,
     names.doubles,
     names.strays,
 )
+
+
+def compared(streams: Mapping[str, Stream]) -> list[Finding]:
+    """Return what topics say of their stamps, and compared with others of the same body."""
+    found = list(_asked(OF_STAMPS, streams))
+    for body in bodies(streams):
+        motion = BodyMotion(body)
+        of_motion = [each for check in OF_MOTION for each in check(motion)]
+        known = {(each.kind, each.where) for each in found}
+        found += [each for each in of_motion if (each.kind, each.where) not in known]
+    return found + list(losses.drifts(streams))
 
 
 def lint(
@@ -84,38 +115,30 @@ def lint(
         most_ns = span_ns or main_span(stream.publish_time_ns for stream in whole.values())
         cleared = {topic: possible(stream, most_ns)[0] for topic, stream in whole.items()}
         streams = {topic: stream for topic, stream in cleared.items() if len(stream)}
-        of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
+        of_stamps = compared(streams) if not index else list(_asked(OF_STAMPS, streams))
         # what is left out for its values is not lost
         of_stamps = [
             each
             for each in of_stamps
-            if each.cause != "lost messages"
-            or len(streams[each.topic]) == len(whole[each.topic])
-            or any(losses(whole[each.topic], whole))
+            if each.kind not in ("lost messages", "gap")
+            or len(streams[each.where]) == len(whole[each.where])
+            or any(one.kind == each.kind for one in _asked(OF_STAMPS, whole, [each.where]))
         ]
-        of_impossible = _asked((partial(impossible.years, most_ns), *OF_IMPOSSIBLE), whole)
-        for each in (*of_impossible, *of_stamps, *_asked(CHECKS, streams)):
-            others = found.setdefault((each.cause, each.topic, each.field), [])
+        of_impossible = _asked((partial(impossible.years, most_ns), *OF_ALL_MESSAGES), whole)
+        for each in (*of_impossible, *of_stamps, *_asked(OF_TOPIC, streams)):
+            others = found.setdefault((each.kind, each.where, each.part), [])
             if not others or (each in of_stamps and not index):
                 others.append(each)
     listed = [each for several in found.values() for each in several]
-    return sorted(listed, key=lambda each: each.sure == "hint")
+    return sorted(listed, key=lambda each: each.severity == "hint")
 
 
-def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
-    """Return the findings of a log file, see `lint`; raises BadInput where it is damaged."""
-    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
-    if not topics:
-        return []
-    span_ns = main_span_of(read_span(log, "publish_time"), lambda: read_blocks(log, topics))
-    blocks = read_blocks(log, topics, block_messages=BLOCK)
-    return lint(blocks, span_ns=span_ns, portions=portions)
-
-
-def _asked(checks: Iterable[Check], streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    for stream in streams.values():
+def _asked(
+    checks: Iterable[OfTopic], streams: Mapping[str, Stream], topics: Iterable[str] | None = None
+) -> Iterator[Finding]:
+    for topic in streams if topics is None else topics:
         for check in checks:
-            yield from check(stream, streams)
+            yield from check(streams[topic], streams)
 
 
 def _portions(blocks: Iterable[Mapping[str, Stream]]) -> Iterator[dict[str, Stream]]:
@@ -132,13 +155,3 @@ def _portions(blocks: Iterable[Mapping[str, Stream]]) -> Iterator[dict[str, Stre
             parts, count = {}, 0
     if parts:
         yield {topic: concatenate(several) for topic, several in parts.items()}
-
-
-def _is_sensed(log: Log, topic: str) -> bool:
-    if topic.startswith("/estimates/"):
-        return False
-    try:
-        read_empty(log, topic)
-    except BadInput:
-        return False
-    return True

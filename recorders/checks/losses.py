@@ -1,17 +1,21 @@
-"""Checks stamps, topic by topic: messages that are lost or there twice, clocks that drift."""
+"""Checks stamps, topic by topic: messages that are lost or there twice, silences, clocks that drift."""
 
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, digits
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
 
 FEWEST = 50
 LOST, GAPS = 0.1, 0.01  # of the messages
 REGULAR, TOLERANCE = 0.8, 0.2  # of the steps that are a multiple of the usual one, and by how near
 FACT = 1e-3  # of a clock's rate
 LONG_S = 10.0
+SILENT = 20.0  # usual steps
+PAUSES = 0.95  # of the steps
+FEWEST_BURSTS = 20
 MOST_LOST = 0.6  # where more lacks, the stamps are of a clock's ticks, and no rate
 # What comes regularly: what sees targets is silent where there are none.
 REGULARS = {
@@ -32,21 +36,12 @@ REGULARS = {
 
 
 def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find messages that lack in a regular row of stamps, but for outages that the log states."""
-    if stream.schema.full_name not in REGULARS:
-        return
-    stamps_ns = np.unique(stream.publish_time_ns)
-    steps_s = np.diff(stamps_ns) * 1e-9
+    """Find messages missing from a regular row of stamps, except in silences and stated outages."""
+    begin_ns, steps_s = _steps(stream, streams)
     if len(steps_s) < FEWEST:
         return
-    begin_ns = stamps_ns[:-1]
-    for outage in streams.values():
-        if outage.schema.full_name == schemas.OUTAGE.full_name:
-            for start, end in zip(outage.publish_time_ns, outage["end_time_ns"], strict=True):
-                outside = (begin_ns > end) | (begin_ns + 1e9 * steps_s < start)
-                steps_s, begin_ns = steps_s[outside], begin_ns[outside]
-    if len(steps_s) < FEWEST:
-        return
+    is_short = steps_s <= SILENT * _pause_s(steps_s)
+    begin_ns, steps_s = begin_ns[is_short], steps_s[is_short]
     usual_s = float(np.quantile(steps_s, 0.1))
     multiples = np.rint(steps_s / usual_s)
     is_regular = np.abs(steps_s / usual_s - multiples) < TOLERANCE
@@ -54,29 +49,52 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     is_gap |= is_regular & (multiples > 1) & (np.median(multiples) > 1)
     lost = 1.0 - (len(steps_s) + 1) / (float(np.sum(steps_s)) / usual_s + 1.0)
     is_lossy = np.mean(is_gap) > GAPS or (lost > LOST and is_gap.any())
+    is_sure = stream.schema.full_name in REGULARS
     if np.mean(is_regular) < REGULAR or not is_lossy or lost > MOST_LOST:
         return
+    if not is_sure and _are_bursts(is_gap):
+        return
     share = f"{100.0 * lost:.2g} %" if lost < 0.45 or lost > 0.55 else "half"
-    at_s = (int(begin_ns[np.argmax(is_gap)]) - int(stamps_ns[0])) * 1e-9
+    first_ns = int(begin_ns[np.argmax(is_gap)])
     yield Finding(
         "lost messages",
         stream.topic,
         "",
         lost,
         f"{stream.topic}: loses {share} of its messages: steps are multiples of {usual_s:.3g} s, and "
-        f"{int(is_gap.sum())} are longer than one, the first {at_s:.4g} s after its first stamp; "
+        f"{int(is_gap.sum())} are longer than one, the first {_since(stream, first_ns)}; "
         "a delay or noise that is found besides may come of it",
-        mapping="look for them where the log is recorded",
+        otherwise="look for them where the log is recorded",
+        severity="likely" if is_sure else "hint",
+        time_ns=first_ns,
     )
+
+
+def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find the longest silence, except of what sees targets and in outages that the log states."""
+    begin_ns, steps_s = _steps(stream, streams)
+    if len(steps_s) < FEWEST or "target_id" in stream.columns:
+        return
+    usual_s = _pause_s(steps_s)
+    longest = int(np.argmax(steps_s))
+    is_long = steps_s[longest] > LOST * float(steps_s.sum())
+    if steps_s[longest] > SILENT * usual_s:
+        yield Finding(
+            "gap",
+            stream.topic,
+            "",
+            float(steps_s[longest]),
+            f"{stream.topic}: is silent for {steps_s[longest]:.3g} s from "
+            f"{_since(stream, int(begin_ns[longest]))} on, where the usual step is {usual_s:.3g} s",
+            otherwise="look for what is missing where the log is recorded",
+            severity="likely" if is_long and stream.schema.full_name in REGULARS else "hint",
+            time_ns=int(begin_ns[longest]),
+        )
 
 
 def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find measurements that are there twice; events may be alike, and what one scan detects."""
-    names = {each.name for each in stream.schema}
-    is_measured = "scan_id" not in names and any(
-        each.kind in ("real", "vector") for each in stream.schema
-    )
-    if not is_measured or stream.schema.full_name == schemas.TRUTH_STATE.full_name:
+    if "scan_id" in stream.columns or not is_measured(stream):
         return
     same = np.diff(stream.publish_time_ns) == 0
     for column in stream.columns.values():
@@ -84,16 +102,53 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         same &= step if step.ndim == 1 else step.all(axis=1)
     if not same.any():
         return
-    first_s = (int(stream.publish_time_ns[int(np.argmax(same))]) - int(stream.publish_time_ns[0])) * 1e-9
+    first_ns = int(stream.publish_time_ns[int(np.argmax(same))])
     yield Finding(
         "stamps",
         stream.topic,
         "",
         float(same.sum()),
         f"{stream.topic}: {int(same.sum())} of its {len(same) + 1} messages are there twice, with equal "
-        f"stamp and content, the first {first_s:.4g} s after its first stamp: they count twice",
-        mapping="leave them out where the log is written",
+        f"stamp and content, the first {_since(stream, first_ns)}: they count twice",
+        otherwise="leave them out where the log is written",
+        time_ns=first_ns,
     )
+
+
+def is_measured(stream: Stream) -> bool:
+    """Tell whether messages are measurements and not the truth, or events without numbers."""
+    is_number = any(each.kind in ("real", "vector") for each in stream.schema)
+    return is_number and stream.schema.full_name != schemas.TRUTH_STATE.full_name
+
+
+def _steps(
+    stream: Stream, streams: Mapping[str, Stream]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return where the steps of measurements begin, and their seconds, outside of outages."""
+    stamps_ns = np.unique(stream.publish_time_ns) if is_measured(stream) else np.empty(0, np.int64)
+    steps_s = np.diff(stamps_ns) * 1e-9
+    begin_ns = stamps_ns[:-1]
+    for outage in streams.values():
+        if outage.schema.full_name == schemas.OUTAGE.full_name:
+            for start, end in zip(outage.publish_time_ns, outage["end_time_ns"], strict=True):
+                outside = (begin_ns > end) | (begin_ns + 1e9 * steps_s < start)
+                steps_s, begin_ns = steps_s[outside], begin_ns[outside]
+    return begin_ns, steps_s
+
+
+def _pause_s(steps_s: NDArray[np.float64]) -> float:
+    """Return the usual step, or the pause between bursts, as of ranges to many anchors."""
+    return float(np.quantile(steps_s, PAUSES))
+
+
+def _since(stream: Stream, time_ns: int) -> str:
+    return f"{(time_ns - int(stream.publish_time_ns.min())) * 1e-9:.4g} s after its first stamp"
+
+
+def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
+    """Tell whether gaps come after as many messages each time, as between bursts of a sensor."""
+    counts = np.diff(np.flatnonzero(is_gap))
+    return len(counts) >= FEWEST_BURSTS and bool(np.mean(counts == np.median(counts)) > REGULAR)
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
@@ -108,19 +163,18 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
         if abs(rate - usual) > FACT:
             gain = 1.0 - rate / usual
             yield Finding(
-                "clock",
+                "clock drift",
                 topic,
                 "",
                 gain,
                 f"{topic}: its clock {'gains' if gain > 0 else 'loses'} {100 * abs(gain):.2g} s in "
                 "100 s on those of other topics, by when its messages reached the recorder",
-                f"{topic}.clock_gain",
-                digits(gain),
+                f"{topic}.clock_gain={digits(gain)}",
             )
     if abs(usual - 1.0) > FACT:
         first = next(iter(rates))
         yield Finding(
-            "clock",
+            "clock drift",
             first,
             "",
             1.0 - usual,

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.losses import FEWEST, REGULARS, losses
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
-from fuselog.recorders.plausibility.stamps import FEWEST, REGULARS, losses
 
 YEAR_2100_NS = 4_102_444_800 * 10**9
 JITTER = 0.2  # of the usual step
@@ -78,19 +78,20 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find stamps that go back between messages, and equal ones of what is measured once at a time."""
-    rows = np.argsort(stream.position, kind="stable")
+    is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
+    rows = np.argsort(stream.log_time_ns if is_late else stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
     back = np.diff(stamps_ns) < 0
     if back.any():
-        is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
         count, first_s = int(back.sum()), _since_s(stream, int(stamps_ns[int(np.argmax(back))]))
         steps_ns = np.diff(stamps_ns)
         usual_ns = float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else np.inf
         began_again = not is_late and -steps_ns.min() > AGAIN * usual_ns and count <= FEW_FALLS
+        behind_s = 1e-9 * float((np.maximum.accumulate(stamps_ns) - stamps_ns).max())
         how = (
             "; its clock began again: it was restarted, rolled over, or is that of several vehicles"
             if began_again
-            else "; messages overtook one another" * is_late
+            else f"; messages overtook one another, and are up to {behind_s:.3g} s behind" * is_late
         )
         yield Finding(
             "stamps",
@@ -99,12 +100,12 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             float(count),
             f"{stream.topic}: {count} of its {len(stream)} stamps go back, the first "
             f"{first_s:.4g} s after the earliest{how}",
-            mapping="--late says what becomes of them"
+            otherwise=f"replay them as they came, with --late rewind:{np.ceil(behind_s * 10) / 10:g}"
             if is_late
             else "`rollover` of `time`, or `vehicle` of the table, in the mapping"
             if began_again
             else "sort them where the log is written",
-            sure="hint" if is_late else "fact",
+            severity="hint" if is_late else "fact",
         )
         return
     things = _things(stream, streams)[rows]
@@ -119,8 +120,8 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             float(same.sum()),
             f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the stamp of the one "
             f"before, the first {first_s:.4g} s after its first stamp: {use}",
-            mapping="leave one of them out where the log is written",
-            sure="fact",
+            otherwise="leave one of them out where the log is written",
+            severity="fact",
         )
 
 
@@ -161,15 +162,14 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}: its stamps are {abs(value):g} s "
         f"{'ahead of' if value > 0 else 'behind'} the clock "
         f"of the recorder: {name}{'' if is_alone else ', as are those of all topics'}",
-        f"{stream.topic}.delay_s",
-        digits(value),
+        f"{stream.topic}.delay_s={digits(value)}",
         f"time = {{ column = ..., {setting} }} in the mapping",
         "likely" if is_alone else "hint",
     )
 
 
 def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a clock a little fast or slow, as most are; more than 1e-3 is told by plausibility."""
+    """Find a clock a little fast or slow, as most are; more than 1e-3 is told by `losses.drifts`."""
     if len(stream) < FEWEST or np.array_equal(stream.publish_time_ns, stream.log_time_ns):
         return
     measured_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
@@ -183,15 +183,14 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     error = float(np.std(rest_s) / np.sqrt(centred_s @ centred_s))
     if max(DRIFT, SURE * error) < abs(gain) < FACT:
         yield Finding(
-            "clock",
+            "clock drift",
             stream.topic,
             "",
             gain,
             f"{stream.topic}: its clock {'gains' if gain > 0 else 'loses'} {1e6 * abs(gain):.3g} us a "
             f"second on the recorder's, in {span_s:.4g} s {1e3 * abs(gain) * span_s:.3g} ms",
-            f"{stream.topic}.clock_gain",
-            digits(gain),
-            sure="hint",
+            f"{stream.topic}.clock_gain={digits(gain)}",
+            severity="hint",
         )
 
 
@@ -205,7 +204,7 @@ def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]
 
 
 def _stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:
-    return Finding("stamps", stream.topic, "", value, f"{stream.topic}: {words}", mapping=mapping)
+    return Finding("stamps", stream.topic, "", value, f"{stream.topic}: {words}", otherwise=mapping)
 
 
 def _steps_ns(stream: Stream) -> NDArray[np.int64]:

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, Kind, Severity
+from fuselog.recorders.checks.losses import FEWEST
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.impossible import TIMELESS, YEAR_NS, impossible
-from fuselog.recorders.plausibility.finding import Cause, Finding, Surety
-from fuselog.recorders.plausibility.stamps import FEWEST
 
 TINIEST = float(np.finfo(np.float64).tiny)  # of the numbers that have all digits
 
@@ -65,8 +65,8 @@ def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Strea
             f"{stream.topic}: {int(rows.sum())} of its {len(stream)} stamps are years from most "
             f"messages of the log: the first, of message {row}, is {apart:.3g} years "
             f"{'before' if before_ns > 0 else 'after'} them",
-            mapping="a replay leaves these messages out; mend the clock where the log is written",
-            sure="fact",
+            otherwise="a replay leaves these messages out; mend the clock where the log is written",
+            severity="fact",
         )
 
 
@@ -89,8 +89,7 @@ def apart(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         "",
         apart_s,
         f"{stream.topic}: its stamps {how.format(f'{apart_s:.4g}')}: no time is in both",
-        f"{stream.topic}.delay_s",
-        -round(apart_s, 3) if is_before else round(apart_s, 3),
+        f"{stream.topic}.delay_s={-round(apart_s, 3) if is_before else round(apart_s, 3)}",
         "its clock may be another",
     )
 
@@ -113,8 +112,8 @@ def restated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             float(times),
             f"{stream.topic}: {number} {first} is stated {times} times, at different places: a replay "
             "takes one of them",
-            mapping="give each point a number of its own",
-            sure="fact",
+            otherwise="give each point a number of its own",
+            severity="fact",
         )
 
 
@@ -127,22 +126,22 @@ def _count(rows: NDArray[np.bool_]) -> str:
 
 def _finding(
     stream: Stream,
-    cause: Cause,
+    kind: Kind,
     field: str,
     rows: NDArray[np.bool_],
     words: str,
     mapping: str,
-    sure: Surety = "fact",
+    severity: Severity = "fact",
 ) -> Finding:
     row = int(np.argmax(rows))
     since_s = 1e-9 * float(stream.publish_time_ns[row] - stream.publish_time_ns[0])
     where = f"the first, message {row}, {since_s:.4g} s after its first stamp"
     return Finding(
-        cause,
+        kind,
         stream.topic,
         field,
         float(rows.sum()),
         f"{stream.topic}: {words}, {where}",
-        mapping=mapping,
-        sure=sure,
+        otherwise=mapping,
+        severity=severity,
     )

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.checks.finding import Finding, digits
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.plausibility.finding import Finding, digits
 
 Floats = NDArray[np.float64]
 FIELD = "magnetic_field_ut"
@@ -40,8 +40,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}: {FIELD} {what}: half of its lengths are above {norm:.3g}, and the "
         f"Earth's field "
         f"has {EARTH_UT[0]:g} to {EARTH_UT[1]:g} uT",
-        f"{stream.topic}.magnetic_field_scale" if given else "",
-        digits(factor) if given else "",
+        f"{stream.topic}.magnetic_field_scale={digits(factor)}" if given else "",
         f'units.{FIELD} = "{given}" in the mapping'
         if given
         else "calibrate it: it tells only directions",
@@ -67,8 +66,7 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             share,
             f"{stream.topic}: hard iron: in a full turn {FIELD} goes round a centre that is {share:.2g} "
             f"of the radius, {circle.radius:.3g} uT, off zero",
-            f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias",
-            digits(float(circle.centre[axis])),
+            f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias={digits(float(circle.centre[axis]))}",
             f"offsets.{FIELD} = [{offsets}] in the mapping",
         )
     elif circle.ratio > SOFT:
@@ -79,7 +77,7 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             circle.ratio,
             f"{stream.topic}: soft iron: in a full turn {FIELD} goes along an ellipse whose axes are "
             f"{circle.ratio:.3g} to 1",
-            mapping="calibrate its axes",
+            otherwise="calibrate its axes",
         )
 
 
