@@ -268,6 +268,7 @@ def test_a_worker_uses_one_core() -> None:
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 
+@pytest.mark.paper
 def test_workers_in_another_folder_read_logs_and_write_files(tmp_path, monkeypatch):
     """Relative paths are the driver's; what is required is every log, and the folder of kept cells."""
     monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
