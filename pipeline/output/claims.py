@@ -76,8 +76,8 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
     Returns:
         The claim with its verdict, "confirmed" or "refuted".
 
-    >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
-    'confirmed'
+    >>> print(judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict)
+    confirmed
     """
     return Claim(claim, paper, ours, Claimed.CONFIRMED if holds else Claimed.REFUTED, why)
 

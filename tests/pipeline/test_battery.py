@@ -195,7 +195,7 @@ def test_several_ordinary_faults_are_fitted_together(*, has_gyro: bool) -> None:
     }
     causes = seek(log, "ekf", OPEN, 5).causes
     named = {
-        (cause.hypothesis.kind, cause.hypothesis.topic, each.part): each
+        (cause.hypothesis.kind, cause.hypothesis.topic, each.name): each
         for cause in causes
         for each in cause.numbers
     }

@@ -121,7 +121,6 @@ MOVES = [
         "compare run.mcap -e ekf -e ukf",
         {
             "--estimator": "-e dead-reckoning",
-            "--margin": "--margin 0.5",
             "--out": "--out out",
             "--save": "--save out.rrd",
             "--stress": "--stress",
@@ -130,6 +129,7 @@ MOVES = [
             "--settings": "--settings settings.toml",
         },
     ),
+    Moves("compare five -e ekf -e ukf", {"--margin": "--margin 0.5"}),  # an interval needs five runs
     Moves("compare both.mcap est.txt --case robot1", {"--case": "--case left"}),
     Moves("compare est.mcap est-ukf.mcap", {"--gap-limit": "--gap-limit 0.001"}),
     Moves(
@@ -242,6 +242,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for line in (
             f"{RECORD} -o run.mcap --set range_bearing.latency_s=0.3",
             f"{RECORD} -o other.mcap --seed 3",
+            *(f"{RECORD} -o five/{seed}.mcap --seed {seed}" for seed in range(5)),
             "record navigation --set duration_s=12 -o drive.mcap",
             "replay run.mcap -e ekf --every 0.03 -o est.mcap",
             "replay run.mcap -e ukf --every 0.03 -o est-ukf.mcap",

@@ -40,7 +40,7 @@ def test_what_ours_have(here: Path) -> None:
     assert found.sentences
     assert found.hypotheses > 2
     compared = fl.compare("run.mcap", estimators=[{"mine": mine}, "ekf"])
-    assert set(compared.table["verdict"]) <= {"unclear", "no difference"}
+    assert set(compared.table["verdict"]) <= {"undecided", "tie"}
     late = {"arrival_order": True, "late": "wait:0.1"}
     done = fl.replay("run.mcap", {"mine": mine, "ekf": {"gate_probability": 1.0}}, **late)
     rmse = done.metrics.set_index("quantity").loc["position_rmse_m", "value"]
