@@ -236,12 +236,7 @@ class Likelihood:
         sources = [each.source for each in scored for _ in range(count)]
         begins_ns = [each.begin_ns for each in scored]
         try:
-            begun = [
-                begun_broadly(begun_at(each, self.starts), begins_ns, count)
-                if _is_free(each)
-                else begun_at(each, self.starts)
-                for each in bound
-            ]
+            begun = [begun_broadly(begun_at(each, self.starts), begins_ns, count) for each in bound]
             outputs = collect(replay(Ensemble(sources), begun, is_part=True))
         except BadInput:  # no run can be followed with these
             outputs = {}
@@ -287,8 +282,8 @@ class Likelihood:
                 return {}
             if share < 1.0:
                 stream = stream.take(first_of_each(stream, share))
-            is_in = stream["accepted"] != 0
-            total = float(np.sum(stream["log_likelihood"][is_in]))
+            is_in, logs = stream["accepted"] != 0, stream["log_likelihood"]
+            total = float((logs if is_in.all() else logs[is_in]).sum())
             if not is_in.all():
                 missing = np.isnan(stream["innovation"][~is_in])
                 total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
@@ -302,12 +297,6 @@ class Likelihood:
                 total += share * more
             found[name] = total
         return found
-
-
-def _is_free(bound: Bound) -> bool:
-    """Tell whether broad starts are found for an estimator."""
-    initialization = bound.initialization if isinstance(bound, Recursive) else None
-    return initialization is not None and initialization.find_broad is not None
 
 
 def _topic(name: str) -> str:

@@ -22,6 +22,7 @@ from fuselog.replay.engine.replaying.estimator import (
     Recursive,
 )
 from fuselog.replay.engine.replaying.truth import refuse_named_truths
+from fuselog.replay.engine.streams.blocks import Findings
 from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.model.augmentation import (
     Start,
@@ -210,6 +211,10 @@ def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
     return " ".join(f"{', '.join(models)}: {meaning}" for meaning, models in meanings_of.items())
 
 
+# What the last few logs have of each model: a log is bound again and again, with other parameters.
+_FOUND = Findings()
+
+
 def _bind_fitting(
     label: str, topics: Mapping[str, Topic], values: Parameters, *, method: Method
 ) -> list[Bound]:
@@ -228,10 +233,24 @@ def _bind_fitting(
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
     refuse_named_truths(label, renamed, topics, {model.truth for model in models.values()})
-    found = {
-        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
-        for name, model in models.items()
-    }
+    stated = (
+        (
+            each.name,
+            each.schema_name,
+            each.encoding,
+            each.channel_ids,
+            each.messages,
+            *each.metadata.items(),
+        )
+        for each in topics.values()
+    )
+    found = _FOUND.once(
+        (*models.items(), *renamed.items(), *stated),
+        lambda: {
+            name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
+            for name, model in models.items()
+        },
+    )
     fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]
     chooses = elsewhere(models, topics, renamed)
     if chooses:

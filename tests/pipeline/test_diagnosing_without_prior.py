@@ -27,6 +27,7 @@ from fuselog.pipeline.diagnosing.likelihood import (
     first_of_each,
 )
 from fuselog.pipeline.optimise import DROP_95
+from fuselog.pipeline.tuning.broad_starts import broad_starts
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
@@ -46,6 +47,24 @@ def test_the_likelihood_over_broad_starts_is_that_of_the_sheet() -> None:
     assert likelihood(car(1)) == pytest.approx(-372.645841, abs=1e-3)
     right = likelihood(car(2000))
     assert likelihood(car(2000), 16.0) == pytest.approx(right, abs=1e-6)
+
+
+def test_broad_starts_are_at_the_first_fix_that_can_be_used() -> None:
+    """However many before it lack their covariance."""
+    log, count = car(2000), 20
+    fixes = log.streams["/car/fix"]
+    covariance = fixes["covariance_m2"].copy()
+    covariance[:count] = np.nan
+    lacking = replace(fixes, columns={**fixes.columns, "covariance_m2": covariance})
+    found = [
+        broad_starts(each, bind("ekf", [each], OPEN))["ekf/car"][0].static["/car/prior"]["mean"]
+        for each in (
+            replace(log, streams={**log.streams, "/car/fix": stream})
+            for stream in (fixes.take(slice(count, None)), lacking)
+        )
+    ]
+    assert found[0].tolist() == found[1].tolist()
+    assert found[0][0, :2] == pytest.approx(fixes["position_m"][count])
 
 
 def test_a_broad_model_knows_how_far_messages_are_from_the_last() -> None:

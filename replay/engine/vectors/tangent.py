@@ -7,6 +7,7 @@ Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3 and 7.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -55,6 +56,13 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
         components: names.
         kinds: one for each.
     """
+    return list(_tangent_components(tuple(components), tuple(kinds)))
+
+
+@lru_cache(maxsize=64)
+def _tangent_components(
+    components: tuple[str, ...], kinds: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
     found: list[tuple[str, str]] = []
     for kind, columns in manifold_blocks(kinds):
         name = components[columns.start]
@@ -65,7 +73,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
             found += [(f"{stem}_{axis}_rad", "rotation") for axis in "xyz"]
         else:
             found.append((f"{stem}_rad", "angle") if kind == "axis" else (name, kind))
-    return found
+    return tuple(found)
 
 
 def _common(names: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from fuselog.recorders.log import Clock, Stream, schemas
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
-from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.blocks import Ragged, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.vectors.components import Components
 from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
@@ -96,6 +96,12 @@ def first_of_runs(
     time_ns = np.zeros(ragged.runs, np.int64)
     time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
     return time_ns, has_one, rows
+
+
+def heads_of_runs(ragged: Ragged, count: int) -> Ragged:
+    """Return the first messages of every run, `count` at most."""
+    is_early = np.arange(len(ragged)) < (ragged.offsets[:-1] + count)[run_of_rows(ragged.offsets)]
+    return Ragged(ragged.stream.take(is_early), ragged_rows(is_early, ragged.offsets))
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:

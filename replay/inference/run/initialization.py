@@ -30,6 +30,7 @@ from fuselog.replay.inference.run.first_messages import (
     Begun,
     Fact,
     first_of_runs,
+    heads_of_runs,
     of_runs,
     run_count,
     started,
@@ -40,6 +41,7 @@ from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 from fuselog.replay.inference.run.timing import compensate_delays, delays_of
 
 FOREVER_NS = np.iinfo(np.int64).max
+HEAD = 16  # messages of a run, among which one is usable as a rule
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
 
 
@@ -154,9 +156,13 @@ class Initializer:
             origins = origins_of(begun[topic.name])
         references: list[list[Reference]] = [[] for _ in range(runs)]
         for number, sensor, topic in self._measuring:
-            ragged = first[topic.name]
-            table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            _when, has_message, rows = first_of_runs(ragged, clock, table.source >= 0)
+            for count in (HEAD, None):
+                whole = first[topic.name]
+                ragged = whole if count is None else heads_of_runs(whole, count)
+                table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
+                _when, has_message, rows = first_of_runs(ragged, clock, table.source >= 0)
+                if (has_message | (np.diff(whole.offsets) == 0)).all():
+                    break
             for run in np.flatnonzero(has_message):
                 state = state_by_message(self.stage, number, table.data[rows[run]])
                 references[run].append((sensor.measured, *state))
