@@ -161,7 +161,7 @@ def test_who_is_conservative_in_every_run_is_not_consistent_however_few_there_ar
 
 
 def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
-    """Whose covariances are too large comes behind a consistent one; where all are, the advice says so."""
+    """Whose covariances are too large comes behind a consistent one; if all are, the advice says so."""
     error = 1.0 + NOISE[0]
     nees = {"a": 1.5 + NOISE[1], "b": 3.0 + NOISE[2]}
     runs = {
