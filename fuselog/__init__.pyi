@@ -112,6 +112,7 @@ from fuselog.replay.inference.model.parameters import ModelParameters as ModelPa
 from fuselog.replay.inference.model.start import Start as Start
 from fuselog.replay.judging.errors.evaluation import Errors as Errors
 from fuselog.replay.judging.errors.evaluation import Innovations as Innovations
+from fuselog.replay.judging.intervals import Interval as Interval
 from fuselog.replay.judging.metrics.measuring import Metric as Metric
 from fuselog.replay.judging.metrics.measuring import Output as Output
 from fuselog.replay.judging.metrics.measuring import metric_of_sums as metric_of_sums

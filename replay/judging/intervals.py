@@ -53,7 +53,14 @@ class Interval(NamedTuple):
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     def rising(self, function: Callable[[float], float]) -> "Interval":
-        """Return a function of it that rises."""
+        """Apply a function that rises, such as `math.exp` to an interval of a logarithm.
+
+        Args:
+            function: of a number.
+
+        Returns:
+            The interval with the function of its value and ends.
+        """
         return self._replace(
             value=function(self.value), low=function(self.low), high=function(self.high)
         )

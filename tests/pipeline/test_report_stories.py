@@ -143,7 +143,7 @@ def test_a_card_says_what_a_message_cost() -> None:
     assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
 
 
-def test_who_is_too_careful_in_every_run_is_not_honest_however_few_there_are() -> None:
+def test_who_is_conservative_in_every_run_is_not_consistent_however_few_there_are() -> None:
     """As the scatter over the runs says, where chance over the covariances would leave it open."""
     told = _told(
         {
@@ -161,7 +161,7 @@ def test_who_is_too_careful_in_every_run_is_not_honest_however_few_there_are() -
 
 
 def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
-    """Whose covariances are too large comes behind an honest one; where all are, the advice says so."""
+    """Whose covariances are too large comes behind a consistent one; if all are, the advice says so."""
     error = 1.0 + NOISE[0]
     nees = {"a": 1.5 + NOISE[1], "b": 3.0 + NOISE[2]}
     runs = {

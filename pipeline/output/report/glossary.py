@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from fuselog.replay.judging.intervals import FEWEST_RUNS
+
 
 class Term(NamedTuple):
     """Explains a word: what it means, and a page about it."""
@@ -34,7 +36,7 @@ _TERMS = {
     "interval": Term(
         "95 % from ... to ...",
         "Where the value lies with 95 % if other runs were made. A run is the unit: errors within one "
-        "hang together.",
+        f"hang together. Fewer than {FEWEST_RUNS} runs have no interval.",
         f"{_WIKI}/Bootstrapping_(statistics)",
     ),
     "tie": Term(

@@ -13,6 +13,7 @@ from fuselog.pipeline.runs.experiment import Experiment, load_experiment, run_ex
 from fuselog.pipeline.runs.inputs import Recording
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import build
+from fuselog.replay.judging.verdicts import Claimed
 from tests.claims.pages import FOLDER
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -23,7 +24,7 @@ LATE = ("jipda-radar-lidar", "jipda-all")
 
 def test_the_stored_result_is_the_sheets() -> None:
     """The reference rows of the sheet, within its tolerances or better; bearings add nothing."""
-    verdicts = [claim["verdict"] for claim in STORED["claims"]]
+    verdicts = [Claimed(claim["verdict"]) for claim in STORED["claims"]]
     assert verdicts == [
         *["confirmed"] * 4,
         *["inconclusive"] * 3,
