@@ -88,8 +88,8 @@ class LandmarksParameters(Parameters):
         odometry_latency_s: time from a reading of the odometry to its arrival at the recorder.
         forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
         turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
-        forward_scale_error: the odometry reports this share too much of the forward speed.
-        turn_bias_radps: the odometry's turn rate is too large by so much.
+        forward_scale_error: the robot drives faster than the odometry reports, by this share.
+        turn_bias_radps: the robot turns faster than the odometry reports, by so much.
         prior_sigma_m: standard deviation of the position in the prior, per axis.
         prior_sigma_rad: standard deviation of the heading in the prior.
         robots_see_each_other: whether robots are targets of the sensors too, beside landmarks.
