@@ -132,6 +132,8 @@ def test_a_page_can_be_worked_through(
             printed = "\n".join(map(printed_by, commands_in(text)))
         elif language == "text":
             for line in text.splitlines():
+                if line.strip() == "...":  # lines that the page leaves out
+                    continue
                 assert flat(line) in flat(printed), f"{name}.md shows\n{line}\nprinted was\n{printed}"
                 shown += 1
     assert shown, "a worked page shows what its commands print"
