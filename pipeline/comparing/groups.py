@@ -219,7 +219,12 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
     settings = [each.settings for each in (first, second) if each.settings is not None]
     names = dict.fromkeys(name for each in settings for name in each) if len(settings) == 2 else {}
     values = {name: [each.get(name, missing) for each in settings] for name in names}
-    differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
+    is_alike = first.label == second.label  # of another method only what both have can differ
+    differing = [
+        f"{name} {a} and {b}"
+        for name, (a, b) in values.items()
+        if a != b and (is_alike or missing not in (a, b))
+    ]
     if differing:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
         what = ", ".join(differing[:NAMED])

@@ -47,7 +47,9 @@ def unlike() -> Iterator[str]:
 
 
 def _side(name: str, runs: str, truths: dict[str, str], settings: dict[str, Any]) -> Any:
-    return SimpleNamespace(name=name, rows={"run": [*runs, *runs]}, truths=truths, settings=settings)
+    return SimpleNamespace(
+        name=name, label="ekf", rows={"run": [*runs, *runs]}, truths=truths, settings=settings
+    )
 
 
 def discrepancies() -> Iterator[str]:
