@@ -57,12 +57,12 @@ def wrapped(mean: Floats, components: Components) -> Floats:
         mean: (n, d).
         components: the d names and their kinds.
     """
-    angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
-    if not angular:
-        return mean
-    mean = mean.copy()
-    angles = mean[:, angular]  # those in range stay as they are, to the last bit
-    mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
+    given = mean
+    for index in (index for index, kind in enumerate(components.values()) if kind == "angle"):
+        beyond = ~(np.abs(mean[:, index]) < np.pi)
+        if beyond.any():  # those in range stay as they are, to the last bit
+            mean = mean.copy() if mean is given else mean
+            mean[beyond, index] = wrap_angle(mean[beyond, index])
     return mean
 
 
