@@ -8,7 +8,7 @@ from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.output.terminal import print_json, say, warn
 from fuselog.pipeline.runs.settings import split_texts
 from fuselog.recorders.checks.finding import Finding
-from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
@@ -16,7 +16,6 @@ from fuselog.replay.engine.streams.sources import LogSource
 NOTHING = "nothing found by looking at the log alone"
 
 
-@without_warnings_of_numbers()
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
     """Return what is wrong with a log as it is written, the worst first and hints last.
 

@@ -135,16 +135,19 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """
     entries = list(_entries(stream, is_regular=False))
     for field, name, column in entries:
-        levels, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+        known = column[np.isfinite(column)]
+        levels, counts = np.unique(known, return_counts=True)
         for at in (-1, 0) if len(levels) > 1 else ():
             end, count = float(levels[at]), int(counts[at])
             if count < max(ROWS, SHARE * len(column)) or end == 0.0:
                 continue
             is_there = column == end
             others = [other for of, which, other in entries if (of, which) != (field, name)]
-            is_end = _is_end_of_range(stream, field, column, end)
-            if not is_end and not _is_clipped(is_there, levels, counts[at], others):
+            is_end = _is_end_of_range(stream, field, known, end)
+            usual = max(len(known) / len(levels), counts[-2 if at else 1])
+            if not is_end and not _is_clipped(is_there, len(levels), usual, others):
                 continue
+            is_sure = stream.schema.full_name in REGULARS and _changes(known[known != end]) > MEASURED
             first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
             first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
             what = "the end of a range" if is_end else f"its {'greatest' if at else 'least'} value"
@@ -156,7 +159,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
                 f"{end:.6g}, {what}, the first {first_s:.4g} s after its first stamp",
                 otherwise="set the sensor to a larger range; leave these messages out",
-                severity="likely" if is_end or _varies(column[~is_there]) else "hint",
+                severity="likely" if is_end or is_sure else "hint",
                 time_ns=first_ns,
             )
             break
@@ -173,20 +176,14 @@ def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> 
 
 
 def _is_clipped(
-    is_there: NDArray[np.bool_], levels: Floats, count: int, others: Sequence[Floats]
+    is_there: NDArray[np.bool_], levels: int, usual: float, others: Sequence[Floats]
 ) -> bool:
     """Tell whether an end comes far more often than other values do, while other columns move."""
-    usual = len(is_there) / len(levels)
-    if len(levels) < MANY_LEVELS or count <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
+    if levels < MANY_LEVELS or is_there.sum() <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
         return False
     runs = int(is_there[0]) + int(np.sum(np.diff(is_there.astype(np.int8)) > 0))
     moves = not others or any(_changes(other[is_there]) > MOVING for other in others)
     return moves and runs >= RUNS
-
-
-def _varies(values: Floats) -> bool:
-    """Tell whether values are measured ones, which differ nearly always, or follow commands."""
-    return _changes(values) > MEASURED
 
 
 def resolution(values: Floats) -> float:

@@ -387,6 +387,21 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
     assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years from these" in said
 
 
+def test_what_rests_or_is_skewed_is_not_saturated() -> None:
+    """Such as a robot that rests where it turns back, and numbers of which the least is the usual one."""
+    path = np.clip(10.0 * np.sin(0.1 * np.arange(600)), -8.0, 8.0)
+    skewed = 1.0 + np.floor(np.random.default_rng(4).exponential(5.0, 600))
+    for forward, turn in ((path, 0.5 * path), (skewed, skewed[::-1])):
+        wheels = make_stream(
+            "/odometry",
+            schemas.ODOMETRY,
+            10**8 * np.arange(600),
+            forward_mps=forward,
+            turn_radps=turn,
+        )
+        assert not [each for each in lint([{"/odometry": wheels}]) if "saturated" in each.evidence]
+
+
 def test_rows_that_are_there_twice_are_counted() -> None:
     twice = np.r_[0:50, 49, 50:70, 69, 70:80]
     [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.kind == "stamps"]

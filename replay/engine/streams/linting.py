@@ -6,11 +6,13 @@ from pathlib import Path
 
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.checks.lint import BLOCK, lint
+from fuselog.recorders.errors import without_warnings_of_numbers
 from fuselog.recorders.log import Stream
 from fuselog.recorders.log.impossible import main_span_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 
 
+@without_warnings_of_numbers()
 def lint_source(source: LogSource | MemorySource, *, portions: int | None = None) -> list[Finding]:
     """Return what is wrong with a source as it is written; see `lint` for `portions`.
 
