@@ -97,5 +97,7 @@ def test_a_seed_gives_the_same_streams_and_way_points_are_passed():
         assert np.linalg.norm(place - point, axis=1).min() < 0.1
     with pytest.raises(BadInput, match="way_points_m has 2 points; give three points or more"):
         streams(way_points_m=points[:2])
-    with pytest.raises(BadInput, match="rest_s is 30 and duration_s 30: after its rest the carrier has to"):
+    with pytest.raises(
+        BadInput, match="rest_s is 30 and duration_s 30: after its rest the carrier has to"
+    ):
         streams(duration_s=30.0, rest_s=30.0)
