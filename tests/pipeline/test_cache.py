@@ -72,9 +72,9 @@ def test_what_was_compiled_ahead_is_not_compiled_again(
 ) -> None:
     """By other processes than those that compiled it, for another log with the same sensors."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "cache"))
-    [made] = fl.precompile("robot", ["ekf"], workers=2)
-    assert made[:3] == ("robot", "ekf", "landmarks")
-    assert not made.why_not
+    made = fl.precompile("robot", ["ekf"], workers=2)
+    assert {each[:3] for each in made} == {("robot", "ekf", "landmarks"), ("robot", "ekf", "car")}
+    assert not any(each.why_not for each in made)
     kept = set(kept_files())
     assert kept
     log = tmp_path / "log.mcap"

@@ -576,7 +576,7 @@ def test_a_log_without_a_prior_is_diagnosed() -> None:
     run = fl.record("landmarks", seed=3, duration_s=10.0, fix={"rate_hz": 2.0})
     streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/prior")}
     found = fl.diagnose(replace(run, streams=streams), "ekf")
-    assert not any("prior" in sentence for sentence in found.sentences)
+    assert not any("prior" in each.sentence for each in found.sentences)
     assert set(found.components["component"]) >= {"x_m", "y_m", "range_m", "bearing_rad"}
 
 

@@ -85,7 +85,7 @@ def test_report_explorer_and_warnings_have_one_verdict(session: Session, log: Pa
         headline = session.play("ekf", own).verdicts["robot1"].headline
         assert headline == (f"{verdict.capitalize()}." if verdict != "consistent" else GOOD)
         reasons = {"small": "overconfident", "large": "conservative"}
-        warned = [each.words.partition("its covariances are too ")[2][:5] for each in done.alarms]
+        warned = [each.sentence.partition("its covariances are too ")[2][:5] for each in done.alarms]
         assert {reasons[each] for each in warned} <= {verdict}
         verdicts.append((verdict, len(warned)))
     sure = "overconfident"
