@@ -388,7 +388,7 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
 
 
 def test_what_rests_or_is_skewed_is_not_saturated() -> None:
-    """Such as a robot that rests where it turns back, and numbers whose least is the usual one."""
+    """Such as a robot that rests where it turns back, and numbers that are mostly the least."""
     path = np.clip(10.0 * np.sin(0.1 * np.arange(600)), -8.0, 8.0)
     skewed = 1.0 + np.floor(np.random.default_rng(4).exponential(5.0, 600))
     for forward, turn in ((path, 0.5 * path), (skewed, skewed[::-1])):
