@@ -72,7 +72,7 @@ class Stream:
         """Return the messages of `rows`, in that order."""
         stamps_ns = self.publish_time_ns[rows]
         if isinstance(rows, np.ndarray):  # np.take copies rows ten times as fast as indexing does
-            places = np.flatnonzero(rows) if rows.dtype == bool else rows
+            places = np.flatnonzero(rows) if rows.dtype == bool else rows.astype(np.intp, copy=False)
             columns = {name: column.take(places, axis=0) for name, column in self.columns.items()}
         else:
             columns = {name: column[rows] for name, column in self.columns.items()}

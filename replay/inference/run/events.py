@@ -267,12 +267,12 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
 
 
 def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
-    """Compute the variances that a sensor gives messages without a covariance; NaN where it has none.
+    """Compute the variances that a sensor gives messages without a covariance; NaN if it has none.
 
     Args:
-        stage: the model and its sensors.
-        number: the sensor's.
-        settings: (sensors + 1, p) numbers of the model, then of each sensor.
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        settings: (1 + sensors, fields), see `settings_of`.
     """
     sensor = stage.sensors[number]
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
