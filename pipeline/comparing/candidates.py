@@ -159,9 +159,9 @@ def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[s
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an estimator's parameters, defaults included where this version knows it."""
+    """Return an estimator's parameters, defaults included where this version knows it; None if unset."""
     try:
-        return dict(configure(label, stated)[1].model_dump(mode="json", exclude_none=True))
+        return dict(configure(label, stated)[1].model_dump(mode="json"))
     except BadInput:
         return dict(stated)
 

@@ -215,20 +215,18 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
     if apart:
         count = runs_of(len(apart))
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
-    missing = "not stated"
-    settings = [each.settings for each in (first, second) if each.settings is not None]
-    names = dict.fromkeys(name for each in settings for name in each) if len(settings) == 2 else {}
-    values = {name: [each.get(name, missing) for each in settings] for name in names}
-    is_alike = first.label == second.label  # of another method only what both have can differ
-    differing = [
-        f"{name} {a} and {b}"
-        for name, (a, b) in values.items()
-        if a != b and (is_alike or missing not in (a, b))
-    ]
+    ours, theirs = first.settings or {}, second.settings or {}
+    both = {name: (ours[name], theirs[name]) for name in ours if name in theirs}  # not those of one method
+    differing = [f"{name} {_stated(a)} and {_stated(b)}" for name, (a, b) in both.items() if a != b]
     if differing:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
         what = ", ".join(differing[:NAMED])
         yield f"settings differ between {first.name} and {second.name}: {what}{more}"
+
+
+def _stated(value: Any) -> Any:
+    """Return the value of a setting as a sentence has it."""
+    return "not stated" if value is None else value
 
 
 def table_of_runs(groups: Sequence[Sequence[Candidate]]) -> pd.DataFrame:

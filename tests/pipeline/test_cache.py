@@ -82,7 +82,8 @@ def test_what_was_compiled_ahead_is_not_compiled_again(
     replaying = start_fuselog("replay", str(log), "-e", "ekf", "-o", f"{tmp_path}/est.mcap")
     replaying.communicate()
     assert replaying.returncode == 0
-    assert set(kept_files()) == kept
+    new = {each.name.partition("-")[0] for each in set(kept_files()) - kept}
+    assert new <= {"_scan", "_sort", "_agree"}  # which this process may have had from another cache
 
 
 def test_what_cannot_be_compiled_ahead_is_one_sentence(place: Path, fuselog: Callable[..., Any]) -> None:
