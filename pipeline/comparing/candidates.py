@@ -259,6 +259,11 @@ def of_result(folder: Path, progress: Progress) -> Given:
             "each run; compare its estimates logs"
         )
     rows, times = (read_table(path) for path in tables.values())
+    if not pd.api.types.is_integer_dtype(rows["run"]):
+        raise BadInput(
+            f"{folder}: its runs have names, as those of a comparison; compare the logs or results that "
+            "it was made of"
+        )
     stated = result.settings.get("parameters", {})
     numbers = sorted(set(rows["run"]))
     runs = {number: _run_of_result(result, number) for number in numbers}

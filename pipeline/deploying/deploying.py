@@ -1,7 +1,7 @@
 """Writes a filter as C99: `deploy`."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from fuselog.pipeline.deploying.folder import cmake_text, readme_text
 from fuselog.pipeline.runs.ensemble import Settings
 from fuselog.recorders.atomic import whole_folder
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.replay.engine.replaying.estimator import Recursive, bind, configure
+from fuselog.replay.engine.replaying.estimator import Reading, Recursive, bind, configure
 from fuselog.replay.foreign.filters import description_of_library
 from fuselog.replay.foreign.naming import shorthand
 from fuselog.replay.foreign.native.library import HEADER
@@ -81,7 +81,7 @@ def deploy(
     run, name = open_source(log), identifier(place.resolve().name)
     precision = SINGLE if single else DOUBLE
     bound, made = _made(name, label, {**settings, **parameters}, run, precision)
-    made = _without_clash(made)
+    made = _without_clash(made, bound.reading)
     vectors = vectors_of(run, bound, made.filtering)
     files = {
         f"{made.name}.h": header(made),
@@ -148,9 +148,12 @@ def _made(
     return bound, CFilter(name, filtering, whole_steps(filtering, kind), precision, origin)
 
 
-def _without_clash(made: CFilter) -> CFilter:
+def _without_clash(made: CFilter, reading: Callable[[], Reading] | None) -> CFilter:
     """Return the filter under a name that is no other word of its C, such as a variable's."""
-    text = source(made._replace(name="fuselog_filter"))
+    alone = made._replace(name="fuselog_filter")
+    text = source(alone) + test_text(alone)
+    if reading is not None and not why_no_replay(alone):
+        text += replay_text(alone, reading())
     words = re.findall(r"\w+", re.sub(r'/\*.*?\*/|//[^\n]*|"[^"\n]*"', " ", text, flags=re.DOTALL))
     return made._replace(name=f"{made.name}_filter") if made.name in words else made
 

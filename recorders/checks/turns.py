@@ -16,6 +16,7 @@ from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 
 NEAR_DEGREES = 0.1
 TOO_FAST_RADPS = 35.0
+BACKWARDS_RAD = 2.6
 HALF = 0.5  # of a slope, above which a mirror image is one
 CLEARER = 1.5  # times as well as its mirror image do forces fit
 FITS = 0.9
@@ -155,6 +156,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
         rest = wrap_angle(offsets - mean)
         spread = float(np.std(rest))
         error = spread / np.sqrt(len(rest) / 4.0)  # windows overlap
+        is_backwards = abs(mean) > BACKWARDS_RAD  # or so the wheels say
         if abs(mean) > max(SMALL_RAD, SURE * error) and spread < STEADY_RAD:
             yield Finding(
                 "mounting",
@@ -163,8 +165,9 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
                 mean,
                 f"{orientation.topic}: its heading is {np.degrees(mean):.3g} deg anticlockwise of the "
                 f"course ({len(rest)} windows, spread {np.degrees(spread):.2g} deg): by the sensor's "
-                "mounting, or north is magnetic",
-                otherwise="in the mapping turn it back, by mounting_deg",
+                f"mounting, or north is magnetic{', or speeds have the wrong sign' * is_backwards}",
+                otherwise="in the mapping turn it back, by mounting_deg"
+                f"{', or the speeds, by factors' * is_backwards}",
             )
 
 

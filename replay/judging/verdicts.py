@@ -87,6 +87,8 @@ class Squares:
     def verdict(self) -> Consistency:
         """Decide what it says of the estimator: by chance over covariances, and over the runs."""
         low, high = self.usual
+        if math.isnan(self.found.value):
+            return Consistency.UNDECIDED
         is_excluded = self.found.is_bounded and not self.found.low <= self.aim <= self.found.high
         is_usual = low <= self.found.value <= high and not is_excluded
         if is_usual or abs(self.found.value / self.aim - 1.0) <= MATERIAL:

@@ -81,6 +81,8 @@ def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: 
     assert (times["low"] > 0).mean() > 0.5
     assert any("sigma_range_m" in note for note in found.notes)
     assert "nees" in {each.quantity for each in found.worse()}
+    with pytest.raises(fl.BadInput, match=r"out: its runs have names, as those of a comparison"):
+        fl.compare(tmp_path / "out", tmp_path / "out")
 
 
 @pytest.mark.paper

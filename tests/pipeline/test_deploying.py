@@ -255,6 +255,15 @@ def test_its_test_notices_errors_of_one_character(tmp_path: Path) -> None:
 
 @pytest.mark.paper
 @needs_compiler
+@pytest.mark.parametrize("name", ["log", "own", "vectors", "cortex_m4f"])
+def test_a_filter_may_be_named_as_what_stands_beside_it(tmp_path: Path, name: str) -> None:
+    """A function of libm, a variable of the test, and files of the folder."""
+    folder = fl.deploy(robot_log(tmp_path), "ekf", tmp_path / name, model="robot")
+    assert furthest(compiled(folder)) < 1e-12
+
+
+@pytest.mark.paper
+@needs_compiler
 def test_a_body_that_does_not_turn_has_an_orientation_in_single_precision(tmp_path: Path) -> None:
     """A rotation by nothing is divided by its angle, which a tiny constant keeps from being zero.
 

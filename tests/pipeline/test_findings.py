@@ -118,6 +118,16 @@ def test_a_clipped_log_is_said_to_be_by_replay_run_and_with_causes(
         assert result["settings"]["notes"] == [found.sentence]
 
 
+def test_wheels_that_turn_backwards_are_named_beside_the_compass() -> None:
+    """A heading that is 180 deg off the course may be right, if the speeds have the wrong sign."""
+    log = fl.record("car", seed=5)
+    wheels = column("forward_mps", np.negative)(log.streams[ODOMETRY])
+    [found] = fl.lint(replace(log, streams={**log.streams, ODOMETRY: wheels}))
+    assert found.where == "/car/heading"
+    assert "or speeds have the wrong sign" in found.evidence
+    assert "or the speeds, by factors" in found.fix
+
+
 def test_lint_denies_no_more_than_it_looked_at(tmp_path: Path, fuselog: Fuselog) -> None:
     fl.write(tmp_path / "log.mcap", recorded(faulty(2003, "nothing")))
     assert (

@@ -18,7 +18,10 @@ from fuselog.replay.tracing.graph import INPUT, described, needed
 _NAMES_OF_C = """auto break case char const continue default do double else enum extern float for goto if
 inline int long register restrict return short signed sizeof static struct switch typedef union unsigned
 void volatile while filter parameters P S C v F H G u a slope data time_ns duration_s step innovation
-samples away centre shift value again index round i k found noise factorisation drawn_samples"""
+samples away centre shift value again index round i k found noise factorisation drawn_samples
+abs acos asin atan ceil cos cosh div erf exp exp2 expm1 fabs fdim float_t floor fma fmax fmin fmod gamma
+hypot j0 j1 jn ldexp log log10 log1p log2 logb main nan pow remainder rint sin sinh sqrt stderr stdin
+stdout tan tanh time trunc y0 y1 yn vectors cortex_m4f"""
 
 
 class CFilter(NamedTuple):

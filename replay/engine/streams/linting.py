@@ -34,7 +34,8 @@ def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
     """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
     if found:
         others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
-        yield f"implausible: {found[0].sentence}{others if len(found) > 1 else ''}"
+        sure = "hint" if found[0].severity == "hint" else "implausible"
+        yield f"{sure}: {found[0].sentence}{others if len(found) > 1 else ''}"
 
 
 def of_first_messages(sources: Sequence[LogSource | MemorySource]) -> list[str]:
