@@ -76,8 +76,8 @@ def unit(text: str) -> Unit:
         for name, own in factor.powers.items():
             powers[name] += own * power
         place = found.end()
-    if number and not float(number[1]) > 0.0:
-        raise BadInput(f"the unit '{text}': its number has to be above zero; `factors` has signs")
+    if number and float(number[1]) == 0.0:
+        raise BadInput(f"the unit '{text}': its number must not be zero")
     return Unit(
         float(number[1]) * size if number else size, {name: own for name, own in powers.items() if own}
     )
