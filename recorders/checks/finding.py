@@ -1,7 +1,8 @@
 """Defines what a check finds: where, a sentence with its evidence, how severe it is, and its fix."""
 
+import warnings
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 Kind = Literal[
     # Of a log: what it says without a filter.
@@ -49,6 +50,18 @@ Kind = Literal[
     "unused",
     "gates",
 ]
+# What the release before called them: in lint's findings, in a diagnosis' sentences, in alarms.
+_OLD = {
+    "words": "sentence",
+    "mended": "sentence",
+    "topic": "where",
+    "estimator": "where",
+    "field": "part",
+    "case": "part",
+    "excess": "value",
+    "mapping": "otherwise",
+    "sure": "severity",
+}
 Severity = Literal["fact", "likely", "hint"]  # counted in the data; far from chance; may be intended
 
 
@@ -89,6 +102,21 @@ class Finding:
     def sentence(self) -> str:
         """Return the evidence, with what to do."""
         return "; ".join(filter(None, (self.evidence, self.fix)))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            """Return what the release before called so, with a FutureWarning."""
+            if name == "cause":  # only what a likelihood names has one
+                return None
+            if name not in _OLD:
+                raise AttributeError(f"'{type(self).__name__}' has no '{name}'")
+            warnings.warn(
+                f"Finding: '{name}' is called '{_OLD[name]}' now; the old name goes in the next release",
+                FutureWarning,
+                stacklevel=2,
+            )
+            return getattr(self, _OLD[name])
 
     @property
     def as_json(self) -> dict[str, Any]:

@@ -126,6 +126,8 @@ def test_wheels_that_turn_backwards_are_named_beside_the_compass() -> None:
     assert found.where == "/car/heading"
     assert "or speeds have the wrong sign" in found.evidence
     assert "or the speeds, by factors" in found.fix
+    with pytest.warns(FutureWarning, match="Finding: 'words' is called 'sentence' now"):
+        assert found.words == found.sentence  # what scripts of the release before ask for
 
 
 def test_lint_denies_no_more_than_it_looked_at(tmp_path: Path, fuselog: Fuselog) -> None:
