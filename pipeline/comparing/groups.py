@@ -216,9 +216,8 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         count = runs_of(len(apart))
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
     ours, theirs = first.settings or {}, second.settings or {}
-    both = {
-        name: (ours[name], theirs[name]) for name in ours if name in theirs
-    }  # not those of one method
+    # what only one of them has is of its method
+    both = {name: (ours[name], theirs[name]) for name in ours if name in theirs}
     differing = [f"{name} {_stated(a)} and {_stated(b)}" for name, (a, b) in both.items() if a != b]
     if differing:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""

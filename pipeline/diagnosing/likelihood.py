@@ -31,7 +31,6 @@ from fuselog.pipeline.tuning.broad_starts import (
 from fuselog.pipeline.tuning.control_noise import disturbed
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
-from fuselog.recorders.log.impossible import YEAR_NS, possible
 from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.ensembles import Ensemble
@@ -123,7 +122,7 @@ class Likelihood:
         """
         bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
-        later = {topic: _moved(each, self.later_ns)[0] for topic, each in trial.source.streams.items()}
+        later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
         self.starts = broad_starts(replace(trial.source, streams=later), bound)
         self.readings = {
             each.name: each.reading()
@@ -215,16 +214,12 @@ class Likelihood:
                     added = trial.stretched.get(topic, 0.0) * len(streams[topic])
                     stretch[each.name] = stretch.get(each.name, 0.0) + added
                 begins += streams[topic].publish_time_ns[:1].tolist()
-        moved = {
-            topic: known.once([stream], self.later_ns, partial(_moved, stream, self.later_ns))
+        later = {
+            topic: known.once([stream], self.later_ns, partial(_later, stream, self.later_ns))
             for topic, stream in streams.items()
         }
-        ends_ns = [end_ns for _, ends_ns in moved.values() for end_ns in ends_ns]
-        source = replace(
-            trial.source,
-            streams={topic: stream for topic, (stream, _) in moved.items()},
-            is_raw=trial.source.is_raw or max(ends_ns, default=0) - min(ends_ns, default=0) <= YEAR_NS,
-        )
+        # raw: a trial that leaves out what is impossible after an alteration would gain by that
+        source = replace(trial.source, streams=later, is_raw=True)
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
@@ -381,13 +376,8 @@ def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
     return replace(inside, publish_time_ns=np.maximum(inside.publish_time_ns, begin_ns))
 
 
-def _moved(stream: Stream, by_ns: int) -> tuple[Stream, tuple[float, ...]]:
-    """Return a stream with later stamps, and their ends; infinite if it has impossible messages."""
-    later = replace(stream, publish_time_ns=stream.publish_time_ns + by_ns) if by_ns else stream
-    if possible(later, None)[1]:
-        return later, (-np.inf, np.inf)
-    stamps_ns = later.publish_time_ns
-    return later, (int(stamps_ns.min()), int(stamps_ns.max())) if len(later) else ()
+def _later(stream: Stream, by_ns: int) -> Stream:
+    return replace(stream, publish_time_ns=stream.publish_time_ns + by_ns) if by_ns else stream
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:

@@ -105,8 +105,7 @@ def first_part(
             f"{MOST_MESSAGES} of {count} messages, and tried on the rest; for another part: fuselog cut"
         )
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    # Impossible values were left out above: no trial leaves out more, or it would gain by that.
-    part = MemorySource(streams, run, source.name, is_raw=True)
+    part = MemorySource(streams, run, source.name)
     return Portion(part, end_ns, note)
 
 
