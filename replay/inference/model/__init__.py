@@ -1,4 +1,4 @@
-"""Defines what a model is, how a log serves it, and what may be added to its state.
+"""Models: their definition, their binding to a log, and additions to their state.
 
 Begin with `model`.
 """

@@ -1,10 +1,11 @@
-"""Augments a state by parameters of its model: a sensor's bias, a scale factor, a time offset.
+"""Augmentation of a state by parameters, such as a sensor's bias, a scale factor or a time offset.
 
-A transformation of models: the state gets a component for each, which the model's functions read in
-place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
-has the parameter's value for a mean, and stands beside the log's; between measurements it moves as
-`fuselog.replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the
-points of a map are added in the same way, see `fuselog.replay.inference.model.point_errors`.
+This is a transformation of models: each parameter becomes a component of the state, which the model's
+functions read in place of the parameter. Derivatives, samples and smoothers then include it without
+special treatment, and methods see an ordinary model. The prior of the component has the parameter's
+value as its mean and is appended to the log's prior. Between measurements, the component moves as
+described in `fuselog.replay.inference.model.gauss_markov`. Errors of the points of a map are added in
+the same way; see `fuselog.replay.inference.model.point_errors`.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,12 +45,12 @@ from fuselog.replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 OfModel = TypeVar("OfModel", bound=ModelFunction)
-# (static topics) -> what an estimator begins with.
+# (static topics) -> initial state of an estimator.
 Start = Callable[[Mapping[str, Ragged]], object]
 
 
 class Added(NamedTuple):
-    """Holds what is added to the state: parameters, then errors about points, and how each moves."""
+    """Components that are added to the state (parameters, then point errors) and their processes."""
 
     parameters: Names
     errors: Errors
@@ -57,20 +58,20 @@ class Added(NamedTuple):
 
     @property
     def names(self) -> Names:
-        """Return the components, in their order."""
+        """Names of the components, in their order."""
         return self.parameters + tuple(each.name for each in self.errors)
 
 
 def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added:
-    """Return what is to be estimated beside the state, as the settings say.
-
-    Raises BadInput where the model does not list as `augmentable` what is asked for, one stands twice,
-    or has no sigma.
+    """Return the components to be estimated in addition to the state, as the settings request.
 
     Args:
-        label: the estimator's, for errors.
-        model: whose parameters are asked for.
-        parameters: with `estimate` and its options.
+        label: label of the estimator, for errors.
+        model: the model whose parameters are requested.
+        parameters: settings with `estimate` and its options.
+
+    Raises BadInput if the model does not list a requested parameter as `augmentable`, if a parameter is
+    named twice, or if it has no sigma.
     """
     asked = list(map(field_of, parameters.estimate or []))
     options = {
@@ -110,7 +111,7 @@ def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added
 
 
 def check_augmentable(where: str, model: Model) -> None:
-    """Raise BadInput where `augmentable` does not map parameters of the model to linear or angle."""
+    """Raise BadInput if `augmentable` does not map parameters of the model to "linear" or "angle"."""
     if not isinstance(model.augmentable, Mapping):
         raise BadInput(
             f"{where}: augmentable is a {type(model.augmentable).__name__}; it is a mapping from "
@@ -129,7 +130,7 @@ def check_augmentable(where: str, model: Model) -> None:
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
-    """Add parameters and errors to a model's state; the model itself where there are none.
+    """Add parameters and errors to a model's state; without any, return the model itself.
 
     >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
@@ -140,11 +141,11 @@ def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
 
 
 def augmented_stage(stage: Stage, added: Added) -> Stage:
-    """Return the same of a model as a method takes it.
+    """Add parameters and errors to the state of a bound model.
 
     Args:
-        stage: the model with the sensors at hand.
-        added: what is added to its state.
+        stage: the bound model, with the sensors of the log.
+        added: components to add to its state.
     """
     names, errors = added.parameters, added.errors
     if names:
@@ -161,11 +162,11 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
 
 
 def with_gauss_markov(settings: Floats, added: Added) -> Floats:
-    """Return numbers of motion and sensors with those that an augmented model has beside them.
+    """Append the numbers of the added processes to the settings of motion and sensors.
 
     Args:
         settings: (1 + sensors, fields).
-        added: what is added to the state.
+        added: components that are added to the state.
     """
     numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
@@ -174,17 +175,16 @@ def with_gauss_markov(settings: Floats, added: Added) -> Floats:
 def begin(
     label: str, topic: str, stage: Stage, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
-    """Make the function that extends the log's own prior on `topic` to an augmented model's.
-
-    `stage` and `settings` are those of the model itself. Raises BadInput where a parameter that is to be
-    estimated has no value.
+    """Make the function that extends the log's prior on `topic` to the augmented state.
 
     Args:
-        label: the estimator's, for errors.
-        topic: of the prior.
-        stage: of the model itself.
-        added: what is added to its state.
-        settings: (1 + sensors, fields), of the model itself.
+        label: label of the estimator, for errors.
+        topic: topic of the prior.
+        stage: the bound model before augmentation.
+        added: components that are added to its state.
+        settings: (1 + sensors, fields), before augmentation.
+
+    Raises BadInput if a parameter to be estimated has no value.
     """
     fields = number_fields(stage.model.parameters)
     means = np.array(
@@ -236,7 +236,7 @@ def _augmented(model: Model, names: Names) -> Model:
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """Return the motion, in which parameters are random walks or return to their given values."""
+    """Add components to a motion that are random walks or return to their given values."""
     n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)
@@ -300,7 +300,7 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
 
 
 def _reading(model: Model, names: Names, function: OfModel) -> OfModel:
-    """Make a model's function of the augmented state, which reads estimated parameters from there."""
+    """Make a function of the augmented state that reads the estimated parameters from the state."""
     n, fields = model.size, number_fields(model.parameters)
     settings = settings_type(fields)
     places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)

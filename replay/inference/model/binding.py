@@ -1,7 +1,7 @@
-"""Finds the topics of a log that serve a model, by the model's names for them.
+"""Binding of a model to a log: finds the topics that serve the model, by the model's names for them.
 
-One binding for all models: the topics of a model are looked for under every prefix that has its prior,
-as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.
+All models are bound in the same way: the topics of a model are searched under every prefix that has its
+prior, such as `/robot1/odometry` next to `/robot1/prior`. Sensors without a topic are left out.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -21,22 +21,24 @@ from fuselog.replay.inference.model.model import (
     Sensor,
 )
 
-START = "start"  # the frame of what begins at zero, wherever that is
+START = "start"  # frame of estimates that begin at zero, at an unknown position
 
 
 class Found(NamedTuple):
-    """Holds where a log has what a model needs.
+    """The topics of a log that a model uses.
 
     Attributes:
-        prefix: what the names of its topics begin with, as `/robot1`.
-        prior: of a log without one, where it would be.
-        truth: the topic that estimates are compared with.
-        control: what drives the motion.
-        sensors: those that the log has.
-        has_prior: whether the log does; else see `fuselog.replay.inference.run.initialization`.
-        fallbacks: topics that take the place of some components of the control.
-        origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
-        frame: the frame of its own that its positions are in; empty where they are in the log's plane.
+        prefix: prefix of the names of its topics, such as `/robot1`.
+        prior: topic of the prior; in a log without one, its name if it existed.
+        truth: topic that estimates are compared with.
+        control: topic that drives the motion.
+        sensors: sensors that the log has, with their topics.
+        has_prior: whether the log has the prior; otherwise see
+            `fuselog.replay.inference.run.initialization`.
+        fallbacks: topics that replace some components of the control.
+        origin: latitude, longitude (deg) and altitude (m) of the origin of the local tangent plane (3,),
+            if the log states it.
+        frame: separate frame of the positions; empty if they are in the log's local tangent plane.
     """
 
     prefix: str
@@ -51,12 +53,12 @@ class Found(NamedTuple):
 
     @property
     def geodetic(self) -> tuple[Topic, ...]:
-        """Return the topics of fixes that are latitude and longitude."""
+        """Topics of position fixes in latitude and longitude."""
         return tuple(topic for _, topic in self.sensors if topic.schema_name == GEODETIC)
 
 
 def roles_of(model: Model) -> list[str]:
-    """Return the topics that a model asks for, by the names that it has for them."""
+    """Return the model's names for all topics that it can use."""
     control = [model.control, *model.control.fallbacks] if model.control else []
     maps = [each.topic for sensor in model.all_sensors for each in sensor.maps]
     sensors = [sensor.topic for sensor in model.all_sensors]
@@ -65,28 +67,28 @@ def roles_of(model: Model) -> list[str]:
 
 
 class UnderPrefix(NamedTuple):
-    """Holds the topics under one prefix of a log; `names` gives a topic by the model's name for it."""
+    """The topics under one prefix of a log; `names` maps the model's names to names of topics."""
 
     topics: Mapping[str, Topic]
     prefix: str
     names: Mapping[str, str]
 
     def place(self, name: str) -> str:
-        """Return a topic's full name."""
+        """Return the full name of a topic."""
         return resolved(self.names.get(name, name), self.prefix)
 
     def topic(self, name: str, schema: Schema) -> Topic | None:
-        """Return the topic of this name, if its messages are of the schema or serve as such."""
+        """Return the topic of this name if its messages have the schema or can be converted to it."""
         found = self.topics.get(self.place(name))
         return found if found is not None and found.schema_name in serving(schema) else None
 
     def has(self, name: str) -> bool:
-        """Tell whether there is a topic of this name, whatever it is."""
+        """Test whether the log has a topic of this name, of any type."""
         return self.place(name) in self.topics
 
 
 def serving(schema: Schema) -> tuple[str, ...]:
-    """Return the schemas, by their full names, whose messages a sensor of this schema takes."""
+    """Return the full names of the schemas whose messages a sensor of this schema accepts."""
     geodetic = (GEODETIC,) if schema is schemas.POSITION_FIX else ()
     return (schema.full_name, *geodetic)
 
@@ -94,7 +96,7 @@ def serving(schema: Schema) -> tuple[str, ...]:
 def first_and_more(
     named: Mapping[str, str | Sequence[str]],
 ) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Split topics by the model's names for them: the first that is named so, and the others.
+    """Split the topics given for each of the model's names into the first topic and the others.
 
     >>> first_and_more({"pose": "/amcl/pose", "fix": ["/gps1/fix", "/gps2/fix"]})
     ({'pose': '/amcl/pose', 'fix': '/gps1/fix'}, {'fix': ['/gps2/fix']})
@@ -111,9 +113,10 @@ def with_more(
     topics: Mapping[str, Topic],
     more: Mapping[str, Sequence[str]],
 ) -> Found:
-    """Add further topics of the kinds that a model's sensors have, each next to the first of its kind.
+    """Add further topics for a model's sensors, each next to the first topic of its sensor.
 
-    Raises BadInput if one has another message than its kind, or the kind is no sensor that is taken.
+    Raises BadInput if a topic has a type that its sensor does not accept, or if the model does not use
+    that sensor with this log.
     """
     sensors = list(found.sensors)
     for role, names in more.items():
@@ -138,15 +141,15 @@ def with_more(
 def topics_of(
     model: Model, topics: Mapping[str, Topic], names: Mapping[str, str] | None = None
 ) -> list[Found]:
-    """Find everything in a log that is of this model; `names` are topics by the model's names for them.
+    """Find every object in a log that this model describes.
 
-    A thing's topics are in one namespace. Where that cannot be meant, since each of its sensors has one
-    of its own, they are those of one thing; see `_one_thing`.
+    The topics of an object share a namespace. If this cannot apply because each sensor has a namespace
+    of its own, all topics belong to one object; see `_one_thing`.
 
     Args:
         model: the model.
-        topics: of the log, by name.
-        names: see above.
+        topics: topics of the log, by name.
+        names: names of topics, by the model's names for them.
     """
     names = names or {}
     one = _one_thing(model, topics, names)
@@ -167,12 +170,13 @@ def topics_of(
 def _one_thing(
     model: Model, topics: Mapping[str, Topic], names: Mapping[str, str]
 ) -> UnderPrefix | None:
-    """Return the one thing of a model whose topics are in several namespaces; None where they are not.
+    """Return the single object of a model whose topics are in several namespaces; None if there is none.
 
-    With one control there is one thing, in its namespace. With none there is one where no sensor, prior
-    or truth is there twice, in the namespace of the prior, or that which its sensors have in common.
-    What its namespace lacks, and one other has, is its own; what several others have is not taken. Nor
-    is a pose, which may be a goal, or in a frame of its own.
+    A log with one topic for the control has one object, in the namespace of that topic. A log without a
+    control has one object if no sensor, prior or truth occurs twice; its namespace is that of the prior,
+    or the common part of the sensors' namespaces. A topic that this namespace lacks is taken from
+    elsewhere if it occurs once; if it occurs several times, it is not used. Poses are not taken from
+    elsewhere either, since they may be goals or be in a frame of their own.
     """
     there = {name: topic for name, topic in topics.items() if not name.startswith("/estimates/")}
     homes: list[str] = []
@@ -213,14 +217,14 @@ def _one_thing(
 
 
 def _serves(model: Model, name: str, topic: Topic) -> bool:
-    """Tell whether a topic of the right type is of a model's system, and a prior of its state."""
+    """Test whether a sensor's topic belongs to the model's system, or a prior to its state."""
     if name == model.prior:
         return model.state.keys() <= set(topic.metadata.get("components", "").split(","))
     return topic.metadata.get("system", model.system) == model.system
 
 
 def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
-    """List the topics of any namespace that end with this name, and serve as messages of the schema."""
+    """List the topics of any namespace that end with this name and serve as messages of the schema."""
     end = f"/{name.removeprefix('/')}"
     return [
         each
@@ -230,17 +234,20 @@ def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
 
 
 def _common(spaces: Collection[str]) -> str:
-    """Return the namespace that all of these are in."""
+    """Return the longest namespace that contains all of these."""
     parts = zip(*(space.split("/") for space in spaces), strict=False)
     alike = takewhile(lambda each: len(set(each)) == 1, parts)
     return "/".join(each[0] for each in alike)
 
 
 def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[str, str]:
-    """Say of topics that are not taken how they would be, where the model has none of that kind.
+    """Suggest settings for unused topics that could serve as a sensor or fallback that the log lacks.
 
-    A kind is a sensor, or what takes the place of a part of the control; its message tells it where only
-    one has such, and else the topic's name.
+    A topic can serve if only one sensor or fallback accepts its type, or otherwise if its name ends with
+    the model's name for it.
+
+    Returns:
+        The option that uses the topic, by topic.
     """
     kinds = {sensor.topic: sensor.schema for sensor in model.all_sensors}
     if model.control is not None:
@@ -265,7 +272,7 @@ def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[s
 
 
 def _found(model: Model, here: UnderPrefix) -> Found | None:
-    """Return what there is of a model under one prefix; None where it does not fit."""
+    """Return the topics of a model under one prefix, or None if the model does not fit."""
     control = here.topic(model.control.topic, model.control.schema) if model.control else None
     if model.control is not None and control is None:
         return None
@@ -295,10 +302,10 @@ def _found(model: Model, here: UnderPrefix) -> Found | None:
 def _suffices(
     model: Model, here: UnderPrefix, sensors: Sequence[tuple[Sensor, Topic]], *, has_prior: bool
 ) -> bool:
-    """Tell whether a model can start from these sensors or the prior, and go on.
+    """Test whether a model can start from the prior or these sensors, and continue.
 
-    A log without the prior fits a model that can start without, if a sensor measures the state itself.
-    One without sensors fits if it has no part of them, such as sightings whose map is missing.
+    A log without a prior fits a model that can start without one if a sensor measures the state itself.
+    A log without sensors fits if it also has no part of them, such as sightings without their map.
     """
     if not has_prior and (model.start is None or here.has(model.prior)):
         return False
@@ -313,15 +320,15 @@ def _suffices(
 
 
 def measures_state(model: Model, sensor: Sensor) -> bool:
-    """Tell whether a sensor measures components of the state by their names, with their covariance."""
+    """Test whether a sensor measures components of the state by name, with their covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
 
 
 def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Found:
-    """Find the plane that positions are in: the log's, or a frame of its own; see `Filter.start`.
+    """Determine the frame of the positions: the log's local tangent plane, or a frame of their own.
 
-    Raises BadInput where a sensor says where the thing is in a frame of its own, and another one on
-    earth; and where fixes are used and channels state different origins.
+    See also `Filter.start`. Raises BadInput if one sensor measures positions in a frame of its own and
+    another one on earth, or if fixes are used and channels state different origins.
     """
     placing = [(sensor, topic) for sensor, topic in found.sensors if "x_m" in sensor.measured]
     if "x_m" not in model.state:

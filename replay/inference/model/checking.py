@@ -1,6 +1,6 @@
-"""Checks that a model is what it declares, by trying its functions: for the tests of its author.
+"""Checks of a model against what it declares, made by calling its functions, for the author's tests.
 
-What `check_model` finds at random states is one sentence with the function's file and line.
+Each failure of `check_model`, found at random states, is one sentence with the function's file and line.
 """
 
 import warnings
@@ -40,26 +40,27 @@ from fuselog.replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
-# Of the step in which noise has to add up, and how near; and the share of a variance from others.
+# Step for the test that noise is additive, its tolerance, and the share of a variance from other
+# components.
 SHORT_S, ADDS_UP, FROM_OTHERS = 0.01, 0.1, 0.01
 STEP = 1e-5  # of central differences
 TURN = 2.0 * np.pi
 
 
-# (state, other inputs) -> Jacobians by the inputs' names.
+# (state, other inputs) -> Jacobians by name of the input.
 Derivatives = Callable[[Floats, Sequence[Floats]], dict[str, Floats]]
 
 
 class _Call(NamedTuple):
-    """Holds a model's function of a state and other inputs, as a method calls it.
+    """A model's function of a state and other inputs, as a method calls it.
 
     Attributes:
-        what: its name and place, for sentences.
-        function: itself.
+        what: its name and place, for messages.
+        function: the function.
         state: names and kinds of the state's components.
-        outputs: those of what it returns.
-        inputs: the further arguments that derivatives are taken by, by name: how many numbers each has,
-            and whether it is zero.
+        outputs: names and kinds of the returned components.
+        inputs: further arguments to differentiate by: by name, their number of components, and whether
+            they are zero.
         rest: the last arguments.
     """
 
@@ -83,24 +84,26 @@ def check_model(
     states: ArrayLike | None = None,
     seed: int = 0,
 ) -> "Checked":
-    """Check all functions of a model against what it declares.
+    """Check all functions of a model against what the model declares.
+
+    Process noise that does not add up, because two half steps add another variance than one whole step,
+    is only reported and raises a warning: published filters with a fixed rate use noise per step.
 
     Args:
         model: the model.
-        parameters: their values; one that is neither given nor has a default is 1.
-        states: (n, components) at which to try; random ones of order one unless given.
-        seed: of the random states, controls and points of a map.
+        parameters: values of its parameters; a parameter that is not given and has no default is 1.
+        states: states (n, components) at which to call the functions; by default, random ones of order
+            one.
+        seed: seed of the random states, controls and points of a map.
 
     Returns:
-        Sentences on what was checked, on what was not, and on process noise that does not add up: it
-        is not the same over two half steps as over a whole one. There is a warning of that too, and no
-        error: filters of regular steps are published with noise per step.
+        Sentences about what was checked, what was not checked, and process noise that does not add up.
 
-    Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
-    from central differences or from those written by hand, a number of components is wrong, what is
-    declared linear is not, an angle is declared linear or what is declared an angle is none, a unit
-    vector leaves its length, or a variance is negative; BadInput where the parameters are none of the
-    model's.
+    Raises AssertionError, with one sentence, if a function cannot be traced, if its derivatives differ
+    from central differences or from those written by hand, if a number of components is wrong, if a
+    function that is declared linear is not, if an angle is declared linear or the reverse, if a unit
+    vector changes its length, or if a variance is negative. Raises BadInput if a parameter is not one of
+    the model's.
     """
     values = build(model.parameters, parameters or {}, "check_model")
     names = number_fields(model.parameters)
@@ -161,7 +164,7 @@ def check_model(
 
 
 class Checked(tuple[str, ...]):
-    """Holds sentences on what was checked; a notebook shows them line by line."""
+    """Sentences about what was checked; a notebook shows one per line."""
 
     def __repr__(self) -> str:
         return "\n".join(self)
@@ -170,7 +173,7 @@ class Checked(tuple[str, ...]):
 def _checked(
     model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
 ) -> Checked:
-    """Say what was checked of every function, and what was not, since nothing is declared of it."""
+    """Describe for every function what was checked, and what was not because nothing is declared."""
     sentences = [f"{model.summary}: {len(calls)} functions at {states} states"]
     for call, part in zip(calls, parts, strict=True):
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
@@ -199,7 +202,7 @@ def _sensor_call(model: Model, sensor: Sensor, numbers: Settings, rng: np.random
 
 
 def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
-    """Draw random states (n, components): numbers of order one, angles of all turns, unit vectors."""
+    """Draw random states (n, components): numbers of order one, arbitrary angles, and unit vectors."""
     columns = []
     for kind, *_ in manifold_blocks(kinds):
         drawn = rng.normal(size=(STATES, WIDTHS[kind]))
@@ -219,7 +222,7 @@ def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
 
 
 def _derivatives_of(call: _Call) -> Derivatives:
-    """Make a function of a state and other inputs that gives exact Jacobians, by the inputs' names."""
+    """Make a function of a state and other inputs that returns exact Jacobians by name of the input."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
     counts = {name: n for name, (n, _) in call.inputs.items()}
     inputs = [Input("state", kinds, "state")]
@@ -243,7 +246,7 @@ def _derivatives_of(call: _Call) -> Derivatives:
 def _check_derivatives(
     call: _Call, exact: Derivatives, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
-    """Compare derivatives with differences and what is written by hand; returns that by the state."""
+    """Compare derivatives with central differences and handwritten ones; return the one by the state."""
     jacobians = exact(state, others)
     for index, (name, jacobian) in enumerate(jacobians.items()):
         for column, slopes in enumerate(_slopes(call, [state, *others], index).T):
@@ -253,7 +256,7 @@ def _check_derivatives(
 
 
 def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
-    """Compute the Jacobian (outputs, size) by one of the arguments, by central differences."""
+    """Compute the Jacobian (outputs, size) by one argument from central differences."""
     outputs = tuple(call.outputs.values())
     kinds = tuple(call.state.values()) if index == 0 else ("linear",) * len(arguments[index])
     add, size = boxplus(kinds), tangent_size(kinds)
@@ -271,7 +274,7 @@ def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
 def _check_correction(
     correct: Correction, model: Model, state: Floats, rng: np.random.Generator
 ) -> None:
-    """Check that a small correction moves every component by itself, and a step back is found again."""
+    """Check that a small correction moves only its own component, and that `step` inverts `back`."""
     at, direction = tuple(state), rng.normal(size=model.tangent)
     slope = tuple(direction / np.dot(direction, correct.along(at)))
     for moved in (correct.move, correct.back):
@@ -302,7 +305,7 @@ def _check_by_hand(
         written = {name: np.zeros_like(exact[name]) for name in ("state", "control")}
         jacobians: ModelFunction = part.jacobians
         jacobians(tuple(state), tuple(control), *call.rest, written["state"], written["control"])
-        if part.control_noise is None:  # nobody asks for it
+        if part.control_noise is None:  # no method uses it
             del written["control"]
     elif isinstance(part, Sensor) and part.jacobian is not None:
         written = {"state": np.zeros_like(exact["state"])}
@@ -316,7 +319,7 @@ def _check_by_hand(
 def _compare(
     call: _Call, exact: Floats, others: Floats, by: tuple[str, int], tolerance: float, how: str
 ) -> None:
-    """Raise where a column of a Jacobian is not as it is by another way."""
+    """Raise AssertionError if a column of a Jacobian differs from that of another computation."""
     name, column = by
     found = exact[:, column]
     allowed = tolerance * np.maximum(1.0, np.maximum(np.abs(found), np.abs(exact).max(initial=0.0)))
@@ -347,7 +350,7 @@ def _check_linear(call: _Call, is_linear: bool, by_state: list[Floats]) -> None:
 
 
 def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """Check that an angle a turn further, and the negative of a unit vector, are the same state."""
+    """Check that an angle plus a full turn, and the negative of a unit vector, give the same values."""
     names, outputs = list(call.state), tuple(call.outputs.values())
     for kind, first, *_ in manifold_blocks(tuple(call.state.values())):
         if kind == "linear":
@@ -378,7 +381,7 @@ def _check_length(call: _Call, value: Floats) -> None:
 
 
 def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """Find components declared linear that jump by a turn along a path: they are angles."""
+    """Find components that are declared linear but jump by a turn along a path, as angles do."""
     kinds = tuple(call.state.values())
     add, scales = boxplus(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
     linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]
@@ -405,12 +408,12 @@ def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
 
 
 def _check_period(name: str, index: int, model: Model, calls: list[_Call], states: Floats) -> None:
-    """Find components declared linear that act by sine and cosine alone: they are angles."""
+    """Find components that are declared linear but only enter through sine and cosine, as angles do."""
     if model.kinds[index] != "linear":
         return
 
     def changes(shift: float) -> bool:
-        """Tell whether anything changes, beside the component itself, when it is shifted."""
+        """Test whether shifting the component changes anything besides the component itself."""
         for call in calls:
             zeros = [np.full(n, 0.0 if zero else 0.5) for n, zero in call.inputs.values()]
             for state in states:
@@ -436,7 +439,7 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
 def _check_noise(
     noise: ModelFunction | None, arguments: tuple[AnyArgument, ...], size: int, block: int = 0
 ) -> None:
-    """Check variances, or the rows of a lower triangle."""
+    """Check the variances, or the lower triangle of a covariance."""
     if noise is None or not size:
         return
     matrix = _matrix(noise, arguments, size, block)
@@ -448,7 +451,7 @@ def _check_noise(
 def _matrix(
     noise: ModelFunction, arguments: tuple[AnyArgument, ...], size: int, block: int = 0
 ) -> Floats:
-    """Make the covariance (size, size) of variances, or of the rows of a lower triangle."""
+    """Make the covariance (size, size) from variances or from the rows of a lower triangle."""
     numbers, matrix = np.array(noise(*arguments), dtype=float), np.zeros((size, size))
     if len(numbers) == size:
         return np.diag(numbers)
@@ -459,10 +462,10 @@ def _matrix(
 def _not_additive(
     model: Model, motion: Motion, numbers: Settings, states: Floats, rng: np.random.Generator
 ) -> list[str]:
-    """Say which components get another variance in one step than in two halves of it.
+    """Describe components that get another variance in one step than in two halves of it.
 
-    A component that gets a share of its variance from others over the step is left out: there the noise
-    may be an approximation of their order.
+    Components that get a share of their variance from others during the step are left out, because the
+    noise may be an approximation of limited order there.
     """
     whole, half = (
         _motion_call(model, motion, numbers)._replace(rest=(step_s, numbers))
@@ -495,7 +498,7 @@ def _not_additive(
 
 
 def _spread(call: _Call, motion: Motion, state: Floats, others: list[Floats]) -> Floats:
-    """Compute the covariance that a step adds: additive noise, that which enters, and the control's."""
+    """Compute the covariance that a step adds: additive noise, other noise, and noise of the control."""
     (step_s, numbers), arguments = call.rest, [state, *others]
     size = tangent_size(tuple(call.state.values()))
     total = np.zeros((size, size))

@@ -1,9 +1,9 @@
-"""Moves a state and its covariance by a step of the tangent space, after an update or a smoother's step.
+"""Corrections of a state and its covariance by a step of the tangent space, in updates and smoothers.
 
-Components move by themselves (`manifold.boxplus`), unless a model says how they bend together
-(`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
-of the new one by the derivative of the moved state by the step, and the other way by that of the step by
-the state to which it leads.
+Each component moves separately (`manifold.boxplus`), unless a model defines how components bend together
+(`model.Correction`). In both cases, the covariance is transformed from the tangent space of the old mean
+to that of the new one by the derivative of the moved state with respect to the step; in the other
+direction, by the derivative of the step with respect to the state that it leads to.
 """
 
 from typing import Protocol
@@ -28,7 +28,7 @@ Kinds = tuple[str, ...]
 
 
 class CorrectionWork(Protocol):
-    """Holds the arrays that a correction works in, see `kalman.steps.Workspace`."""
+    """Working arrays of a correction; see `kalman.steps.Workspace`."""
 
     @property
     def state(self) -> Floats: ...
@@ -43,33 +43,36 @@ class CorrectionWork(Protocol):
 
 
 class ComparisonWork(CorrectionWork, Protocol):
-    """Holds these, and `change` (..., t), whose first row becomes a step."""
+    """Working arrays of a comparison, with `change` (..., t), whose first row is set to the step."""
 
     @property
     def change(self) -> Floats: ...
 
 
 class RelinearisingWork(CorrectionWork, Protocol):
-    """Holds these, and `turned` (t,)."""
+    """Working arrays of a relinearization, with `turned` (t,)."""
 
     @property
     def turned(self) -> Floats: ...
 
 
 class FillSlope(Protocol):
-    """Fills the tangent (t,) of a belief, a mean (n,) and a covariance (t, t); see `Correction`."""
+    """Function that fills the slope (t,) for a mean (n,) and a covariance (t, t); see `Correction`."""
 
     def __call__(self, mean: Floats, covariance: Floats, slope: Floats, /) -> None: ...
 
 
 class Correct(Protocol):
-    """Moves a mean (n,) and its covariance (t, t) in place by the workspace's `step`."""
+    """Function that moves a mean (n,) and its covariance (t, t) in place by the workspace's `step`."""
 
     def __call__(self, mean: Floats, covariance: Floats, work: CorrectionWork, /) -> None: ...
 
 
 class Compare(Protocol):
-    """Fills `work.change[0]` with the step from an origin (n,) to a mean (n,); see `comparing`."""
+    """Function that fills `work.change[0]` with the step from an origin (n,) to a mean (n,).
+
+    See `comparing`.
+    """
 
     def __call__(
         self, origin: Floats, mean: Floats, covariance: Floats, work: ComparisonWork, /
@@ -77,26 +80,26 @@ class Compare(Protocol):
 
 
 class StepTo(Protocol):
-    """Fills `work.state` with the mean (n,) moved by `work.step`."""
+    """Function that fills `work.state` with the mean (n,) moved by `work.step`."""
 
     def __call__(self, mean: Floats, work: CorrectionWork, /) -> None: ...
 
 
 class Chain(Protocol):
-    """Makes of a Jacobian (m, t) at the moved state one by the step, in place."""
+    """Function that converts a Jacobian (m, t) at the moved state, in place, to one by the step."""
 
     def __call__(self, rows: Floats, work: RelinearisingWork, /) -> None: ...
 
 
 def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> FillSlope:
-    """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
+    """Make `fill(mean, covariance, slope)`, which computes the slope (t,) of `model.Correction`.
 
-    Where nothing bends it is left as it is.
+    Without a correction of its own, the function leaves the slope unchanged.
 
     Args:
-        kinds: of the state's components.
+        kinds: kinds of the state's components.
         correct: the model's own correction, if it has one.
-        form: of what the filter carries for a covariance.
+        form: the form in which the filter stores covariances.
     """
     if correct is None:
 
@@ -121,10 +124,10 @@ def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) 
 def correcting(
     kinds: Kinds, correct: Correction | None, *, back: bool = False, form: Form = COVARIANCES
 ) -> Correct:
-    """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
+    """Make `move(mean, covariance, work)`, which moves a state and its covariance by `work.step`.
 
-    Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
-    `product`. With `back` it is a step of a smoother's backward pass.
+    If components bend together, they do so along `work.slope`; `work.state`, `work.transition` and
+    `work.product` are then overwritten. With `back`, the step is one of a smoother's backward pass.
     """
     if correct is not None:
         step_together = stepping(kinds, correct.back if back else correct.move)
@@ -152,13 +155,13 @@ def correcting(
 
 
 def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
-    """Make `compare(origin, mean, covariance, work)`: it finds the step that `correcting` takes back.
+    """Make `compare(origin, mean, covariance, work)`, which finds the step that `correcting` inverts.
 
-    Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
-    from the mean's tangent space to the origin's.
+    It fills `work.change[0]` with the step from the origin (n,) to the mean, and transforms the
+    covariance from the mean's tangent space to the origin's.
 
     Args:
-        kinds: of the state's components.
+        kinds: kinds of the state's components.
         correct: the model's own correction, if it has one.
     """
     if correct is not None:
@@ -198,10 +201,10 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
 
 
 def relinearising(model: Model) -> tuple[StepTo, Chain]:
-    """Find where an iterated update linearises, and the chain rule back to the mean.
+    """Make the functions that find an iterated update's linearization point and apply the chain rule.
 
-    `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`; after it
-    `chain(rows, work)` makes of a Jacobian (m, t) at that state one by the step.
+    `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`. After that, `chain(rows,
+    work)` converts a Jacobian (m, t) at that state to one by the step.
     """
     t = model.tangent
     if model.correct is not None:
@@ -233,9 +236,9 @@ def relinearising(model: Model) -> tuple[StepTo, Chain]:
 
 
 def stepping(kinds: Kinds, move: AlongSlope) -> StepTo:
-    """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative.
+    """Make `step_to(mean, work)`, which fills `work.state` and its derivative `work.transition`.
 
-    It is moved by `work.step`, and bends along `work.slope`.
+    The mean is moved by `work.step` and bends along `work.slope`.
     """
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
@@ -250,7 +253,7 @@ def stepping(kinds: Kinds, move: AlongSlope) -> StepTo:
 
 
 def correcting_more(model: Model, more: int) -> Correction | None:
-    """Extend a model's correction to more components of the state, which move by themselves."""
+    """Extend a model's correction to further components of the state, which move separately."""
     if model.correct is None:
         return None
     n, t, correct = model.size, model.tangent, model.correct

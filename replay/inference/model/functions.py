@@ -1,7 +1,7 @@
-"""Names the functions that a model is made of, by what they take and return.
+"""Types of the functions that a model consists of, by what they take and return.
 
-They take and return tuples of numbers: states (n,), the control, the point that a message refers to. The
-parameters are a NamedTuple of numbers. All arguments are given by position.
+The functions take and return tuples of numbers: states (n,), the control, and the point that a message
+refers to. Parameters are a NamedTuple of numbers. All arguments are positional.
 """
 
 from collections.abc import Callable
@@ -9,32 +9,32 @@ from typing import Any, Protocol
 
 from fuselog.replay.engine.arrays import Floats, Numbers, Settings
 
-# Any function of a model, for what wraps or traces all of them alike: what they take differs.
+# Any function of a model, for code that wraps or traces all of them, whatever arguments they take.
 ModelFunction = Callable[..., Any]  # type: ignore[explicit-any]
 
-# (state, control, duration_s, parameters) -> state. Where noise enters other than by addition it stands
-# behind the control, so that there are four or five arguments.
+# (state, control, duration_s, parameters) -> state. Noise that is not additive is an argument after the
+# control, so there are four or five arguments.
 Move = Callable[..., Numbers]  # type: ignore[explicit-any]
 
-# (state, reference, parameters) -> what a sensor measures (m,). Noise that is not additive stands behind
-# the state, so that there are three or four arguments.
+# (state, reference, parameters) -> what a sensor measures (m,). Noise that is not additive is an
+# argument after the state, so there are three or four arguments.
 Measure = Callable[..., Numbers]  # type: ignore[explicit-any]
 
 
 class MotionNoise(Protocol):
-    """Gives variances of what a motion adds over a duration, or the rows of a lower triangle."""
+    """Function that returns the variances that a motion adds over a duration, or a lower triangle."""
 
     def __call__(self, state: Numbers, duration_s: float, parameters: Settings, /) -> Numbers: ...
 
 
 class ControlNoise(Protocol):
-    """Gives the variances of the control's error over a duration (controls,)."""
+    """Function that returns the variances of the control's error over a duration (controls,)."""
 
     def __call__(self, duration_s: float, parameters: Settings, /) -> Numbers: ...
 
 
 class MotionJacobians(Protocol):
-    """Fills the derivatives of the moved state by the state (t, t) and by the control (t, controls)."""
+    """Function that fills the derivatives of the moved state by the state and by the control."""
 
     def __call__(
         self,
@@ -49,7 +49,7 @@ class MotionJacobians(Protocol):
 
 
 class MotionMoments(Protocol):
-    """Moves a mean (n,) and a covariance (t, t) in place, exactly and without the additive noise."""
+    """Function that moves a mean (n,) and covariance (t, t) in place, exactly, without added noise."""
 
     def __call__(
         self,
@@ -63,13 +63,13 @@ class MotionMoments(Protocol):
 
 
 class OfParameters(Protocol):
-    """Gives numbers that depend on the parameters only: noise of a sensor, rates between modes."""
+    """Function of the parameters only, such as noise of a sensor or rates between modes."""
 
     def __call__(self, parameters: Settings, /) -> Numbers: ...
 
 
 class MeasurementJacobian(Protocol):
-    """Fills the derivative of what a sensor measures by the state, (m, t)."""
+    """Function that fills the derivative (m, t) of a measurement by the state."""
 
     def __call__(
         self, state: Numbers, reference: Numbers, parameters: Settings, by_state: Floats, /
@@ -77,9 +77,9 @@ class MeasurementJacobian(Protocol):
 
 
 class MeasurementMoments(Protocol):
-    """Fills the mean of a measurement (m,), its covariance (m, m) and that with the state (t, m).
+    """Function that fills a measurement's mean (m,), covariance (m, m) and covariance with the state.
 
-    Of a mean (n,) and covariance (t, t) of the state.
+    The last is (t, m); the state has the given mean (n,) and covariance (t, t).
     """
 
     def __call__(
@@ -96,7 +96,7 @@ class MeasurementMoments(Protocol):
 
 
 class LogLikelihood(Protocol):
-    """Gives log p(measured | state)."""
+    """Function that returns log p(measured | state)."""
 
     def __call__(
         self, state: Numbers, measured: Numbers, reference: Numbers, parameters: Settings, /
@@ -104,12 +104,12 @@ class LogLikelihood(Protocol):
 
 
 class OfState(Protocol):
-    """Gives a direction d (t,) of the tangent space at a state (n,)."""
+    """Function that returns a direction d (t,) of the tangent space at a state (n,)."""
 
     def __call__(self, state: Numbers, /) -> Numbers: ...
 
 
 class AlongSlope(Protocol):
-    """Moves a state (n,) by a step (t,) along a slope (t,); or finds the step to a target (n,)."""
+    """Function that moves a state (n,) by a step (t,) along a slope (t,), or finds such a step."""
 
     def __call__(self, state: Numbers, step_or_target: Numbers, slope: Numbers, /) -> Numbers: ...

@@ -1,6 +1,6 @@
-"""Models how an added component moves: a random walk, or a first-order Gauss-Markov process.
+"""Processes of added components: a random walk, or a first-order Gauss-Markov process.
 
-The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimation, 1974, section 3.6.
+For the latter see Gelb, Applied Optimal Estimation, 1974, section 3.6.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,13 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class GaussMarkov(NamedTuple):
-    """Describes a first-order Gauss-Markov process, or a random walk.
+    """A first-order Gauss-Markov process, or a random walk.
 
     Attributes:
-        sigma: its standard deviation at first.
-        drift: the density of its walk, per square root of a second.
-        time_s: how fast it comes back to its mean, while noise keeps up its sigma; infinite for never.
+        sigma: standard deviation at the start.
+        drift: density of the random walk, per square root of a second.
+        time_s: time constant of the return to the mean, while noise maintains sigma; infinite for a
+            random walk.
     """
 
     sigma: float
@@ -30,7 +31,7 @@ class GaussMarkov(NamedTuple):
 def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
-    """Add to a model's parameters those of the processes of these components."""
+    """Add the parameters of these components' processes to a model's parameters."""
     processes: dict[str, AnyArgument] = {
         f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
@@ -38,7 +39,7 @@ def with_gauss_markov_parameters(
 
 
 def remaining_share(name: str, duration_s: float, parameters: Settings) -> float:
-    """Compute the share of a component's distance from its mean that is left after a step."""
+    """Compute the share of a component's deviation from its mean that remains after a step."""
     share: float = np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
     return share
 

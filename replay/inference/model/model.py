@@ -1,8 +1,8 @@
-"""Defines a model: how a state moves, and what sensors measure of it.
+"""Models: how a state moves, and what sensors measure of it.
 
-A model is written once, as plain component-first functions: they take tuples of components and return
-tuples, and run on arrays as well. Every method (see `fuselog.replay.inference.kalman.methods`) estimates
-the state of every model that gives what the method needs.
+A model is written once, as plain component-first functions: they take tuples of components, return
+tuples, and also run on arrays. Every method (see `fuselog.replay.inference.kalman.methods`) can estimate
+the state of every model that provides what the method needs.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,16 +36,16 @@ FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Describes a map: fixed points of a topic, to which measurements refer by number.
+    """A map: fixed points on a topic, to which measurements refer by number.
 
     Attributes:
-        topic: the map's.
-        schema: of its messages.
-        number: the field that numbers them.
-        point: the vector field of the point.
-        components: of the point, by name.
-        of: the measurement's field that says which point; where it names none, the measurement has
-            no information on the state.
+        topic: topic of the map.
+        schema: schema of its messages.
+        number: field with the number of a point.
+        point: vector field with the position of a point.
+        components: components of the point, by name.
+        of: field of the measurement with the number of the point; a measurement whose number is not on
+            the map has no information about the state.
     """
 
     topic: str
@@ -57,31 +57,31 @@ class Map:
 
     @property
     def size(self) -> int:
-        """Count the components of a point."""
+        """Number of components of a point."""
         return len(self.components)
 
 
 @renamed(instead="fallbacks")
 @dataclass(frozen=True, eq=False)
 class Control:
-    """Describes what drives the motion.
+    """The control of a model: what drives its motion.
 
     Attributes:
-        topic: its name, under the prefix of what is estimated.
-        schema: of its messages.
-        components: their names, which are the messages' fields unless `read` is given.
+        topic: name of its topic, under the prefix of what is estimated.
+        schema: schema of its messages.
+        components: names of its components, which are fields of the messages unless `read` is given.
         read: stream -> (n, components).
-        interpolated: the control is linear between two messages, and the motion over a step gets the
-            mean of its two ends; else a message holds until the next one.
-        initial: what holds before the first message; zeros unless given.
-        gap: the parameter that says how long, in s, an interpolated control may be missing: what is
-            estimated ends there, or is unknown until it speaks again, see `Motion.gap_noise`.
-        delay: the parameter that says how long before its stamp, in s, a message was measured.
-        estimates: whether there are estimates at its stamps too, not at those of sensors alone.
-        fallbacks: other topics that the components of these names are taken from where the log has them,
-            such as a gyro's turn rate in place of the wheels'.
-        noise: of one of these, the parameters that are its noise, by the names under which its channel
-            may state them; no other channel is asked for them where it drives.
+        interpolated: whether the control is linear between two messages, so that the motion uses the
+            mean of both ends of a step; otherwise a message holds until the next one.
+        initial: control before the first message; zeros by default.
+        gap: parameter with the longest time, in s, without messages of an interpolated control. In a
+            longer gap the estimate ends, or is unknown until messages resume; see `Motion.gap_noise`.
+        delay: parameter with the time, in s, by which a message is stamped after its measurement.
+        estimates: whether estimates are made at its stamps, and not only at those of sensors.
+        fallbacks: other topics that replace the components of the same names if the log has them, such
+            as the turn rate of a gyro in place of that of the wheels.
+        noise: for a fallback, the names under which its channel may state the noise of the control, by
+            parameter; while the fallback is used, no other channel is asked for these parameters.
     """
 
     topic: str
@@ -100,25 +100,25 @@ class Control:
 @renamed(lost="gap_noise")
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Describes how the state moves.
+    """How a state moves.
 
     Attributes:
         move: (state, control, duration_s, parameters) -> state; with `noises`, (state, control, noise,
             duration_s, parameters) -> state.
-        noise: (state, duration_s, parameters) -> the variances of the additive noise in the tangent
-            space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
-        noises: how many numbers of noise enter `move` other than by addition.
-        noise_block: how many components the triangle is of, where variances of the others follow it; of
-            all of them for zero.
-        control_noise: (duration_s, parameters) -> the variances of the control's error over the
-            duration; it enters the state through the derivative by the control.
-        gap_noise: (state, duration_s, parameters) -> the variances in the tangent space that are added
-            where the control was silent for longer than its `gap`. The state stays, so that they cover
-            what it may have moved meanwhile; there are no estimates between.
-        linear: whether `move` is linear in the state: sampling methods then need no samples.
-        jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
-            they are written by hand, the graph of `move` gives them else.
-        moments: (mean, covariance, control, duration_s, parameters) moves both in place, exactly and
+        noise: (state, duration_s, parameters) -> variances of the additive noise in the tangent space,
+            or the rows of the lower triangle of its covariance; with `noises`, the variances of these.
+        noises: number of noise components that enter `move` other than by addition.
+        noise_block: number of components in the lower triangle, if variances of the other components
+            follow it; zero for all components.
+        control_noise: (duration_s, parameters) -> variances of the control's error over the duration;
+            they enter the state through the derivative by the control.
+        gap_noise: (state, duration_s, parameters) -> variances in the tangent space that are added after
+            the control was missing for longer than its `gap`. The state stays the same, so they must
+            cover any motion in the meantime; no estimates are made during the gap.
+        linear: whether `move` is linear in the state; sampling methods then need no samples.
+        jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both Jacobians;
+            only needed if they are written by hand, since they are otherwise derived from `move`.
+        moments: (mean, covariance, control, duration_s, parameters) moves both in place, exactly,
             without the additive noise; for the method `analytic`.
     """
 
@@ -133,19 +133,19 @@ class Motion:
     moments: MotionMoments | None = None
 
     def triangle(self, tangent: int) -> int:
-        """Count the numbers of `noise` where they are a triangle, for a state of size `tangent`."""
+        """Return the length of `noise` if it is a triangle, for a state of tangent size `tangent`."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
 
 @dataclass(frozen=True, eq=False)
 class Switching:
-    """Describes how a target changes from mode to mode: a Markov chain in continuous time.
+    """Changes between modes: a Markov chain in continuous time.
 
     Attributes:
-        rates: (parameters) -> how often per second it changes from the first mode to each of the others,
-            in their order, then from the second one, and so on: M (M - 1) numbers of M modes.
-        initial: (parameters) -> the modes' probabilities at the prior's time; equal ones unless given.
+        rates: (parameters) -> number of changes per second from the first mode to each of the others in
+            order, then from the second one, and so on: M (M - 1) numbers for M modes.
+        initial: (parameters) -> probabilities of the modes at the time of the prior; equal by default.
     """
 
     rates: OfParameters
@@ -155,41 +155,44 @@ class Switching:
 @renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Describes what a sensor measures of the state.
+    """What a sensor measures of the state.
 
     Attributes:
-        topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
-        schema: of its messages. A GeodeticFix serves for a PositionFix, through the log's origin.
-        measured: the components by name, with their kinds ("linear" or "angle").
-        measure: (state, reference, parameters) -> what it measures; `reference` is the point of the map,
-            or empty. With `noises`, (state, noise, reference, parameters). A component without
-            information of this state, or has no derivative there, is NaN: as if the message lacked it.
+        topic: name of its topic, under the prefix of what is estimated; a leading slash makes it a full
+            name.
+        schema: schema of its messages. A GeodeticFix is accepted as a PositionFix, through the origin of
+            the log's local tangent plane.
+        measured: names of the measured components, with their kinds ("linear" or "angle").
+        measure: (state, reference, parameters) -> measurement; with `noises`, (state, noise, reference,
+            parameters). `reference` is the point of the map, or empty. A component that has no
+            information about this state, or no derivative there, is NaN, as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
-            has neither is passed over, and counted.
-        vector: the field that holds what is measured as a vector. The channel's metadata say in
-            `components` how its entries are called, in any order; those of a position need no names.
-            Unless this is given, every component is a field of its own.
-        noises: how many numbers of noise enter `measure` other than by addition.
-        covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
-            where it is unknown.
-        reference: what the message is about: a point of a map, or one of each of several maps.
-        fields: numbers that a message states beside what it measures, such as the pose of a sensor that
-            moves: fields of the schema, and how many components each has. `reference` has them behind
-            the points and the control.
+            with `noises`, the variances of these. With `covariance`, it applies to messages without one;
+            a message with neither is skipped and counted.
+        vector: field with the measured components as a vector. The channel's metadata name its entries
+            in `components`, in any order; those of a position need no names. By default, every component
+            is a separate field.
+        noises: number of noise components that enter `measure` other than by addition.
+        covariance: field with the covariance of the vector; with `read`, stream -> (n, m, m), NaN if
+            unknown.
+        reference: map whose points the messages refer to, or several maps with one point each.
+        fields: numbers that a message contains in addition to the measurement, such as the pose of a
+            moving sensor: fields of the schema, with their numbers of components. They follow the points
+            and the control in `reference`.
         is_numbered: whether `reference` ends with the numbers of these points.
-        control: the model's, where what is measured depends on it: `reference` then has its numbers at
-            the stamp, behind the points. It has to be `interpolated`: one that is held is refused.
-        read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
-            message: a pseudo-measurement.
-        delay: the parameter that says how long before its stamp, in s, a message was measured.
+        control: the model's control, if the measurement depends on it; `reference` then contains its
+            components at the stamp, after the points. It must be `interpolated`.
+        read: stream -> (n, measured), NaN if a component is missing, for values that are computed from a
+            message, such as a pseudo-measurement.
+        delay: parameter with the time, in s, by which a message is stamped after its measurement.
         linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
-            moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
-            the measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
+        moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of the
+        measurement (m,), its covariance (m, m) including noise, and its covariance with the state (t,
+        m).
         log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
             that can use it.
-        stated: parameters that its channel may state in another form: metadata -> number, NaN where it
-            does not.
+        stated: parameters that its channel may state in another form: metadata -> number, NaN if it does
+            not.
     """
 
     topic: str
@@ -214,7 +217,7 @@ class Sensor:
 
     @property
     def maps(self) -> tuple[Map, ...]:
-        """List the maps of the points that a message refers to."""
+        """The maps of the points that a message refers to."""
         return (
             self.reference
             if isinstance(self.reference, tuple)
@@ -225,12 +228,12 @@ class Sensor:
 
     @property
     def control_start(self) -> int:
-        """Count the numbers of `reference` before those of the control: the points' components."""
+        """Number of entries of `reference` before those of the control, that is, of the points."""
         return sum(each.size for each in self.maps)
 
     @property
     def reference_size(self) -> int:
-        """Count the numbers of `reference`: points, control, fields, the points' numbers."""
+        """Number of entries of `reference`: points, control, fields, and numbers of the points."""
         controls = len(self.control.components) if self.control else 0
         numbers = len(self.maps) if self.is_numbered else 0
         return self.control_start + controls + sum(self.fields.values()) + numbers
@@ -238,7 +241,7 @@ class Sensor:
 
 @lru_cache(maxsize=64)
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
-    """Make the sensor of position fixes, of a state that has x, y and perhaps z in these places."""
+    """Make the sensor of position fixes for a state with x, y and perhaps z at these indices."""
 
     def position(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
         return tuple(state[place] for place in places)
@@ -260,18 +263,18 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Describes how a state is corrected where one direction of its error, a heading's, bends others.
+    """Correction of a state in which one direction of its error, such as the heading, bends the others.
 
-    A belief that is wide in that direction is no ellipsoid: given how far the state is off along it, the
-    mean of the rest moves on a curve. `slope` (t,) is the tangent there, P d / d' P d with the
-    covariance P and the direction d. Small steps move every component by itself: the derivative of the
-    moved state at zero is the unit matrix.
+    A belief that is wide in that direction is not an ellipsoid: as a function of the error along it, the
+    mean of the other components follows a curve. `slope` (t,) is the tangent of that curve, P d / d' P d
+    with the covariance P and the direction d. Small steps move every component separately: at zero, the
+    derivative of the moved state is the identity matrix.
 
     Attributes:
         along: state -> d (t,).
-        move: (state, step, slope) -> the state after an update's step (t,) of its tangent space.
+        move: (state, step, slope) -> state after an update by a step (t,) of the tangent space.
         step: (state, target, slope) -> the step that `back` takes from the state to the target.
-        back: (state, step, slope) -> the state after a step of a smoother's backward pass.
+        back: (state, step, slope) -> state after a step of a smoother's backward pass.
     """
 
     along: OfState
@@ -283,35 +286,34 @@ class Correction:
 @renamed(estimable="augmentable")
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Describes a model of one kind of target; a log may hold several, each under its own prefix.
+    """A model of one kind of object; a log may contain several, each under its own prefix.
 
     Attributes:
-        summary: what it is, in one line.
-        state: the components by name, with their kinds; the four of a quaternion side by side.
-        parameters: their type.
-        sensors: all it can use; any of them makes a log fit. A model with a position, linear `x_m` and
-            `y_m` or these and `z_m`, takes fixes as well, see `all_sensors`.
+        summary: description in one line.
+        state: components by name, with their kinds; the four components of a quaternion are adjacent.
+        parameters: type of its parameters.
+        sensors: all sensors that it can use; any of them makes a log fit. A model with a position
+            (linear `x_m` and `y_m`, perhaps `z_m`) also uses position fixes; see `all_sensors`.
         motion: how the state moves.
-        modes: other motions by name, for methods of several; `motion` is then one of them.
-        switching: how the thing changes between its modes.
-        control: what drives it; a log without this topic does not fit.
-        prior, truth: topics with the first Gaussian and the reference, under the prefix.
-        output: the last part of the estimates' topic.
-        system: what a channel's metadata has to name as its `system`, if anything.
-        needs_sensor: whether a log without any of its sensors does not fit.
-        start: what is assumed of a log without the prior; None where that does not fit.
-        takes_fixes: whether position fixes are sensors of it.
-        correct: how an update moves the state where not every component moves by itself.
-        by_name: whether it is only taken where it is named, since it fits the logs of other models too.
-        augmentable: the parameters that may become part of the state, linear or angles, see
-            `fuselog.replay.inference.model.augmentation`: those that motion and sensors read, and no
-            noise.
-        calibration: the parameters that say how sensors are mounted, scaled, biased and delayed, each
-            with a useful standard deviation: what is known no better counts as not determined.
-        owned: by their names the parameters that single topics have, each with the topic and what it is
-            called there; see `fuselog.replay.inference.model.own_parameters`.
+        modes: other motions by name, for methods with several modes; `motion` is then one of them.
+        switching: how the object changes between its modes.
+        control: what drives its motion; a log without this topic does not fit.
+        prior, truth: topics of the first Gaussian and of the reference, under the prefix.
+        output: last part of the name of the estimates' topic.
+        system: the `system` that a channel's metadata must name, if any.
+        needs_sensor: whether a log must have at least one of its sensors.
+        start: assumptions for a log without the prior; None if such a log does not fit.
+        takes_fixes: whether it can use position fixes.
+        correct: how an update moves the state, if not every component moves separately.
+        by_name: whether it is only used if it is named, because it also fits logs of other models.
+        augmentable: parameters that can be added to the state, linear or angles: those that motion and
+            sensors read, except noise. See `fuselog.replay.inference.model.augmentation`.
+        calibration: parameters that describe how sensors are mounted, scaled, biased and delayed, each
+            with a useful standard deviation; an estimate that is less certain counts as undetermined.
+        owned: parameters that belong to single topics, by name: the topic, and the name of the parameter
+            there. See `fuselog.replay.inference.model.own_parameters`.
 
-    A thing on a line, whose range from the origin is measured:
+    An object on a line whose distance from the origin is measured:
 
     >>> import numpy as np
     >>> from fuselog.recorders.log import schemas
@@ -331,8 +333,8 @@ class Model:
     >>> model.size, model.kinds
     (2, ('linear', 'linear'))
 
-    `fuselog.replay.inference.model.checking.check_model` says whether the functions keep to what is
-    declared:
+    `fuselog.replay.inference.model.checking.check_model` tests whether the functions match the
+    declarations:
 
     >>> from dataclasses import replace
     >>> from fuselog.replay.inference.model.checking import check_model
@@ -368,7 +370,7 @@ class Model:
 
     @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """List the sensors, with that of position fixes unless the model has one of its own."""
+        """The sensors, with that of position fixes unless the model has its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
         has_position = names[:2] == list(POSITION[:2])
         has_own = any(sensor.topic == FIX for sensor in self.sensors)
@@ -378,42 +380,42 @@ class Model:
         return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
 
     def key_of(self, name: str) -> str:
-        """Return the key by which a parameter is set: `/TOPIC.NAME` of one that a topic has.
+        """Return the key that sets a parameter: `/TOPIC.NAME` if it belongs to a topic.
 
         Args:
-            name: the parameter's.
+            name: name of the parameter.
         """
         return ".".join(self.owned[name]) if name in self.owned else name
 
     def kind_of(self, name: str) -> str:
-        """Return the parameter that one of a topic stands for; any other is its own.
+        """Return the general parameter that a topic's parameter replaces, or else the name itself.
 
         Args:
-            name: the parameter's.
+            name: name of the parameter.
         """
         return self.owned[name][1] if name in self.owned else name
 
     @property
     def finds_start(self) -> bool:
-        """Tell whether the model finds its own start, see `Start.find`."""
+        """Whether the model finds its own start; see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
-        """List the kinds of the state's components."""
+        """Kinds of the state's components."""
         return tuple(self.state.values())
 
     @property
     def size(self) -> int:
-        """Count the components of the state."""
+        """Number of components of the state."""
         return len(self.state)
 
     @cached_property
     def tangent(self) -> int:
-        """Count those of its tangent space: an orientation has four components and three."""
+        """Number of components of its tangent space: three for an orientation, which has four."""
         return tangent_size(self.kinds)
 
     @property
     def controls(self) -> int:
-        """Count the components of the control."""
+        """Number of components of the control."""
         return len(self.control.components) if self.control else 0

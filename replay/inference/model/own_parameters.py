@@ -1,8 +1,9 @@
-"""Gives topics parameters of their own: two receivers have two lever arms, a second compass its offset.
+"""Parameters of single topics, such as lever arms of two receivers, or the offset of a second compass.
 
-A transformation of models: the sensor of a topic reads the topic's own parameter in place of that of its
-kind. It is called `/gps2/fix.lever_x_m`, and has the value of `lever_x_m` unless it is set. Methods,
-states that parameters become part of, and what is written as C have it as any other.
+This is a transformation of models: the sensor of a topic reads the topic's parameter in place of the
+general one. The parameter is called, for example, `/gps2/fix.lever_x_m`, and has the value of
+`lever_x_m` unless it is set. Methods, augmented states and exported C code treat it as any other
+parameter.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,15 +32,15 @@ Tables = Mapping[str, Mapping[str, object]]
 def with_own_parameters(
     model: Model, found: Found, tables: Tables, parameters: Parameters
 ) -> tuple[Model, Found, CombinedParameters]:
-    """Return a model whose topics have parameters of their own, its topics, and the parameters.
+    """Return a model whose topics have their own parameters, its topics, and the parameters.
 
-    They are given to topics that some are set for, and to all of a kind of which there are several.
+    A topic gets its own parameters if some are set for it, or if several topics serve the same sensor.
 
     Args:
         model: the model.
         found: its topics.
-        tables: what is set, by topic and name.
-        parameters: what is set of all topics.
+        tables: parameters that are set for single topics, by topic and name.
+        parameters: parameters that are set for all topics.
     """
     kinds = [sensor.topic for sensor, _ in found.sensors]
     own = tuple(
@@ -63,7 +64,7 @@ def with_own_parameters(
 
 
 def check_tables(label: str, model: Model, found: Sequence[Found], tables: Tables) -> None:
-    """Raise BadInput if a topic with own parameters is not taken, or its sensor reads no such one."""
+    """Raise BadInput if a topic in `tables` is not used or its sensor does not read a parameter."""
     for topic, table in tables.items():
         sensors = [sensor for each in found for sensor, own in each.sensors if own.name == topic]
         if not sensors:
@@ -84,7 +85,7 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
 
 @lru_cache(maxsize=256)
 def read_by(model: Model, sensor: Sensor) -> tuple[str, ...]:
-    """List the parameters that a sensor reads, and the motion does not."""
+    """List the parameters that a sensor reads and the motion does not."""
     names, state = number_fields(model.parameters), trial_state(model.kinds)
     read, moving = (TracedParameters(dict.fromkeys(names)) for _ in range(2))
     with np.errstate(all="ignore"):
@@ -100,7 +101,7 @@ def read_by(model: Model, sensor: Sensor) -> tuple[str, ...]:
 
 
 def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
-    """List the sensors of a model that one topic of this kind is for."""
+    """List the model's sensors that read one topic of this kind."""
     return [each for each in model.all_sensors if each.topic == sensor.topic]
 
 
@@ -108,9 +109,9 @@ def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
 def _transformed(
     model: Model, sensors: tuple[Sensor, ...], own: tuple[tuple[int, str], ...]
 ) -> tuple[Model, tuple[Sensor, ...]]:
-    """Give the sensors with these numbers parameters of their topics.
+    """Give the sensors with these numbers the parameters of their topics.
 
-    Raises BadInput if two topics have names that differ in their marks alone.
+    Raises BadInput if the names of two topics differ only in punctuation.
     """
     names = {number: _fields_of(topic, read_by(model, sensors[number])) for number, topic in own}
     owned: dict[str, tuple[str, str]] = {}
@@ -147,7 +148,7 @@ def _with_owned(given: Mapping[str, Value], owned: Mapping[str, tuple[str, str]]
 def _with_fields(
     parameters: type[Parameters], owned: tuple[tuple[str, tuple[str, str]], ...]
 ) -> type[CombinedParameters]:
-    """Add the topics' own parameters to others, with the bounds of what they stand for."""
+    """Add the topics' own parameters to a parameter type, with the bounds of the general parameters."""
     said, fields, lines = meanings(parameters), dict[str, AnyArgument](), list[str]()
     for field, (topic, name) in owned:
         entry = parameters.model_fields[name]
@@ -182,7 +183,7 @@ def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
 
 @pure
 class _Own:
-    """Reads parameters, in place of some those of a topic."""
+    """Parameters of which some are replaced by those of a topic."""
 
     def __init__(self, parameters: Settings, fields: tuple[tuple[str, str], ...]) -> None:
         self._parameters, self._fields = parameters, dict(fields)
@@ -193,9 +194,9 @@ class _Own:
 
 
 def _reading(function: OfModel, place: int, fields: Mapping[str, str]) -> OfModel:
-    """Make a function whose parameters, at a place of its arguments, are the topic's own.
+    """Make a function whose argument at an index, the parameters, is replaced by the topic's own.
 
-    It is seen to do the same again where the given one is; see `fuselog.replay.tracing.reads`.
+    The function counts as unchanged if the given one is unchanged; see `fuselog.replay.tracing.reads`.
     """
     pairs = tuple(fields.items())
 

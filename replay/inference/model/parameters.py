@@ -1,4 +1,4 @@
-"""Defines the options of every model, and the numbers that its functions read."""
+"""Options of every model, and the numbers that its functions read."""
 
 from collections import namedtuple
 from collections.abc import Mapping
@@ -10,14 +10,14 @@ from pydantic import Field, PositiveFloat
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.arrays import Settings
 
-# The parameters of a model and of a method together: a class that is made when both are known, see
+# The parameters of a model and of a method combined, in a class that is made when both are known; see
 # `fuselog.replay.inference.estimators.combined`.
 CombinedParameters = Any  # type: ignore[explicit-any]
 
 
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """List the parameters that model functions may read: all that are numbers."""
+    """List the parameters that model functions can read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")
     return tuple(
@@ -29,26 +29,27 @@ def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def settings_type(names: tuple[str, ...]) -> type[Settings]:
-    """Make the NamedTuple that model functions get as their parameters."""
+    """Make the NamedTuple type of the parameters that model functions receive."""
     return namedtuple("Settings", names)
 
 
 class ModelParameters(Parameters):  # type: ignore[explicit-any]
-    """Defines the options of every model.
+    """Options of every model.
 
-    A parameter that is none is what the channels of the log state: the sensor's own first, then those
-    of control, prior and the other sensors.
+    A parameter that is not set is read from the channels of the log: from the sensor's own channel
+    first, then from those of the control, the prior and the other sensors.
 
     Attributes:
-        gate_probability: a measurement whose NIS is beyond this quantile of chi-square is not used; 1
-            uses all.
-        gate_reopens_s: the gate is open for a sensor whose last accepted measurement is older, so that a
-            filter that has drifted, as in an outage, accepts what brings it back.
-        inflate_nis: an innovation with a greater NIS counts with a larger covariance, which gives it
-            this NIS.
-        student_freedom: innovations count as if they had Student's distribution with so many degrees of
-            freedom.
-        switch_nis: above this NIS a measurement counts less and less, as in dynamic covariance scaling.
+        gate_probability: measurements whose NIS exceeds this quantile of the chi-square distribution are
+            rejected; 1 accepts all.
+        gate_reopens_s: time since a sensor's last accepted measurement after which its gate opens, so
+            that a filter that has drifted, such as in an outage, accepts the measurements that correct
+            it.
+        inflate_nis: NIS above which the innovation covariance is inflated until the NIS has this value.
+        student_freedom: degrees of freedom of a Student's t-distribution that innovations are assumed to
+            have.
+        switch_nis: NIS above which measurements are increasingly down-weighted, as in dynamic covariance
+            scaling.
         sigma_fix_m: standard deviation of each component of a fix that does not state its covariance.
     """
 

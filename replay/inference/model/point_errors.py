@@ -1,10 +1,10 @@
-"""Augments a state by lasting errors of what is measured about each point of a map.
+"""Augmentation of a state by lasting measurement errors about each point of a map.
 
-Measurement noise that is not white: ranges to one anchor, or between an anchor and a tag, err alike for
-seconds. A transformation of models: the state gets a component for each point or pair of points, which
-is added to what is measured about it, and moves by itself: a random walk, or a first-order Gauss-Markov
-process of mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, section 8.2.
+These model measurement noise that is not white: ranges to one anchor, or between an anchor and a tag,
+have the same error for seconds. This is a transformation of models: each point or pair of points gets a
+component of the state, which is added to the measurements about it. The component is a random walk or a
+first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, section 8.2.
 """
 
 import re
@@ -30,14 +30,14 @@ Names = tuple[str, ...]
 
 
 class PointError(NamedTuple):
-    """Holds the error of what is `measured` about the points with these numbers, one of each map."""
+    """The error of the `measured` component about the points with these numbers, one per map."""
 
     measured: str
     numbers: tuple[int, ...]
 
     @property
     def name(self) -> str:
-        """Return the component of the state."""
+        """Name of its component of the state."""
         return "_".join(["error", self.measured, *map(str, self.numbers)])
 
 
@@ -45,16 +45,17 @@ Errors = tuple[PointError, ...]
 
 
 def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
-    """Return the errors that an entry of `estimate` names; none where it names a parameter.
+    """Return the errors that an entry of `estimate` names; empty if it names a parameter.
 
-    `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
-    about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
-    Raises BadInput where the model measures nothing of the kind.
+    `range_m[3]` is the error of range_m about point 3; `range_m[0:8]` are those about points 0 to 7;
+    `range_m[0:8,0:3]` are those of all pairs with points 0 to 2 of the second map.
 
     Args:
         where: the estimator and option, for errors.
-        model: with the sensors whose errors they are.
+        model: model with the sensors whose errors they are.
         asks: the entry, such as `range_m[0:8]`.
+
+    Raises BadInput if the model has no such measurement about points of maps.
     """
     found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
     if found is None:
@@ -89,7 +90,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
 
 @lru_cache(maxsize=256)
 def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
-    """Return the motion, beside which each error goes its own way."""
+    """Return the motion with these errors, which move independently."""
     n, t = model.size, model.tangent
     noises, names, inner, noise_of = motion.noises, _names(errors), motion.move, motion.noise
     given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()
@@ -121,7 +122,7 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
 
 @lru_cache(maxsize=256)
 def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
-    """Return the sensor, to whose measurements the errors about their points are added."""
+    """Return the sensor with these errors added to the measurements about their points."""
     own = [
         (model.size + index, list(sensor.measured).index(each.measured), each.numbers)
         for index, each in enumerate(errors)
@@ -147,7 +148,7 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
 
 
 def _same(reference: Numbers, numbers: Sequence[int]) -> float:
-    """Return 1 where a message is about these points, 0 where not."""
+    """Return 1 if a message is about these points, otherwise 0."""
     found = 1.0
     for index, number in enumerate(numbers):
         found = found * (reference[index] == number)

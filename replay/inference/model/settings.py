@@ -1,4 +1,4 @@
-"""Collects the numbers that a model's functions read: from parameters, or from a log's channels."""
+"""Numbers that a model's functions read, collected from parameters or from a log's channels."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
@@ -23,13 +23,14 @@ from fuselog.replay.inference.model.validation import (
     switching_of,
 )
 
-# (settings (1 + sensors, fields), row) -> its parameters: 0 is the motion's, the others the sensors'.
+# (settings (1 + sensors, fields), row) -> its parameters; row 0 is the motion, the others are the
+# sensors.
 ReadSettings = Callable[[Floats, int], Settings]
 
 
 @lru_cache(maxsize=64)
 def reading_settings(names: tuple[str, ...]) -> ReadSettings:
-    """Make the function that reads a row of numbers as the NamedTuple."""
+    """Make the function that converts a row of numbers to the NamedTuple of parameters."""
     kind = settings_type(names)
 
     def read(settings: Floats, row: int) -> Settings:
@@ -39,13 +40,13 @@ def reading_settings(names: tuple[str, ...]) -> ReadSettings:
 
 
 def trial_parameters(model: Model) -> Settings:
-    """Make parameters to try functions with: every number is one."""
+    """Make parameters for trial calls of functions: every number is one."""
     names = number_fields(model.parameters)
     return settings_type(names)(*(1.0,) * len(names))
 
 
 class TracedParameters:
-    """Records which parameters a model's functions read: `read`; a parameter that is unset is one."""
+    """Parameters that record in `read` which of them a model's functions read; unset ones are 1."""
 
     def __init__(self, values: Mapping[str, float | None]) -> None:
         self._values = values
@@ -61,17 +62,19 @@ class TracedParameters:
 
 
 def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:
-    """Collect the numbers (1 + sensors, fields) of motion and sensors: given, or as channels state them.
+    """Collect the numbers (1 + sensors, fields) of motion and sensors from parameters and channels.
 
-    What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
-    looks in its own first. Raises BadInput where none states a number that is used, or one that the
-    parameter does not allow, and where the model is not what it declares.
+    A number that is not given is taken from the channels of the control, the prior and the sensors; a
+    sensor uses its own channel first.
 
     Args:
-        label: the estimator's, for errors.
-        stage: the model with the sensors at hand.
+        label: label of the estimator, for errors.
+        stage: the bound model, with the sensors of the log.
         found: its topics.
-        parameters: as given by the user.
+        parameters: parameters given by the user.
+
+    Raises BadInput if no channel states a number that is needed, if a channel states one that the
+    parameter does not allow, or if the model does not match its declarations.
     """
     model = stage.model
     names = number_fields(model.parameters)
@@ -125,9 +128,9 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
 def _stated(
     found: Found, topics: Sequence[Topic], name: str, parameters: type[ModelParameters]
 ) -> float:
-    """Return what channels state for a parameter; NaN where none does.
+    """Return the value that channels state for a parameter; NaN if none states it.
 
-    The noise of what drives is that of the topic that does, not of the one whose place it takes.
+    The noise of a control that a fallback replaces is that of the fallback's topic.
     """
     for drive, topic in found.fallbacks:
         for other in drive.noise.get(name, ()):
@@ -141,7 +144,8 @@ def _stated(
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
     """List the numbers of the plane's origin that are neither given nor stated for the model itself.
 
-    They are those of the plane that fixes are taken into: gravity is that of the place.
+    They are taken from the origin of the plane into which fixes are projected, so that, for example,
+    gravity is that of the position.
     """
     stating = _stating(found)
     return tuple(
@@ -155,7 +159,7 @@ def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, .
 
 
 def _of_origin(stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """Take numbers from the plane's origin; until a first fix is known, what is usual stands for its."""
+    """Return numbers of the plane's origin; typical values until the first fix is known."""
     start = stage.model.start
     usual = start.parameters if start is not None else {}
     return {
@@ -176,11 +180,12 @@ def placed_settings(
 
     Args:
         settings: see `settings_of`; or (runs, 1 + sensors, fields) if each run has its own.
-        names: of its columns.
-        found: the topics.
-        parameters: as given by the user.
-        origins: (runs, 3) of every run's plane, first fixes if none is stated; None without fixes.
-        runs: how many there are.
+        names: names of the columns.
+        found: topics of the model.
+        parameters: parameters given by the user.
+        origins: (runs, 3) origin of each run's plane, its first fix if none is stated; None without
+            fixes.
+        runs: number of runs.
     """
     placed = np.empty((runs, *settings.shape[-2:]))
     placed[:] = settings
@@ -193,20 +198,20 @@ def placed_settings(
 
 
 def _stating(found: Found) -> list[Topic]:
-    """List the topics whose channels state numbers, in the order in which they are asked."""
+    """List the topics whose channels may state numbers, in the order of precedence."""
     control = [] if found.control is None else [found.control]
     fallbacks, sensors = ([topic for _, topic in each] for each in (found.fallbacks, found.sensors))
     return [*fallbacks, *control, found.prior, *sensors]
 
 
 def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """List the parameters that are assumed, since a log without a prior does not state them.
+    """Return the parameters that are assumed because a log without a prior does not state them.
 
     Args:
-        label: the estimator's, for errors.
-        stage: the model with the sensors at hand.
+        label: label of the estimator, for errors.
+        stage: the bound model, with the sensors of the log.
         found: its topics.
-        parameters: as given by the user.
+        parameters: parameters given by the user.
     """
     start = stage.model.start
     if found.has_prior or start is None:
@@ -231,7 +236,7 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
 def _needed(
     where: str, stage: Stage, given: tuple[tuple[str, float | None], ...]
 ) -> tuple[set[str], ...]:
-    """Find the parameters that motion and sensors read; BadInput where the model is not as declared."""
+    """Return the parameters that motion and sensors read; raise BadInput if declarations are wrong."""
     model, values = stage.model, dict(given)
     check_state(where, model)
     check_correction(where, model)
@@ -246,7 +251,7 @@ def _needed(
 
 
 def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
-    """Explain why a message was not used, and what would help; "" where no covariance can be missing."""
+    """Explain why a message was skipped, and what to do; empty if its covariance cannot be missing."""
     if not sensor.covariance:
         return ""
     parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))

@@ -1,4 +1,4 @@
-"""Prepares a model for a method: traces the functions of its motion and of the sensors at hand."""
+"""Bound models: models whose motion and sensors at hand are traced for a method."""
 
 import sys
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ Part = TypeVar("Part")
 
 
 class Stage(NamedTuple):
-    """Holds a model as a method takes it: its motion, and the sensors that the log has.
+    """A bound model: a model with its motion and the sensors that the log has.
 
-    `modes` are the motions of all modes, in their order, for a method that takes all of them. Made by
-    `stage_of`: the functions are traced.
+    `modes` are the motions of all modes in order, for a method that uses all of them. Use `stage_of` to
+    make one with traced functions.
     """
 
     model: Model
@@ -33,11 +33,12 @@ def stage_of(
     modes: Sequence[Motion] = (),
     names: tuple[str, ...] | None = None,
 ) -> Stage:
-    """Return a model with one of its motions, some of its sensors, and perhaps all its modes, traced.
+    """Return a model with one of its motions, some of its sensors, and optionally all modes, traced.
 
-    `names` are the parameters that functions may read, the model's own unless given.
+    `names` are the parameters that functions may read, by default the model's own. Unchanged parts are
+    the same objects in every call.
 
-    Raises BadInput where a function cannot be traced; what has not changed is the same again.
+    Raises BadInput if a function cannot be traced.
     """
     names = number_fields(model.parameters) if names is None else names
     return Stage(
@@ -51,11 +52,11 @@ def stage_of(
 def title_of(model: Model, summary: str) -> str:
     """Name the kernel of a method with this summary, for messages while it is compiled.
 
-    The model has its registered name where it is one of those that are loaded, which imports nothing.
+    The model's registered name is used if its module is already loaded; nothing is imported.
 
     Args:
-        model: whose summary is part of it.
-        summary: the method's.
+        model: the model.
+        summary: summary of the method.
     """
     found = (
         (name, getattr(sys.modules.get(entry.module), entry.attr, None))
@@ -66,7 +67,7 @@ def title_of(model: Model, summary: str) -> str:
 
 
 def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motion:
-    """Return a motion whose functions are traced."""
+    """Return the motion with traced functions."""
     n, t, controls = model.size, model.tangent, model.controls
     entering = (motion.noises,) if motion.noises else ()
     driven = (controls, None, names)
@@ -82,7 +83,7 @@ def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motio
 
 
 def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Sensor:
-    """Return a sensor whose functions are traced."""
+    """Return the sensor with traced functions."""
     n, t, m, reference = model.size, model.tangent, len(sensor.measured), sensor.reference_size
     entering = (sensor.noises,) if sensor.noises else ()
     filled = (Shape((m,)), Shape((m, m)), Shape((t, m)))
@@ -97,7 +98,7 @@ def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Senso
 
 
 def traced_model(model: Model, names: tuple[str, ...]) -> Model:
-    """Return a model whose switching is traced; its motion and sensors are as they were."""
+    """Return the model with traced switching; its motion and sensors stay unchanged."""
     if model.switching is None:
         return model
     switching = _with_traced(model.switching, rates=(names,))
@@ -115,7 +116,7 @@ _KNOWN: dict[tuple[object, ...], tuple[object, object]] = {}
 
 
 def _same_again(part: Part, **changes: object) -> Part:
-    """Return the part with these changes: one object as long as they are the same ones."""
+    """Return the part with these changes, as the same object for the same changes."""
     key = id(part), *((name, id(each)) for name, each in changes.items())
     known = _KNOWN.get(key)
     if known is None:

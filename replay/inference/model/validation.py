@@ -1,4 +1,4 @@
-"""Checks that a model is what it declares: sizes, kinds, variances and rates, before any method runs."""
+"""Checks of a model against its declarations (sizes, kinds, variances, rates) before any method runs."""
 
 from functools import lru_cache
 
@@ -13,7 +13,7 @@ from fuselog.replay.tracing.functions import place_of
 
 
 def check_state(where: str, model: Model) -> None:
-    """Raise BadInput where a state's kinds are none."""
+    """Raise BadInput if the kinds of a state's components are invalid."""
     if not are_kinds(model.kinds):
         raise BadInput(
             f"{where}: a state of kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
@@ -24,14 +24,13 @@ def check_state(where: str, model: Model) -> None:
 def check_motion(where: str, model: Model, motion: Motion, parameters: Settings) -> None:
     """Call a motion's functions once, uncompiled.
 
-    `parameters` has a number for every parameter. Raises BadInput where a function fails, or
-    returns what the model denies.
-
     Args:
         where: the estimator, for errors.
-        model: whose motion it is.
+        model: model of the motion.
         motion: one of its motions.
-        parameters: that record what is read.
+        parameters: a number for every parameter, in an object that records which are read.
+
+    Raises BadInput if a function fails or contradicts the model's declarations.
     """
     state, control = trial_state(model.kinds), (0.0,) * model.controls
     sizes = (model.tangent, motion.triangle(model.tangent))
@@ -51,9 +50,9 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Settings)
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
-@lru_cache(maxsize=64)  # it is the same whatever the parameters, of which a search tries hundreds
+@lru_cache(maxsize=64)  # independent of the parameters, of which a search tries hundreds
 def check_correction(where: str, model: Model) -> None:
-    """Call the functions of how a model is corrected once, uncompiled; see `check_motion`."""
+    """Call the functions of a model's correction once, uncompiled; see `check_motion`."""
     if model.correct is not None:
         state, error = trial_state(model.kinds), (0.0,) * model.tangent
         _check(where, model.correct.along, (state,), (model.tangent,))
@@ -75,12 +74,12 @@ def check_switching(where: str, model: Model, parameters: Settings) -> None:
 def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats, Floats]:
     """Return the rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
 
-    Raises BadInput where a rate is negative, or the probabilities are none.
-
     Args:
         where: the estimator, for errors.
-        model: of M modes.
-        parameters: of its functions.
+        model: model with M modes.
+        parameters: parameters of its functions.
+
+    Raises BadInput if a rate is negative or the probabilities are invalid.
     """
     assert model.modes
     assert model.switching
@@ -109,9 +108,9 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
 
     Args:
         where: the estimator, for errors.
-        model: whose sensor it is.
+        model: model of the sensor.
         sensor: one of its sensors.
-        parameters: that record what is read.
+        parameters: a number for every parameter, in an object that records which are read.
     """
     where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
@@ -138,7 +137,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
 
 
 def _check_interpolated(where: str, model: Model, control: Control) -> None:
-    """Refuse a sensor's control that has no value between two messages: all it measures would be NaN."""
+    """Raise BadInput if a sensor's control is not interpolated: its measurements would be NaN."""
     driving = model.control
     if driving is None or driving.components != control.components:
         asked, given = (
@@ -156,7 +155,7 @@ def _check_interpolated(where: str, model: Model, control: Control) -> None:
 
 
 def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """Return a state at which to try functions: numbers that differ, unit vectors."""
+    """Return a state for trial calls of functions: distinct numbers and unit vectors."""
     found: list[float] = []
     while len(found) < len(kinds):
         kind = kinds[len(found)]
