@@ -1,4 +1,4 @@
-"""Runs one model by one method over messages: events, the recursion, initialization, late messages.
+"""Runs of one model by one method over messages: events, recursion, initialization, late messages.
 
 Begin with `recursion`.
 """

@@ -1,7 +1,7 @@
-"""Makes starts that hardly depend on parameters, over which likelihoods can be compared.
+"""Starts that hardly depend on parameters, so that likelihoods can be compared.
 
-A start that is found by the parameters, as one aligned with the first fixes, uses up more messages the
-larger their noise is stated: likelihoods would be of different messages.
+A start that depends on the parameters, such as one aligned with the first fixes, consumes more messages
+if their noise is stated larger; the likelihoods would then be of different messages.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -15,11 +15,11 @@ from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.run.first_messages import unknown
 
-BROAD_M = 1000.0  # a position's standard deviation about its first message
-# By a sensor that measures the state: what it measures, and by its first message the state's mean (n,)
-# and sigmas (t,).
+BROAD_M = 1000.0  # standard deviation of a position about its first message
+# For a sensor that measures the state: the measured components, and the mean (n,) and sigmas (t,) of the
+# state according to its first message.
 Reference = tuple[Collection[str], Floats, Floats]
-PARTS, BROAD_RAD = 8, 0.45  # of an angle: equally likely parts all round, and the sigma of each
+PARTS, BROAD_RAD = 8, 0.45  # number of equally likely parts of an angle, and the sigma of each
 
 
 def broad_priors(
@@ -28,15 +28,15 @@ def broad_priors(
     times_ns: Sequence[int],
     references: Sequence[Iterable[Reference]],
 ) -> list[Stream]:
-    """Make the priors of runs, a stream of one for each run for each of the equally likely parts.
+    """Make the priors of all runs, one stream for each of the equally likely parts of an angle.
 
-    A filter is linear about a heading only nearby, so an angle, where the state has one, is in PARTS.
+    A filter is linear in a heading only nearby, so an angle of the state is divided into PARTS.
 
     Args:
-        model: whose state it is.
-        topic: of the priors.
-        times_ns: their stamps.
-        references: of each run.
+        model: model of the state.
+        topic: topic of the priors.
+        times_ns: stamps of the priors, one per run.
+        references: first messages of each run.
     """
     names = list(model.state)
     components = [name for name, _ in tangent_components(names, model.kinds)]

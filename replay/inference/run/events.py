@@ -1,4 +1,4 @@
-"""Turns a log's messages into events: rows of numbers in time order, whatever the model."""
+"""Conversion of a log's messages to events: rows of numbers in time order, independent of the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ from fuselog.replay.inference.run.timing import last_of_stamps, select_events, s
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Holds the points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
+    """Points of a map in all runs: keys, run * 2^32 + number, sorted; their positions (n, d)."""
 
     keys: Integers
     places: Floats
 
     def rows(self, run: Integers, number: Integers) -> Integers:
-        """Find the rows of the points with these numbers in these runs; -1 where there is none."""
+        """Return the rows of the points with these numbers in these runs; -1 for missing points."""
         keys = (run << 32) + number
         if len(self.keys) == 0:
             return np.full(len(keys), -1)
@@ -40,17 +40,19 @@ class Points:
         return np.where(self.keys[rows] == keys, rows, -1)
 
     def at(self, rows: Integers) -> Floats:
-        """Look up the places (m, d) of rows as `rows` gives them; NaN where there is none."""
-        nowhere = np.full((1, self.places.shape[1]), np.nan)  # what has no row takes the last one
+        """Return the positions (m, d) in rows that `rows` returned; NaN for -1."""
+        nowhere = np.full((1, self.places.shape[1]), np.nan)  # selected by row -1
         return np.concatenate([self.places, nowhere])[rows]
 
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
-    """Collect the points of all runs; raises BadInput where they lack a component.
+    """Collect the points of a map in all runs.
 
     Args:
-        ragged: the messages of a map's topic, in all runs.
+        ragged: messages of the map's topic, in all runs.
         asked: the map as the model describes it.
+
+    Raises BadInput if the points lack a component.
     """
     places = read_vectors(ragged.stream, asked.point, asked.components)
     run = run_of_rows(ragged.offsets)
@@ -60,9 +62,9 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
 
 
 class Context(NamedTuple):
-    """Holds what messages are read against: every map's points by its topic, and the planes' origins.
+    """Data that messages refer to: each map's points, by its topic, and the origins of the planes.
 
-    The origins (runs, 3) are latitude, longitude and altitude; None where no fix needs them.
+    The origins (runs, 3) are latitude, longitude and altitude; None if no fix needs them.
     """
 
     points: Mapping[str, Points]
@@ -71,7 +73,7 @@ class Context(NamedTuple):
 
 @lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
-    """Count the numbers of an event, and find the first of the control's among them."""
+    """Return the number of columns of an event's data, and the first column of the control."""
     width, control = (
         max((message_layout(sensor).width for sensor in stage.sensors), default=0),
         stage.model.control,
@@ -83,7 +85,7 @@ def data_columns(stage: Stage) -> tuple[int, int]:
 def events_of(
     stage: Stage, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """Return what `filter_events` does, which may be known from an earlier replay of the block.
+    """Return the result of `filter_events`, which may be known from an earlier replay of the block.
 
     Args:
         stage, found, block, context, settings: as for `filter_events`.
@@ -103,21 +105,22 @@ def events_of(
 def filter_events(
     stage: Stage, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """Turn a block's messages into events of the recursion.
+    """Convert a block's messages to events of the recursion.
 
     Args:
-        stage: the model with the sensors at hand.
+        stage: the bound model, with the sensors of the log.
         found: its topics.
-        block: the messages of these topics, in all runs.
+        block: messages of these topics, in all runs.
         context: maps and origins.
-        settings: (1 + sensors, fields), see `settings_of`.
+        settings: (1 + sensors, fields); see `settings_of`.
 
-    Returns the events, and which messages (n,) of the block have no covariance and are left out.
+    Returns:
+        The events, and which messages (n,) of the block are skipped because they lack a covariance.
     """
     merged, control = block.events, stage.model.control
     width, start = data_columns(stage)
     uses: list[tuple[str, Table]] = []
-    sampled: list[int] = []  # the columns of what is a sample, and does not hold until the next
+    sampled: list[int] = []  # columns of samples, which do not hold until the next one
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
         replaced = {name for each, _ in found.fallbacks for name in each.components}
@@ -140,7 +143,7 @@ def filter_events(
     arrival = np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival
     events = FilterEvents(merged.offsets, merged.time_ns, source, data, merged.is_last, target, arrival)
     again = [_again(events, block, name, table) for name, table in uses if table is not tables[name]]
-    if without_covariance.any():  # as if these had not come
+    if without_covariance.any():  # events without these
         chosen = ~without_covariance
         after = np.cumsum(chosen)
         again = [(after[places] - 1, others) for places, others in again]
@@ -155,7 +158,7 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """Holds one topic's messages: data (n, width), source, reference, and which lack a covariance."""
+    """Messages of one topic: data (n, width), source, reference, and whether a covariance is missing."""
 
     data: Floats
     source: Integers
@@ -164,9 +167,9 @@ class Table(NamedTuple):
 
 
 def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
-    """Turn a topic's messages into what another sensor measures by them, with their places among all.
+    """Convert a topic's messages to a further sensor's measurements, with indices among all events.
 
-    One of which nothing is measured does not come again.
+    Messages that the sensor does not measure anything from are left out.
     """
     before = list(block.streams).index(name)
     begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
@@ -180,7 +183,7 @@ def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple
 
 
 def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents]]) -> FilterEvents:
-    """Insert other events after those at whose places they are."""
+    """Insert further events after those at the given indices."""
     places, others = zip(*again, strict=True)
     order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
     offsets, *columns = zip(events, *others, strict=True)
@@ -189,14 +192,14 @@ def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
-    """Read a control into the columns of its components; NaN where they come from elsewhere."""
+    """Read a control into the columns of its components; NaN for components of fallbacks."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
     read = control_numbers(control, ragged)
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    # one that says nothing, or cannot be interpolated, is as if it had not come
+    # a message without finite components, or one that cannot be interpolated, is skipped
     known = np.isfinite(read)
     enough = np.logical_and if control.interpolated else np.logical_or
     says_nothing = np.logical_not(over_columns(enough, known))
@@ -204,7 +207,7 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
 
 
 def control_numbers(control: Control, ragged: Ragged) -> Floats:
-    """Read what drives the motion (n, components)."""
+    """Read the control (n, components)."""
     names = control.components
     return _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
 
@@ -212,16 +215,16 @@ def control_numbers(control: Control, ragged: Ragged) -> Floats:
 def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
     """Read the messages of a sensor: measurement, reference and covariance; see `update.message_layout`.
 
-    A message without a covariance, or of which all is NaN, counts as none.
+    Messages without a covariance, or with only NaN, are marked as not used.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
         ragged: its messages in all runs.
         context: maps and origins.
-        settings: (1 + sensors, fields), see `settings_of`.
+        settings: (1 + sensors, fields); see `settings_of`.
 
-    Raises BadInput where a field has another width than the model declares.
+    Raises BadInput if a field has another width than the model declares.
     """
     sensor, (width, _) = stage.sensors[number], data_columns(stage)
     m = len(sensor.measured)
@@ -267,12 +270,12 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
 
 
 def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
-    """Compute the variances that a sensor gives messages without a covariance; NaN if it has none.
+    """Compute the variances that a sensor assigns to messages without a covariance; NaN if it has none.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
-        settings: (1 + sensors, fields), see `settings_of`.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
+        settings: (1 + sensors, fields); see `settings_of`.
     """
     sensor = stage.sensors[number]
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
@@ -280,7 +283,7 @@ def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
 
 
 def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
-    """Read measurements (n, m) of messages that state no covariance; NaN where one is missing."""
+    """Read measurements (n, m) from messages that state no covariance; NaN for missing components."""
     if sensor.read:
         return _computed(sensor.read, ragged, len(sensor.measured))
     if sensor.vector:
@@ -289,7 +292,7 @@ def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
 
 
 def with_covariance(sensor: Sensor, ragged: Ragged) -> MeasuredVectors:
-    """Read measurements, their covariances and which of them lack one."""
+    """Read measurements, their covariances, and whether the covariance is missing."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
     assert sensor.read is not None
@@ -304,8 +307,8 @@ def _fields(stream: Stream, names: Sequence[str]) -> Floats:
 
 
 def _field(stream: Stream, name: str, size: int) -> Floats:
-    """Read a field of numbers or vectors (n, size); raises BadInput where it has another width."""
-    if not len(stream):  # vectors have no width here
+    """Read a field of numbers or vectors (n, size); raise BadInput if it has another width."""
+    if not len(stream):  # the width of vectors is unknown here
         return np.empty((0, size))
     numbers = np.asarray(stream[name], float).reshape(len(stream), -1)
     if numbers.shape[1] != size:
@@ -316,8 +319,8 @@ def _field(stream: Stream, name: str, size: int) -> Floats:
 
 
 def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int) -> Floats:
-    """Call a model's own function of a topic; raises BadInput where its array has another shape."""
-    if not len(ragged):  # vectors have no width here
+    """Call a model's own function on a topic; raise BadInput if its array has another shape."""
+    if not len(ragged):  # the width of vectors is unknown here
         return np.empty((0, components))
     numbers = np.asarray(read(ragged.stream), float)
     if numbers.shape != (len(ragged), components):
@@ -329,13 +332,13 @@ def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int)
 
 
 def not_driven(name: str, control: Control, found: Found, events: FilterEvents) -> Ragged:
-    """List measurements that were skipped in a gap of the control.
+    """Report measurements that were skipped in a gap of the control.
 
     Args:
-        name: of the filter.
-        control: an interpolated one, which is NaN in its gaps.
-        found: its topics.
-        events: with the control.
+        name: name of the filter.
+        control: interpolated control, which is NaN in its gaps.
+        found: topics of the filter.
+        events: events with the control.
     """
     in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
     reasons = [
@@ -356,14 +359,14 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 def passed_over(
     name: str, stage: Stage, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
-    """List messages that were skipped since they lack a covariance, if any topic may.
+    """Report messages that were skipped because they lack a covariance; empty if no topic can.
 
     Args:
-        name: of the filter.
-        stage: the model with the sensors at hand.
+        name: name of the filter.
+        stage: the bound model, with the sensors of the log.
         found: its topics.
-        block: their messages.
-        without_covariance: which of these (n,) have none.
+        block: messages of these topics.
+        without_covariance: whether each message (n,) lacks its covariance.
     """
     control = stage.model.control
     drops = control is not None and control.interpolated

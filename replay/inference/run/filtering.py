@@ -1,4 +1,4 @@
-"""Runs a filter in a replay: one model by one method, bound to the topics of a log."""
+"""A filter in a replay: one model with one method, bound to the topics of a log."""
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
@@ -75,21 +75,21 @@ from fuselog.replay.inference.run.timing import (
 )
 from fuselog.replay.inference.sampling.samplers import Sampler
 
-# What a smoother keeps for its backward pass, or a filter for late messages: its own.
+# What a smoother keeps for its backward pass, or a filter for late messages; the type is its own.
 Kept = Any  # type: ignore[explicit-any]
 
 
 class FilterState(NamedTuple):
-    """Holds what a filter carries from block to block.
+    """State of a filter between blocks.
 
     Attributes:
         carried: see `recursion.RecursionState`.
-        context: what messages are read against.
-        generators: of the randomised samples, for every sampled function and run.
+        context: maps and origins that messages refer to.
+        generators: random generators of samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
-        unsettled: events that wait for others which were measured before them and come later.
+        unsettled: events that wait for messages that arrive later but were measured earlier.
         kept: what a smoother keeps for its backward pass, or a filter for late messages.
-        next_output: (runs,) the number of the next extra estimate.
+        next_output: (runs,) number of the next additional estimate.
     """
 
     carried: RecursionState
@@ -103,13 +103,12 @@ class FilterState(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _steps(stage: Stage, method: Method) -> Steps:
-    """Make the steps of the loop over the runs."""
     return method.steps(stage)
 
 
 @lru_cache(maxsize=64)
 def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
-    """Make the loop over the runs, compiled when first called, and its steps."""
+    """Make the loop over the runs, which is compiled when first called, and its steps."""
     steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
@@ -118,12 +117,14 @@ def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
 
 
 def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) -> tuple[Sampler, ...]:
-    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size.
+    """Make a sampler for each sampled function.
 
     Args:
-        stage: the model as the method takes it.
-        method: whose `sampling` chooses samples.
-        parameters: the method's.
+        stage: the bound model.
+        method: method whose `sampling` makes the samples.
+        parameters: parameters of the method.
+
+    Raises BadInput if the sampling does not exist in the required dimension.
     """
     if method.sampling is None:
         return ()
@@ -133,15 +134,15 @@ def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) ->
 
 @dataclass(frozen=True)
 class Filter:
-    """Runs one bound filter: `start`, `run` and `finish` of an `estimator.Recursive`.
+    """A bound filter, with the `start`, `run` and `finish` of an `estimator.Recursive`.
 
     Attributes:
-        name: what its output topics begin with, after `/estimates/`.
+        name: its output topics begin with this, after `/estimates/`.
         found: its topics.
-        stage, method, parameters: what it is made of.
-        settings: (1 + sensors, fields), see `settings_of`.
+        stage, method, parameters: the bound model, the method and its parameters.
+        settings: (1 + sensors, fields); see `settings_of`.
         samplers: one for each of `Steps.sampled`.
-        each_run: (runs, 1 + sensors, fields), the settings of runs that have their own.
+        each_run: (runs, 1 + sensors, fields), the settings if each run has its own.
     """
 
     name: str
@@ -155,13 +156,13 @@ class Filter:
     is_bound: ClassVar[bool] = False
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
-        """List the topics of a log that it starts from: the prior, where there is one, and the maps."""
+        """List the topics needed before the start: the prior, if the log has one, and the maps."""
         maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior; a run whose prior cannot be used takes no part."""
+        """Make the state at every run's prior; runs with an invalid prior do not start."""
         model = self.stage.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
@@ -175,7 +176,7 @@ class Filter:
             for topic, asked in maps.items()
         }
         waiting = None
-        if model.control is not None and model.control.interpolated:  # what drives from there on
+        if model.control is not None and model.control.interpolated:  # control from the start on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
         context = Context(points, self.origins(static, len(mean)))
@@ -183,22 +184,22 @@ class Filter:
 
     @cached_property
     def steps(self) -> Steps:
-        """Return the steps of its loop."""
+        """Steps of its loop."""
         return _steps(self.stage, self.method)
 
     @property
     def form(self) -> Form:
-        """Return what stands for covariances in what it carries."""
+        """Form in which covariances are stored."""
         return self.steps.form
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
-        """Find the origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
+        """Return the origins of the planes (runs, 3), as stated or from the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
 
     def settings_of_runs(self, context: Context, runs: int) -> Floats:
-        """Repeat the settings for each run (runs, 1 + sensors, fields), see `placed_settings`."""
+        """Repeat the settings for each run (runs, 1 + sensors, fields); see `placed_settings`."""
         names, of = number_fields(self.stage.model.parameters), (self.found, self.parameters)
         settings = self.settings if self.each_run is None else self.each_run
         return placed_settings(settings, names, *of, context.origins, runs)
@@ -216,7 +217,7 @@ class Filter:
     def ready(
         self, state: FilterState, events: FilterEvents, *, is_end: bool
     ) -> tuple[FilterState, FilterEvents]:
-        """Return the events that need not wait for others, and a state that keeps those that do."""
+        """Return the events that need not wait for others, and a state that keeps the waiting ones."""
         next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
@@ -236,18 +237,18 @@ class Filter:
         return after, events
 
     def gaps(self, events: FilterEvents) -> list[Ragged]:
-        """Report the gaps of the control after which the filter goes on."""
+        """Report the gaps of the control after which the filter continues."""
         control = self.stage.model.control
         if control is None or not control.gap or not self.steps.resumes_after_gap:
             return []
         return [not_driven(self.name, control, self.found, events)]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter what still waits for messages that do not come any more."""
+        """Filter the events that still wait for messages."""
         return self.ended(state)[1]
 
     def ended(self, state: FilterState) -> tuple[FilterState, list[Ragged]]:
-        """Filter what waits for messages that do not come any more: the state and its outputs."""
+        """Filter the events that still wait for messages; return the state and the outputs."""
         made: list[Ragged] = []
         if state.unsettled is not None:
             no_more = select_events(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
@@ -262,7 +263,7 @@ class Filter:
 
     @property
     def gap_ns(self) -> float:
-        """Read how long an interpolated control may be silent."""
+        """Longest time without messages of an interpolated control."""
         control = self.stage.model.control
         if control is None or not control.gap:
             return np.inf
@@ -271,18 +272,18 @@ class Filter:
 
     @cached_property
     def delays_ns(self) -> Integers:
-        """Compute the delays of messages, see `delays_of`."""
+        """Delays of messages; see `delays_of`."""
         return delays_of(self.stage, self.settings)
 
     @property
     def initial(self) -> tuple[float, ...]:
-        """Return what drives the motion before the first message of the control."""
+        """Control before its first message."""
         control = self.stage.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     @cached_property
     def beside_settings(self) -> Hashable:
-        """Return all that it is made of beside settings that only the loop over the runs reads."""
+        """All that defines the filter except settings that only the loop over the runs reads."""
         names = {*number_fields(self.stage.model.parameters)} - {"gate_probability"} | {"of_topics"}
         return (
             self.name,
@@ -301,7 +302,7 @@ class Filter:
 
     @property
     def why_in_sequence(self) -> str:
-        """Explain why it needs its messages in order; empty where it can take late ones."""
+        """Reason why the filter needs its messages in order; empty if it can reprocess late ones."""
         control = self.stage.model.control
         if self.parameters.every_s is not None:
             return "there are no estimates between messages (every_s, --every) then"
@@ -322,7 +323,7 @@ class Filter:
     def filtered(
         self, state: FilterState, events: FilterEvents
     ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
-        """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
+        """Filter events; return the state after them, estimates, their offsets, and other outputs."""
         sensors = self.stage.sensors
         with done_once():
             loop, _ = _compiled(self.stage, self.method)
@@ -358,7 +359,7 @@ class Filter:
     def parts(
         self, generators: tuple[Samples, ...], events: FilterEvents
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Iterate over runs, None for all, and what makes the memory of a core with their samples."""
+        """Yield slices of runs (None for all) with functions that make a core's working memory."""
         if not self.is_random:
             yield None, self.scratch
             return
@@ -367,26 +368,26 @@ class Filter:
 
     @cached_property
     def is_random(self) -> bool:
-        """Tell whether its samples are drawn, for every event anew."""
+        """Whether new samples are drawn for every event."""
         return any(each.redrawn for each in self.samplers)
 
     @cached_property
     def scratch(self) -> Scratch:
-        """Make the memory of cores, with samples that serve every event."""
+        """Working memory of each core, with samples that serve every event."""
         [(_, sets)] = sample_sets(self.samplers, (), np.zeros(1, np.int64))
         return Scratch(partial(self.steps.memory, sets))
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[EstimatesToFill, InnovationRows]:
-        """Make estimates and innovations to be filled in, see `recursion.no_results`."""
+        """Make arrays of estimates and innovations to fill; see `recursion.no_results`."""
         return no_results(due, recorded, self.stage.model, innovation_size)
 
     @cached_property
     def gates(self) -> Floats:
-        """Compute bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
+        """Bounds of the NIS (sensors + 1, largest measurement + 1), by number of components.
 
-        The last row is that of a gate that is open.
+        The last row is that of an open gate.
         """
         largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
         bounds = _nis_bounds(self.parameters.gate_probability, largest)
@@ -396,7 +397,7 @@ class Filter:
 
     @property
     def truth(self) -> str:
-        """Name the topic that the estimates are compared with."""
+        """Topic that the estimates are compared with."""
         return self.found.truth
 
     def output_streams(self, estimates: EstimatesToFill, offsets: Integers, /) -> list[Ragged]:
@@ -417,21 +418,21 @@ class Filter:
 
     @cached_property
     def state_metadata(self) -> Mapping[str, str]:
-        """Return what the channel of the states says."""
+        """Metadata of the channel of the states."""
         return {**named(self.stage.model.state), "truth": self.truth, **in_frame(self.found.frame)}
 
     @cached_property
     def measured(self) -> Mapping[str, str]:
-        """Return the components of all innovations."""
+        """Names and kinds of the components of all innovations."""
         return innovation_components(self.stage.sensors)
 
     def innovations(self, innovations: InnovationRows, offsets: Integers) -> Ragged:
-        """Make the stream of innovations, which needs a sensor; see `states`."""
+        """Make the stream of innovations, for a filter with sensors; see `states`."""
         topic = f"/estimates/{self.name}"
         return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)
 
 
 @lru_cache(maxsize=64)
 def _nis_bounds(probability: float, components: int) -> Floats:
-    """Compute the quantiles (components + 1,) of the NIS by its components; zero are always let in."""
+    """Compute the quantiles (components + 1,) of the NIS; without components it is unbounded."""
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))

@@ -1,4 +1,4 @@
-"""Finds the first messages of every run, and describes what they determine."""
+"""The first messages of every run, and what they determine."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, ta
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.start import Start
 
-WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
+WIDER = 30.0  # times a message's standard deviation: such a prior has a thousandth of its weight
 
 
 class Begun(NamedTuple):
-    """Holds where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; Gaussians."""
+    """Starts of the runs, to be filled: stamps (runs,), FOREVER_NS if unknown, means and covariances."""
 
     time_ns: Integers
     mean: Floats
@@ -26,7 +26,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """Holds a sentence to be reported, its stamps (runs,), and the runs that it holds for (runs,)."""
+    """A sentence to report, its stamps (runs,), and the runs to which it applies (runs,)."""
 
     text: str
     time_ns: Integers
@@ -34,7 +34,7 @@ class Fact(NamedTuple):
 
 
 def diagonal_places(size: int) -> Integers:
-    """Find the diagonal among the rows of a lower triangle."""
+    """Return the indices of the diagonal in the flattened lower triangle."""
     rows = np.arange(1, size + 1)
     return np.cumsum(rows) - 1
 
@@ -45,7 +45,7 @@ def run_count(first: Mapping[str, Ragged]) -> int:
 
 
 def unknown(state: Components, start: Start | None) -> tuple[Floats, Floats]:
-    """Make the mean (n,) and sigmas (t,) of a state that nobody knows; NaN where none is given."""
+    """Make the mean (n,) and sigmas (t,) of an unknown state; NaN for sigmas that are not given."""
     kinds = list(state.values())
     sigmas = named_now(start.sigmas, list(state), kinds) if start else {}
     mean = np.zeros(len(kinds))
@@ -57,12 +57,12 @@ def unknown(state: Components, start: Start | None) -> tuple[Floats, Floats]:
 
 
 def state_by_message(stage: Stage, number: int, data: Floats) -> tuple[Floats, Floats]:
-    """Compute the mean (n,) and the much wider sigmas (t,) of a state that one message measures.
+    """Compute the mean (n,) and the much larger sigmas (t,) of a state that one message measures.
 
     Args:
-        stage: the model, with its sensors.
-        number: of the sensor.
-        data: what the message measures, and its noise, as a row of `sensor_table`.
+        stage: the bound model with its sensors.
+        number: number of the sensor.
+        data: measurement and noise of the message, as a row of `sensor_table`.
     """
     model, sensor = stage.model, stage.sensors[number]
     mean, sigma = unknown(model.state, model.start)
@@ -81,12 +81,12 @@ def state_by_message(stage: Stage, number: int, data: Floats) -> tuple[Floats, F
 def first_of_runs(
     ragged: Ragged, clock: Clock, usable: Booleans | None
 ) -> tuple[Integers, Booleans, Integers]:
-    """Find the first usable message of every run (runs,): its stamp, whether there is one, its row.
+    """Find the first usable message of every run (runs,): its stamp, whether there is one, and its row.
 
     Args:
-        ragged: the messages of a topic, in all runs.
-        clock: by which the stamps are taken.
-        usable: (n,) which of them may be used; all where it is None.
+        ragged: messages of a topic, in all runs.
+        clock: clock of the stamps.
+        usable: (n,) whether each message may be used; None for all.
     """
     every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
     place = np.searchsorted(every, ragged.offsets)
@@ -99,23 +99,23 @@ def first_of_runs(
 
 
 def heads_of_runs(ragged: Ragged, count: int) -> Ragged:
-    """Return the first messages of every run, `count` at most."""
+    """Return the first messages of every run, at most `count`."""
     is_early = np.arange(len(ragged)) < (ragged.offsets[:-1] + count)[run_of_rows(ragged.offsets)]
     return Ragged(ragged.stream.take(is_early), ragged_rows(is_early, ragged.offsets))
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """Lay out a stream of one message for each of some runs.
+    """Assign the messages of a stream to those runs that have one.
 
     Args:
-        stream: these messages, in the order of their runs.
-        has_one: (runs,), which runs have one.
+        stream: the messages, in the order of their runs.
+        has_one: (runs,) whether a run has a message.
     """
     return Ragged(stream, np.append(0, np.cumsum(has_one)))
 
 
 def started(name: str, facts: list[Fact]) -> list[Ragged]:
-    """Make the stream `started` of an estimator: a message for each fact and run."""
+    """Make the stream `started` of an estimator, with one message per fact and run."""
     if not facts:
         return []
     texts, times, which = zip(*facts, strict=True)

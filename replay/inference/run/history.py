@@ -1,4 +1,4 @@
-"""Keeps the latest messages of every run, and what a filter believed after each."""
+"""History of the latest messages of every run, with the belief after each."""
 
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -20,13 +20,13 @@ Structure = tuple[tuple[str, "int | Structure"], ...]
 
 
 class KeptMessages(NamedTuple):
-    """Holds messages in order, and the belief after each; first axis = run and message.
+    """Messages in order, and the belief after each; the first axis is run and message.
 
     Attributes:
-        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
-        position: in the file.
-        after: what was carried after the message.
-        has_innovation: whether it was an update, and so has an innovation.
+        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last as uint32.
+        position: position in the file.
+        after: state after the message.
+        has_innovation: whether the message was an update and therefore has an innovation.
         difference, covariance, numbers: see `steps.InnovationRecord`.
     """
 
@@ -43,14 +43,14 @@ class KeptMessages(NamedTuple):
 
 
 class History(NamedTuple):
-    """Holds the latest messages of every run.
+    """The latest messages of every run.
 
     Attributes:
         start_ns: (runs,) stamps of the priors.
-        first, counts: (runs,) which rows are a run's: run r has C rows of `kept`, of which `counts[r]`
-            are filled, from row r C + first[r] on. What was carried after the first of them is where
-            the others are repeated from.
-        kept: (runs C).
+        first, counts: (runs,) rows of each run: run r has C rows of `kept`, of which `counts[r]` are
+        filled, starting at row r C + first[r]. The messages after the first filled row can be
+        reprocessed from the state stored in it.
+        kept: (runs C) the messages.
     """
 
     start_ns: Integers
@@ -60,23 +60,23 @@ class History(NamedTuple):
 
     @property
     def capacity(self) -> int:
-        """Count the rows of every run."""
+        """Number of rows for every run."""
         return len(self.kept.time_ns) // max(len(self.first), 1)
 
     @property
     def rows(self) -> Integers:
-        """List the filled rows, run by run."""
+        """Filled rows, run by run."""
         begin = np.arange(len(self.first)) * self.capacity + self.first
         before = np.cumsum(self.counts) - self.counts
         return np.repeat(begin - before, self.counts) + np.arange(self.counts.sum())
 
     @property
     def offsets(self) -> Integers:
-        """Return offsets by which run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
+        """Offsets of the runs: run r has the entries offsets[r]:offsets[r + 1] of `rows`."""
         return np.append(0, np.cumsum(self.counts))
 
     def with_room(self, capacity: int) -> "History":
-        """Copy it with so many rows for every run, of which the filled ones are the first."""
+        """Copy the history to one with `capacity` rows per run, of which the first are filled."""
         rows, runs = self.rows, np.arange(len(self.first))
         places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
 
@@ -94,11 +94,11 @@ class History(NamedTuple):
 
 
 def no_history(stage: Stage, carried: RecursionState) -> History:
-    """Make the history before all messages: the priors alone.
+    """Make a history that contains only the priors.
 
     Args:
-        stage: the model with the sensors at hand.
-        carried: the state at the priors.
+        stage: the bound model, with the sensors of the log.
+        carried: state at the priors.
     """
     runs, innovation_size, (width, _) = (
         len(carried.time_ns),
@@ -122,12 +122,12 @@ def no_history(stage: Stage, carried: RecursionState) -> History:
 
 
 def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """Count the most messages of a run that lie within a window, of those kept and those that come.
+    """Count the most messages of a run within any window, among the stored and the new ones.
 
     Args:
-        history: of all runs.
-        events: those that come now.
-        window_ns: its length.
+        history: history of all runs.
+        events: the new messages.
+        window_ns: length of the window.
     """
     most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
     for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
@@ -139,7 +139,7 @@ def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
 
 
 def structure_of(rows: Columns) -> Structure:
-    """Describe a NamedTuple of arrays, or of such NamedTuples: their names and numbers of axes."""
+    """Describe a possibly nested NamedTuple of arrays by its names and numbers of axes."""
     return tuple(
         (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
         for name, column in zip(rows._fields, rows, strict=True)
@@ -147,14 +147,14 @@ def structure_of(rows: Columns) -> Structure:
 
 
 class CopyRow(Protocol):
-    """Copies row i of a NamedTuple of arrays to row j of another."""
+    """Function that copies row i of a NamedTuple of arrays to row j of another."""
 
     def __call__(self, source: Columns, i: int, target: Columns, j: int, /) -> None: ...
 
 
 @lru_cache(maxsize=64)
 def copying_rows(structure: Structure) -> CopyRow:
-    """Make `copy(source, i, target, j)`: row i of a NamedTuple of arrays to row j of another."""
+    """Make `copy(source, i, target, j)`, which copies a row of a NamedTuple of arrays to another."""
     columns = tuple(name for name, of in structure if not isinstance(of, tuple))
     groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
 

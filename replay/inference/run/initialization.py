@@ -1,8 +1,9 @@
-"""Initializes a filter in a log without a prior, and finds the origin of its plane.
+"""Initialization of a filter in a log without a prior, and of the origin of its plane.
 
-A log without a prior gets one at the first message that measures the state, see `start.Start`. It is so
-much wider than that message that the message itself, used like any other, is what counts. The origin of
-a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
+Such a log gets a prior at the first message that measures the state; see `start.Start`. The prior is
+much wider than the message, so that the message itself, which is also processed as a measurement,
+determines the estimate. If no channel states the origin of the plane, it is the first geodetic fix. All
+such decisions are reported on the topic `started`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,20 +42,20 @@ from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 from fuselog.replay.inference.run.timing import compensate_delays, delays_of
 
 FOREVER_NS = np.iinfo(np.int64).max
-HEAD = 16  # messages of a run, among which one is usable as a rule
-CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
+HEAD = 16  # first messages of a run that are tried first, one of which is usually usable
+CERTAIN = 1e-6  # times the standard deviations of a start, for an estimate that defines its own frame
 
 
 @dataclass(frozen=True)
 class Initializer:
-    """Finds where a filter begins from the first messages of a log.
+    """Search for the start of a filter in the first messages of a log.
 
     Attributes:
-        name: what its output topics begin with, after `/estimates/`.
+        name: its output topics begin with this, after `/estimates/`.
         found: its topics.
-        stage: the model as the log states it, with the sensors at hand.
-        settings: (1 + sensors, fields) numbers of motion and sensors.
-        assumed: the parameters among them that the log does not state.
+        stage: the bound model, with the sensors of the log.
+        settings: (1 + sensors, fields), numbers of motion and sensors.
+        assumed: parameters among them that the log does not state.
     """
 
     name: str
@@ -65,7 +66,7 @@ class Initializer:
 
     @property
     def initialization(self) -> Initialization | None:
-        """Return how the start is found; None where the log states all."""
+        """How the start is found; None if the log states everything."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
@@ -82,7 +83,7 @@ class Initializer:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """List the sensors that measure the state itself, with their numbers."""
+        """The sensors that measure the state itself, with their numbers."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
@@ -91,7 +92,7 @@ class Initializer:
 
     @property
     def _starting(self) -> list[Topic]:
-        """List the topics whose first message says where to begin."""
+        """The topics whose first message determines the start."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.fallbacks)]
         if self.stage.model.finds_start:
@@ -101,7 +102,7 @@ class Initializer:
 
     @property
     def _aligns(self) -> bool:
-        """Tell whether fixes alone have to determine the whole state, and can."""
+        """Whether fixes must determine the whole state, and can."""
         model = self.stage.model
         kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
         can_align = bool(model.start and model.start.align)
@@ -110,12 +111,14 @@ class Initializer:
     def find(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
     ) -> Initialized:
-        """Find starts in the first messages; raises BadInput where none of them can be used.
+        """Find starts in the first messages.
 
         Args:
-            first: the first messages of every run, by topic.
-            static: the topics that the filter starts from, by name.
-            clock: by which the replay stamps estimates.
+            first: first messages of every run, by topic.
+            static: topics that the filter needs before it starts, by name.
+            clock: clock by which the replay stamps estimates.
+
+        Raises BadInput if no message can be used.
         """
         found: dict[str, Ragged] = {}
         streams: list[Ragged] = []
@@ -146,7 +149,7 @@ class Initializer:
         clock: Clock,
         times_ns: Sequence[int],
     ) -> list[Initialized]:
-        """Find the equally likely starts of runs, each at its stamp; see `broad_priors`."""
+        """Find equally likely starts of the runs at the given stamps; see `broad_priors`."""
         runs = run_count(first)
         origins = None if self.found.origin is None else np.tile(self.found.origin, (runs, 1))
         begun: dict[str, Ragged] = {}
@@ -177,7 +180,7 @@ class Initializer:
         clock: Clock,
         origins: Floats | None,
     ) -> tuple[Ragged, list["Fact"]]:
-        """Make the priors of all runs, and the facts to be reported of them."""
+        """Make the priors of all runs, and the facts to report about them."""
         model, runs = self.stage.model, run_count(first)
         mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
@@ -207,7 +210,7 @@ class Initializer:
         return of_runs(stream, has_begun), facts
 
     def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
-        """Report that fixes did not determine all, where a run begins without."""
+        """Report which components the fixes did not determine, for runs that start without alignment."""
         _, sensor, _ = self._measuring[0]
         measured = sensor.measured
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
@@ -218,7 +221,7 @@ class Initializer:
         return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
     def _assumption(self, name: str, number: float) -> str:
-        """Write the sentence for a parameter that is assumed, with its meaning if the model gives it."""
+        """Describe an assumed parameter, with its meaning if the model gives one."""
         meaning = meanings(self.stage.model.parameters).get(name, "")
         sentence = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{sentence} ({meaning.rstrip('.')})" if meaning else sentence
@@ -228,7 +231,7 @@ class Initializer:
         return f"the log has no prior ({self.found.prior.name}): it begins"
 
     def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "Begun") -> list["Fact"]:
-        """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
+        """Start all runs at zero, at their first control; this defines the frame of the estimates."""
         for topic in self._starting:
             found_ns, has_one, _ = first_of_runs(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
@@ -243,7 +246,7 @@ class Initializer:
         origins: Floats | None,
         begun: "Begun",
     ) -> list["Fact"]:
-        """Begin all runs where the model finds them; raises BadInput where it finds none."""
+        """Start all runs at the states that the model finds; raise BadInput if it finds none."""
         model = self.stage.model
         assert model.start is not None
         assert model.start.find is not None
@@ -267,7 +270,7 @@ class Initializer:
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Settings]:
-        """Collect first messages and maps by the model's names for their topics, and the parameters."""
+        """Return first messages and maps, by the model's names of their topics, and the parameters."""
         model, control = self.stage.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -276,7 +279,7 @@ class Initializer:
             ragged = first[topic.name]
             if origins is not None and topic in self.found.geodetic:
                 ragged = in_plane(ragged, origins)
-            given.setdefault(sensor.topic, ragged)  # the first of its kind
+            given.setdefault(sensor.topic, ragged)  # the first topic of each sensor
             given |= {each.topic: static[each.topic] for each in sensor.maps}
         return given, self._parameters()
 
@@ -287,7 +290,7 @@ class Initializer:
         static: Mapping[str, Ragged],
         origins: Floats | None,
     ) -> list["Fact"]:
-        """Check the prior of runs against their first messages, as the model does."""
+        """Check the prior of each run against its first messages with the model's `check_prior`."""
         given, parameters = self._given(first, static, origins)
         sentences = [
             check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
@@ -302,7 +305,7 @@ class Initializer:
     def _at_first(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> list["Fact"]:
-        """Begin all runs at their first message that measures components of the state."""
+        """Start all runs at their first message that measures components of the state."""
         chosen = np.full(len(begun.time_ns), -1)
         for number, _, topic in self._measuring:
             ragged = first[topic.name]
@@ -324,9 +327,9 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Begin runs just after first fixes that, with the path between them, determine the state.
+        """Start runs just after first fixes that, with the path between them, determine the state.
 
-        Of several topics of a kind, these are the fixes of the first.
+        If several topics serve the same sensor, the fixes of the first topic are used.
         """
         numbers = [number for number, _, _ in self._measuring[:1]]
         sensors = tuple(self.found.sensors[number] for number in numbers)
@@ -350,7 +353,7 @@ class Initializer:
         return Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
 
     def _align(self, events: FilterEvents, run: int, stage: Stage) -> tuple[int, Floats, Floats] | None:
-        """Align a run: stamp, mean and covariance at the last of its first fixes; None if they end."""
+        """Align a run: return stamp, mean and covariance at one of its first fixes, or None."""
         model = stage.model
         assert model.start is not None
         assert model.start.align is not None
@@ -386,7 +389,7 @@ class Initializer:
         return None
 
     def _parameters(self) -> Settings:
-        """Return the parameters; of those that topics have, these are the first topic's of each kind."""
+        """Return the parameters; parameters of topics are those of the first topic of each sensor."""
         model = self.stage.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
         for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):
@@ -402,7 +405,7 @@ class Initializer:
         return "; ".join(complaints)
 
     def _origin_stream(self, fixes: Ragged) -> Ragged:
-        """Make the stream of origins, as fixes on a topic of their own."""
+        """Make the stream of origins, as fixes on a separate topic."""
         stream = fixes.stream
         columns: dict[str, Columns] = {
             name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")

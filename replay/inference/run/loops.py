@@ -1,7 +1,7 @@
-"""Goes through the events of a run in time: the loops that filters, trackers and networks share.
+"""Loops over the events of a run, shared by filters, trackers and networks.
 
-What events are differs: messages, scans of detections, activities of nodes. All have `offsets`
-(runs + 1,) and `time_ns` (n,), and stand in the inputs of a recursion as `events`.
+Events may be messages, scans of detections or activities of nodes. All have `offsets` (runs + 1,) and
+`time_ns` (n,), and are the field `events` of a recursion's inputs.
 """
 
 from typing import Protocol
@@ -11,9 +11,9 @@ from fuselog.replay.engine.streams.results import ALL_WELL
 
 
 class OnEvent(Protocol):
-    """Does something at an event of a run, see `over_events`; returns ALL_WELL or what failed.
+    """Function that is called for an event of a run; it returns ALL_WELL or the number of the failure.
 
-    Inputs, state, results and memory are those of the recursion.
+    Inputs, state, results and memory are those of the recursion; see `over_events`.
     """
 
     def __call__(
@@ -29,7 +29,10 @@ class OnEvent(Protocol):
 
 
 class OnStamp(Protocol):
-    """Moves the state of a run through all events of a stamp; returns whether the run goes on."""
+    """Function that moves the state of a run through all events of a stamp.
+
+    It returns whether the run continues.
+    """
 
     def __call__(
         self,
@@ -45,7 +48,7 @@ class OnStamp(Protocol):
 
 
 class Follow(Protocol):
-    """Moves the state of a run through all its events, and fills the results."""
+    """Function that moves the state of a run through all its events and fills the results."""
 
     def __call__(
         self,
@@ -61,15 +64,18 @@ class Follow(Protocol):
 def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Follow:
     """Make the loop over the events of one run, one after the other.
 
-    Args:
-        process: `process(run, event, inputs, state, results, memory)` moves the state through an event;
-            returns the number of what failed. What is negative ends no run, and only after ALL_WELL is
-            something recorded.
-        record: the same, after that: it fills in what is wanted of the state.
-        fails: whether a run may fail; else the state has no `failure`, and all events are processed.
+    The run ends when its `state.failure` is not ALL_WELL, or after its last event.
 
-    Returns `follow(run, inputs, state, results, memory)`, for `compile_over_runs`. The run ends where
-    its `state.failure` is not ALL_WELL, or its events end.
+    Args:
+        process: `process(run, event, inputs, state, results, memory)` moves the state through an event
+            and returns ALL_WELL or the number of the failure. Negative numbers do not end the run, but
+            nothing is recorded for the event.
+        record: called in the same way after ALL_WELL; it fills the results that are requested.
+        fails: whether a run may fail; otherwise the state needs no `failure`, and all events are
+            processed.
+
+    Returns:
+        `follow(run, inputs, state, results, memory)`, for `compile_over_runs`.
     """
 
     def follow(
@@ -79,7 +85,6 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
         results: AnyArgument,
         memory: AnyArgument,
     ) -> None:
-        """Move the state, and fill the results, until the events end or the run fails."""
         for event in range(inputs.events.offsets[run], inputs.events.offsets[run + 1]):
             has_failed = state.failure[run] != ALL_WELL if fails else False
             if has_failed:
@@ -94,13 +99,14 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
 
 
 def over_stamps(process: OnStamp) -> Follow:
-    """Make the loop over the events of one run, all of one stamp together.
+    """Make the loop over the events of one run that processes all events of a stamp together.
 
     Args:
         process: `process(run, begin, end, inputs, state, results, memory)` moves the state through the
-            events from `begin` to `end`; returns whether the run goes on.
+            events from `begin` to `end` and returns whether the run continues.
 
-    Returns `follow(run, inputs, state, results, memory)`, for `compile_over_runs`.
+    Returns:
+        `follow(run, inputs, state, results, memory)`, for `compile_over_runs`.
     """
 
     def follow(
@@ -110,7 +116,6 @@ def over_stamps(process: OnStamp) -> Follow:
         results: AnyArgument,
         memory: AnyArgument,
     ) -> None:
-        """Move the state, and fill the results, until the events end or the run does."""
         begin, last, time_ns = (
             inputs.events.offsets[run],
             inputs.events.offsets[run + 1],

@@ -1,9 +1,9 @@
-"""Processes out-of-sequence measurements: the belief afterwards equals that of in-order processing.
+"""Reprocessing of out-of-sequence messages: the final belief equals that of processing in order.
 
-Of every message within a window the filter keeps the message, what it carried after it, and how the
-message fitted the prediction. A late message is put where it belongs by its stamp and its place in the
-file, and all after it are used again. The estimates that were given stay as they were; an innovation is
-told when no message can change it any more.
+For every message within a window, the filter stores the message, the state after it, and its innovation.
+A late message is inserted at its stamp and position in the file, and all messages after it are processed
+again. Estimates that were already issued stay as they were; an innovation is issued once no message can
+change it.
 """
 
 from collections.abc import Mapping
@@ -54,15 +54,15 @@ from fuselog.replay.inference.sampling.sets import sets_by_runs
 
 
 class LateState(NamedTuple):
-    """Holds what the recursion moves, of all runs.
+    """State of the recursion, for all runs.
 
     Attributes:
-        carried: after all messages so far.
-        failure: that of what is carried.
-        history: what is kept.
-        window_ns: how far messages may be late.
-        repeated: (n,), how many updates each event had repeated.
-        row: (runs,), the kept message that each run is at.
+        carried: state after all messages so far.
+        failure: its failures.
+        history: the stored messages.
+        window_ns: how late messages may be.
+        repeated: (n,) number of updates that each event caused to be repeated.
+        row: (runs,) row of the stored message that each run is processing.
     """
 
     carried: RecursionState
@@ -85,7 +85,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverR
 def reprocessing(
     model: Model, process: ProcessEvent, estimate: EstimateRun, structure: Structure
 ) -> Follow:
-    """Make the loop over the events of one run in the order of arrival; see `recursion.recursion`.
+    """Make the loop over the events of one run in order of arrival; see `recursion.recursion`.
 
     `structure` is that of `KeptMessages`.
     """
@@ -94,7 +94,7 @@ def reprocessing(
     passes_controls = model.control is not None and not model.control.estimates
 
     def insert(run: int, event: int, events: FilterEvents, history: History, capacity: int) -> int:
-        """Put an event where it belongs, by stamp and place in the file; returns its row."""
+        """Insert an event in order of stamp and position in the file, and return its row."""
         kept, base = history.kept, run * capacity
         if history.first[run] + history.counts[run] == capacity:
             for k in range(history.counts[run]):
@@ -116,7 +116,7 @@ def reprocessing(
     def process_again(
         run: int, row: int, inputs: RunInputs, state: LateState, memory: CoreMemory
     ) -> int:
-        """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
+        """Predict to a stored message and update by it; return the failure or ALL_WELL."""
         events, carried, kept, at = inputs.events, state.carried, state.history.kept, state.row
         stored = FilterEvents(
             events.offsets,
@@ -139,7 +139,7 @@ def reprocessing(
         return failure
 
     def write_innovation(run: int, row: int, kept: KeptMessages, innovations: InnovationRows) -> None:
-        """Fill in the innovation of a kept message."""
+        """Write the innovation of a stored message to the results."""
         if kept.has_innovation[row]:
             result = innovations.end[run]
             innovations.time_ns[result] = kept.time_ns[row]
@@ -150,7 +150,7 @@ def reprocessing(
             innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: KeptMessages) -> int:
-        """Find the last row of the newest stamp at which there are estimates."""
+        """Return the last row of the newest stamp that has estimates."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
             row -= 1
@@ -166,7 +166,7 @@ def reprocessing(
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Put an event where it belongs, and use it and all behind it again."""
+        """Insert an event, and process it and all later messages again."""
         history, kept = state.history, state.history.kept
         begin = insert(run, event, inputs.events, history, capacity_of(history))
         last = last_row(run, history)
@@ -193,7 +193,7 @@ def reprocessing(
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Fill in the newest estimate where one is wanted."""
+        """Write the newest estimate if the event requests one."""
         if not inputs.events.wants_estimate[event]:
             return ALL_WELL
         kept = state.history.kept
@@ -204,12 +204,12 @@ def reprocessing(
 
 
 def capacity_of(history: History) -> int:
-    """Return how many messages there is room for in each run."""
+    """Return the number of rows for the messages of each run."""
     return len(history.kept.time_ns) // len(history.first)
 
 
 def last_row(run: int, history: History) -> int:
-    """Find the newest kept message of a run."""
+    """Return the row of the newest stored message of a run."""
     row: int = run * capacity_of(history) + history.first[run] + history.counts[run] - 1
     return row
 
@@ -217,16 +217,16 @@ def last_row(run: int, history: History) -> int:
 # As an estimator
 
 
-# An `filtering.Filter` and its state, which stand above this module.
+# A `filtering.Filter` and its state; this module cannot import that one.
 AnyFilter = Any  # type: ignore[explicit-any]
 AnyFilterState = Any  # type: ignore[explicit-any]
 
 
 @dataclass(frozen=True)
 class OutOfSequenceFilter:
-    """Runs a filter that reprocesses up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
+    """A filter that reprocesses messages up to `window_ns` late; its methods are those of `Filter`.
 
-    `inner` is an `filtering.Filter`, and the states are of its type.
+    `inner` is a `filtering.Filter`, and the states are of its type.
     """
 
     inner: AnyFilter
@@ -238,7 +238,7 @@ class OutOfSequenceFilter:
         return state._replace(kept=no_history(self.inner.stage, state.carried))
 
     def run(self, state: AnyFilterState, block: Block) -> tuple[AnyFilterState, list[Ragged]]:
-        """Filter a block, its messages in the order of arrival."""
+        """Filter a block with its messages in order of arrival."""
         inner, sensors = self.inner, self.inner.stage.sensors
         events, without_covariance = filter_events(
             inner.stage, inner.found, block, state.context, inner.settings
@@ -275,7 +275,7 @@ class OutOfSequenceFilter:
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: AnyFilterState) -> list[Ragged]:
-        """Put out the innovations that might still have changed."""
+        """Return the innovations that could still have changed."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
@@ -288,12 +288,12 @@ class OutOfSequenceFilter:
 
 
 def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
-    """List the late messages, and how many updates each had repeated.
+    """Report the late messages, and how many updates each caused to be repeated.
 
     Args:
-        name: of the estimator.
-        events: of the block, n of them.
-        repeated: (n,), zero for a message that was not late.
+        name: name of the estimator.
+        events: the n events of the block.
+        repeated: (n,) zero for messages that were not late.
     """
     is_late = repeated > 0
     stream = make_stream(
@@ -307,13 +307,13 @@ def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
 
 
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
-    """Stamp estimates with the log times at which the events that called for them arrived.
+    """Set the log times of estimates to the arrival times of the events that requested them.
 
-    Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
+    Each run has one estimate for each such event after its prior, or only for the first of these.
 
     Args:
-        estimates: as the filter put them out.
-        events: of the block, with their arrivals.
+        estimates: estimates of the filter.
+        events: events of the block, with their arrival.
         start_ns: (runs,) stamps of the priors.
     """
     if not events.arrival.shape[1]:

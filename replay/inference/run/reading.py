@@ -1,4 +1,4 @@
-"""Says what an estimator of a model reads: which numbers of which topics, which parameters for what."""
+"""Descriptions of what an estimator reads: numbers of topics, and parameters with their roles."""
 
 from functools import partial
 
@@ -18,16 +18,16 @@ from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
 
-STEP = 1e-3  # of parameters and controls, by which their effects are compared
+STEP = 1e-3  # change of parameters and controls by which their effects are compared
 
 
 def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
     """Describe what an estimator reads.
 
     Args:
-        stage: the model with the sensors at hand, its functions as they were written.
+        stage: the bound model before tracing, with the sensors of the log.
         found: its topics.
-        settings: (1 + sensors, fields), the numbers of motion and sensors.
+        settings: (1 + sensors, fields), numbers of motion and sensors.
     """
     model = stage.model
     drives: dict[str, Control] = {}
@@ -71,7 +71,7 @@ def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
 
 
 def _measured(sensor: Sensor, stream: Stream) -> Floats:
-    """Read what a sensor measures (n, m); of geodetic fixes in the plane about the first one."""
+    """Read a sensor's measurements (n, m); geodetic fixes are relative to the first one."""
     ragged = gather([stream])
     if stream.schema.full_name == GEODETIC:
         ragged = in_plane(ragged, origins_of(gather([stream.take(slice(0, 1))])))
@@ -83,7 +83,7 @@ def _measured(sensor: Sensor, stream: Stream) -> Floats:
 
 
 def _noises(stage: Stage, found: Found) -> dict[str, str]:
-    """List the parameters that are standard deviations: a variance grows with their squares."""
+    """Return the parameters that are standard deviations, with the topics of their sensors or ""."""
     model = stage.model
     names = number_fields(model.parameters)
     state = trial_state(model.kinds)
@@ -99,7 +99,7 @@ def _noises(stage: Stage, found: Found) -> dict[str, str]:
 
 
 def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
-    """List the parameters by which one of the variances grows as by a standard deviation."""
+    """List the parameters whose squares a variance is linear in."""
     traced, ones = TracedParameters(dict.fromkeys(names)), dict.fromkeys(names, 1.0)
     kind = settings_type(names)
     with np.errstate(all="ignore"):
@@ -116,7 +116,7 @@ def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
 
 
 def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """List the parameters that may be estimated, with what reads them."""
+    """Return the parameters that can be estimated, with their kinds and the topics that read them."""
     readers = _readers(stage, found)
     by_name = {
         name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
@@ -126,14 +126,14 @@ def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, 
 
 
 def _calibration(stage: Stage, found: Found) -> dict[str, float]:
-    """List the parameters of the calibration that something reads here, with their useful sigmas."""
+    """Return the calibration parameters that are read here, with their useful standard deviations."""
     used = set().union(*(read for _, read in _readers(stage, found)))
     used |= {sensor.delay for sensor, _ in found.sensors}
     return {name: sigma for name, sigma in stage.model.calibration.items() if name in used}
 
 
 def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
-    """List the parameters that motion, under "", and sensors, under their topics, read."""
+    """List the parameters that the motion (under "") and each sensor (under its topic) read."""
     model = stage.model
     names = number_fields(model.parameters)
     state, control = trial_state(model.kinds), (0.0,) * model.controls
@@ -157,7 +157,7 @@ def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
 def _own_errors(
     stage: Stage, found: Found
 ) -> tuple[dict[tuple[str, int], str], dict[tuple[str, int], str]]:
-    """Find the parameters that are biases or factors of controls, or biases of what is measured."""
+    """Find parameters that act as biases or factors of controls, or as biases of measurements."""
     model = stage.model
     kind = settings_type(number_fields(model.parameters))
     ones = kind(*(1.0,) * len(kind._fields))
@@ -205,7 +205,7 @@ def _own_errors(
 def _control_noise(
     stage: Stage, found: Found, settings: Floats, step_s: float
 ) -> dict[tuple[str, int], float]:
-    """Return the variances of the control's numbers, of messages that hold for so long."""
+    """Return the variances of the control's components, for messages that hold for `step_s`."""
     variances = stage.motion.control_noise
     if variances is None:
         return {}
@@ -214,7 +214,7 @@ def _control_noise(
 
 
 def _driving(stage: Stage, found: Found) -> list[tuple[str, int]]:
-    """List from which topic, and which of its numbers, the components of the control come."""
+    """List the topic, and the index in its messages, of each component of the control."""
     control = stage.model.control
     if control is None or found.control is None:
         return []

@@ -1,8 +1,8 @@
-"""Goes through the events of a run in time: the one recursion for all models and methods.
+"""The recursion through the events of a run in time, common to all models and methods.
 
-One prediction per distinct stamp, one update per message in the order given; a control message changes
-what drives the next prediction. Messages before the state's own time say nothing. The run ends where its
-belief is no Gaussian any more.
+The recursion makes one prediction per distinct stamp and one update per message, in the given order; a
+control message changes the control of the next prediction. Messages before the time of the state are
+ignored. The run ends when its belief is no longer a Gaussian.
 """
 
 import math
@@ -40,23 +40,23 @@ from fuselog.replay.inference.model.settings import ReadSettings
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.loops import Follow, over_events
 
-CONTROL = -1  # an event's source; sensors count from zero, and NOTHING is only a time
+CONTROL = -1  # source of an event; sensors count from zero, and NOTHING is only a time
 NOTHING = -2
 
 
 class FilterEvents(NamedTuple):
-    """Holds the events of all runs in order: run r owns offsets[r]:offsets[r + 1].
+    """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
-        time_ns: (n,).
-        source: (n,) a sensor's number, CONTROL or NOTHING.
-        data: (n, width) the numbers of the message, see `update.message_layout`; the control's where
-            that is interpolated.
-        wants_estimate: (n,) whether the estimate after the event is wanted.
-        target_id: (n,) what the message is about, 0 for nothing.
-        arrival: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the
-            order of the stamps.
+        time_ns: (n,) stamps.
+        source: (n,) number of the sensor, CONTROL or NOTHING.
+        data: (n, width) numbers of the message, see `update.message_layout`; with an interpolated
+            control, the last columns are the control.
+        wants_estimate: (n,) whether the event requests an estimate.
+        target_id: (n,) what the message refers to, 0 for nothing.
+        arrival: (n, 2) time of arrival, and position in the file; (n, 0) if events arrive in the order
+            of their stamps.
     """
 
     offsets: Integers
@@ -69,14 +69,15 @@ class FilterEvents(NamedTuple):
 
 
 class RecursionState(NamedTuple):
-    """Holds what the recursion carries from block to block; first axis = run.
+    """State of the recursion between blocks; the first axis is the run.
 
     Attributes:
-        belief: the method's own.
-        control: (runs, controls), what drives the state.
-        time_ns: (runs,), of the belief.
-        accepted_ns: (runs, sensors), of the last measurement that the gate let in, or of the start.
-        failure: (runs,), ALL_WELL or an index of `steps.FAILURES`.
+        belief: the belief, of the method's own type.
+        control: (runs, controls) current control.
+        time_ns: (runs,) time of the belief.
+        accepted_ns: (runs, sensors) time of the last measurement that the gate accepted, or of the
+            start.
+        failure: (runs,) ALL_WELL or an index of `steps.FAILURES`.
     """
 
     belief: Belief
@@ -87,7 +88,7 @@ class RecursionState(NamedTuple):
 
 
 class EstimateRows(NamedTuple):
-    """Holds estimates as the recursion fills them in: those of run r end before row `end[r]`."""
+    """Estimates that the recursion fills; those of run r end before row `end[r]`."""
 
     end: Integers
     time_ns: Integers
@@ -96,7 +97,7 @@ class EstimateRows(NamedTuple):
 
 
 class InnovationRows(NamedTuple):
-    """Holds innovations as the recursion fills them in; see `steps.InnovationRecord`."""
+    """Innovations that the recursion fills; see `steps.InnovationRecord`."""
 
     end: Integers
     time_ns: Integers
@@ -107,12 +108,12 @@ class InnovationRows(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """Holds what a recursion goes by, in all runs.
+    """Inputs of a recursion, for all runs.
 
     Attributes:
-        events: in the order in which they are processed.
-        settings: (runs, 1 + sensors, fields), see `settings_of`.
-        gates: (sensors + 1, m + 1), bounds of the NIS by sensor; the last row is an open gate's.
+        events: events in the order of processing.
+        settings: (runs, 1 + sensors, fields); see `settings_of`.
+        gates: (sensors + 1, m + 1) bounds of the NIS by sensor; the last row is that of an open gate.
     """
 
     events: FilterEvents
@@ -121,7 +122,7 @@ class RunInputs(NamedTuple):
 
 
 class RunResults(NamedTuple):
-    """Holds what a recursion fills in: the method's own estimates, and innovations."""
+    """Results of a recursion: the method's own estimates, and innovations."""
 
     estimates: EstimatesToFill
     innovations: InnovationRows
@@ -130,14 +131,14 @@ class RunResults(NamedTuple):
 def recorded_innovations(
     topic: str, components: Mapping[str, str], truth: str, innovations: InnovationRows, offsets: Integers
 ) -> Ragged:
-    """Make the stream of innovations that a recursion filled in.
+    """Make the stream of innovations from the results of a recursion.
 
     Args:
-        topic: of the estimator.
-        components: what is measured, with kinds.
-        truth: the topic that the estimates are judged by.
-        innovations: (n, ...), laid end to end, see `filled`.
-        offsets: (runs + 1,), where those of each run begin.
+        topic: topic of the estimator.
+        components: names and kinds of the measured components.
+        truth: topic that the estimates are compared with.
+        innovations: (n, ...) innovations of all runs, concatenated; see `filled`.
+        offsets: (runs + 1,) first row of each run.
     """
     _, time_ns, target_id, difference, covariance, numbers = innovations
     columns: dict[str, Columns] = {
@@ -160,16 +161,16 @@ ResultsType = TypeVar("ResultsType", bound=tuple[AnyArgument, ...])
 def no_results(
     due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[EstimateRows, InnovationRows]:
-    """Make results to be filled in: run r has the rows from due[r] and recorded[r] up to the next run's.
+    """Make empty results; run r owns the rows from due[r] and recorded[r] to those of the next run.
 
-    All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
-    every page by itself, and that takes as long as half of a small filter.
+    All columns share one array: with many arrays, the operating system maps every page separately, which
+    takes half as long as running a small filter.
 
     Args:
         due: (runs + 1,) offsets of the estimates.
         recorded: (runs + 1,) offsets of the innovations.
-        model: the model, for the sizes of its state and tangent space.
-        innovation_size: how many components the sensors measure together.
+        model: model, for the sizes of its state and tangent space.
+        innovation_size: number of components that all sensors measure.
     """
     places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
     memory = np.empty(places[-1][0].stop)
@@ -188,7 +189,7 @@ def no_results(
 def _places(
     estimates: int, innovations: int, n: int, t: int, m: int
 ) -> tuple[tuple[RowSlice, tuple[int, ...]], ...]:
-    """Return where the columns of so many estimates and innovations lie in memory, and their shapes."""
+    """Return the slice of the shared array and the shape of each column of the results."""
     shapes = (
         *((estimates, *shape) for shape in ((), (n,), (t, t))),
         *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
@@ -198,11 +199,11 @@ def _places(
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
-    """Cut results down to what was filled in, laid end to end, and return their offsets.
+    """Remove the rows of results that were not filled; return the results and their new offsets.
 
     Args:
-        results: estimates or innovations, with the `end` that each run has reached.
-        offsets: (runs + 1,) where the runs began.
+        results: estimates or innovations, with the `end` that each run reached.
+        offsets: (runs + 1,) first row of each run.
     """
     end, *columns = results
     rows, kept = filled_rows(offsets, end)
@@ -213,7 +214,7 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
 
 
 class ProcessEvent(Protocol):
-    """Predicts to an event of a run and updates by it, see `processing`; an `OnEvent` of filters."""
+    """Function that predicts to an event of a run and updates by it; see `processing`."""
 
     def __call__(
         self,
@@ -228,7 +229,10 @@ class ProcessEvent(Protocol):
 
 
 class WriteEstimate(Protocol):
-    """Fills in the next estimate of a run from a row of the belief, see `writing_estimates`."""
+    """Function that writes the next estimate of a run from a row of the belief.
+
+    See `writing_estimates`.
+    """
 
     def __call__(
         self,
@@ -246,11 +250,12 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
     """Make the function that processes one event of a run; see `recursion`.
 
     Args:
-        stage: the model as the method takes it.
-        steps: the method's steps for it.
-        settings_of: `settings_of(settings, row)` makes a row's parameters.
+        stage: the bound model.
+        steps: steps of the method for it.
+        settings_of: `settings_of(settings, row)` makes the parameters of a row.
 
-    Returns `process(run, event, inputs, carried, results, memory)`.
+    Returns:
+        `process(run, event, inputs, carried, results, memory)`.
     """
     predict = steps.predict
     updates = steps.updates
@@ -260,7 +265,7 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: RecursionState) -> None:
-        """Take over the control that an event has; an interpolated one stands at the end of its data."""
+        """Set the control to that of an event; an interpolated control is at the end of its data."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
             if not np.isnan(data[first + k]):
@@ -274,7 +279,6 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
         carried: RecursionState,
         memory: CoreMemory,
     ) -> bool:
-        """Predict to an event."""
         control, data = carried.control[run], inputs.events.data[event]
         first = len(data) - controls
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
@@ -291,9 +295,9 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did.
+        """Predict to one event and update by it; return the failure or ALL_WELL.
 
-        UNKNOWN in a gap of the control after which it goes on.
+        Return UNKNOWN in a gap of the control after which the filter continues.
         """
         events, gates, innovations = inputs.events, inputs.gates, results.innovations
         source, data = events.source[event], events.data[event]
@@ -319,7 +323,7 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
             measurement = Measurement(data, parameters, gate, event)
             outcome = NOTHING_MEASURED
-            for number in range_of(len(updates)):  # written out: a kernel calls no function by number
+            for number in range_of(len(updates)):  # unrolled: a kernel cannot call functions by index
                 if source == number:
                     outcome = updates[number](run, carried.belief, measurement, memory, record)
             if outcome >= 0:
@@ -338,14 +342,14 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
 def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
     """Make the loop over events, for `fuselog.recorders.compiling.compile.compile_over_runs`.
 
-    `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
-
     Args:
-        stage: the model as the method takes it.
-        steps: the method's steps for it.
-        settings_of: see above.
+        stage: the bound model.
+        steps: steps of the method for it.
+        settings_of: `settings_of(settings, row)` makes the parameters of a row: row 0 is the motion, the
+            others are the sensors.
 
-    Returns `follow(run, inputs, carried, results, memory)`; it changes what is carried in place.
+    Returns:
+        `follow(run, inputs, carried, results, memory)`, which changes `carried` in place.
     """
     write = writing_estimates(steps.estimate)
 
@@ -357,7 +361,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Fill in the estimate where one is wanted, from the state's own time on."""
+        """Write an estimate if the event requests one and is not before the state's time."""
         time_ns = inputs.events.time_ns[event]
         if inputs.events.wants_estimate[event] and time_ns >= carried.time_ns[run]:
             return write(run, run, time_ns, carried.belief, results.estimates, memory)
@@ -367,13 +371,13 @@ def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
 
 
 def writing_estimates(estimate: EstimateRun) -> WriteEstimate:
-    """Make `write(run, row, time_ns, belief, estimates, memory)`: it fills in a run's next estimate.
+    """Make `write(run, row, time_ns, belief, estimates, memory)`, which writes a run's next estimate.
 
-    That is of a row of the belief; an estimate that is none counts as not written. Returns what is wrong
-    with it, see `fault_of`.
+    The estimate is that of a row of the belief. The function returns the failure, see `fault_of`; an
+    invalid estimate is not kept.
 
     Args:
-        estimate: the method's, see `Steps.estimate`.
+        estimate: function of the method; see `Steps.estimate`.
     """
 
     def write(
@@ -396,7 +400,7 @@ def writing_estimates(estimate: EstimateRun) -> WriteEstimate:
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:
-    """Find why an estimate is none: it is not finite, or a variance is negative; else ALL_WELL.
+    """Return the failure of an estimate that is not finite or has a negative variance, or ALL_WELL.
 
     Args:
         mean: (n,).

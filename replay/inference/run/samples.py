@@ -1,4 +1,4 @@
-"""Draws the samples of randomised filters: a generator for every run, a set for every event."""
+"""Samples of randomised filters: one random generator per run, one set per event."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,13 +13,13 @@ from fuselog.replay.inference.sampling.sets import Generators, SampleSets, seede
 def seeded_generators(
     generators: tuple[Generators, ...], events: FilterEvents, count: int, seed: int
 ) -> tuple[Generators, ...]:
-    """Seed generators of every sampled function and run, by the seed and the run's first data.
+    """Seed a generator for every sampled function and run from the seed and the run's first data.
 
     Args:
-        generators: those of the block before, by function and run; empty before the first.
-        events: of all runs.
-        count: how many functions are sampled.
-        seed: the parameter.
+        generators: generators after the previous block, by function and run; empty for the first block.
+        events: events of all runs.
+        count: number of sampled functions.
+        seed: the parameter `seed`.
     """
     runs = len(events.offsets) - 1
     before = generators or ((None,) * runs,) * count
@@ -32,12 +32,12 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Generators, ...], offsets: Integers
 ) -> Iterator[tuple[RowSlice, tuple[SampleSets, ...]]]:
-    """Iterate over runs and their samples; the largest random function says how many runs at once.
+    """Yield slices of runs with their samples; the largest random function limits the runs per slice.
 
     Args:
         samplers: one for each sampled function.
-        generators: by function and run, see `seeded_generators`.
-        offsets: (runs + 1,) of the events.
+        generators: by function and run; see `seeded_generators`.
+        offsets: (runs + 1,) offsets of the events.
     """
     drawn = [index for index, each in enumerate(samplers) if each.redrawn]
     if not drawn:

@@ -1,4 +1,4 @@
-"""Puts events where they belong in time: delays, an interpolated control, and times of output alone."""
+"""Timing of events: delays, interpolated controls, and additional output times."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -11,11 +11,11 @@ from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 
-EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
+EARLY = 1000  # output times: a prior that is older than this is taken to be from another time
 
 
 def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
-    """Tell which of the last events of their stamps want an estimate: none of the control alone."""
+    """Return which events (n,) request an estimate: those of the control alone may not."""
     control = stage.model.control
     if control is None or control.estimates or not stage.sensors:
         return events.wants_estimate
@@ -23,11 +23,11 @@ def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
 
 
 def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
-    """Tell which of the last events of their stamps have a chosen one at their stamp, (n,).
+    """Return which events (n,) are the last of a stamp that has a chosen event.
 
     Args:
-        is_last: (n,) which events are the last of their stamps.
-        chosen: (n,) which events are looked for.
+        is_last: (n,) whether each event is the last of its stamp.
+        chosen: (n,) whether each event is chosen.
     """
     stamp: Integers = np.cumsum(is_last) - is_last
     has_one = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
@@ -36,13 +36,14 @@ def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
 
 
 def delays_of(stage: Stage, settings: Floats) -> Integers:
-    """Compute how long before their stamps messages were measured, in ns, by an event's source.
-
-    (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
+    """Compute the delays of stamps after the measurement, in ns, by source of an event.
 
     Args:
-        stage: the model with the sensors at hand.
-        settings: (1 + sensors, fields), see `settings_of`.
+        stage: the bound model, with the sensors of the log.
+        settings: (1 + sensors, fields); see `settings_of`.
+
+    Returns:
+        (sensors + 2,) delays of the sensors, then 0 for NOTHING, then that of the CONTROL.
     """
     names, control = number_fields(stage.model.parameters), stage.model.control
     asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
@@ -54,16 +55,16 @@ def delays_of(stage: Stage, settings: Floats) -> Integers:
 def compensate_delays(
     stage: Stage, events: FilterEvents, delays_ns: Integers, *, is_end: bool
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Move events to the times at which they were measured, in order; returns those that wait as well.
+    """Move events to the times of measurement, in order; return them and the events that must wait.
 
-    What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
-    something older may come.
+    An event waits if it was measured less than the longest delay before a run's last stamp, because an
+    older one may still arrive; at the end, no event waits.
 
     Args:
-        stage: the model with the sensors at hand.
-        events: by their stamps, in order.
-        delays_ns: (sensors + 2,), see `delays_of`.
-        is_end: whether no more events come.
+        stage: the bound model, with the sensors of the log.
+        events: events in the order of their stamps.
+        delays_ns: (sensors + 2,); see `delays_of`.
+        is_end: whether no more events will arrive.
     """
     run = run_of_rows(events.offsets)
     time_ns = events.time_ns - delays_ns[events.source]
@@ -79,20 +80,20 @@ def compensate_delays(
 
 
 def last_of_stamps(events: FilterEvents) -> Booleans:
-    """Tell whether the next event of the run has another stamp, or arrived at another time."""
+    """Return whether the next event of the run has another stamp or arrival time."""
     return last_of_equals(events.offsets, events.time_ns, *events.arrival.T[:1])
 
 
 def output_times(
     offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
 ) -> FilterEvents:
-    """Make events that are only times: run r owns offsets[r]:offsets[r + 1].
+    """Make events that are only times; run r owns offsets[r]:offsets[r + 1].
 
     Args:
         offsets: (runs + 1,).
         time_ns: (n,) the times.
-        width: how many numbers the events have beside which they stand.
-        wants_estimate: whether there is an estimate at each.
+        width: number of columns of the other events' data.
+        wants_estimate: whether each event requests an estimate.
     """
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
@@ -101,7 +102,7 @@ def output_times(
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
-    """Join two sequences of events in time, run by run; at equal stamps those of the first go first."""
+    """Merge two sequences of events by time, run by run; at equal stamps, the first goes first."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
@@ -112,7 +113,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
 
 
 def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
-    """Add arrivals to events where others have them: times of output alone arrive at their stamps."""
+    """Add arrivals to events if the other events have them: output times arrive at their stamps."""
     if events.arrival.shape[1] >= other.arrival.shape[1]:
         return events
     time_ns = events.time_ns
@@ -123,8 +124,8 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
     """Select some of the events.
 
     Args:
-        events: n of them, of all runs.
-        chosen: (n,).
+        events: n events of all runs.
+        chosen: (n,) whether each event is selected.
     """
     places = np.flatnonzero(chosen)
     columns: Columns = (column.take(places, axis=0) for column in events[1:])
@@ -132,13 +133,13 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Give the control's samples of one stamp their mean, so that each of them counts.
+    """Replace the control's samples of one stamp by their mean, so that each of them counts.
 
-    A recorder may stamp two samples at once: of each two, one would drive for no time at all.
+    A recorder may give two samples the same stamp; one of them would otherwise be used for no time.
 
     Args:
-        events: in the order of their stamps.
-        columns: those of the control that are samples.
+        events: events in the order of their stamps.
+        columns: columns of the control that contain samples.
     """
     at = np.flatnonzero(events.source == CONTROL)
     run = run_of_rows(events.offsets)[at]
@@ -157,15 +158,15 @@ def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
 def interpolate_control(
     events: FilterEvents, controls: int, gap_ns: float = np.inf
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Interpolate the control at events, linear between messages; returns those that wait as well.
+    """Interpolate the control linearly at all events; return these and the events that must wait.
 
-    What comes after a run's last control message waits for the next, with that message before it. From
-    one message that comes more than a gap before the next, up to that, the control is NaN.
+    Events after a run's last control message wait for the next one, together with that message. After a
+    message that is followed by a gap, the control is NaN up to and including the next message.
 
     Args:
-        events: in order, with the control in their last columns where they are its messages.
-        controls: how many components the control has.
-        gap_ns: how long the control may be missing.
+        events: events in order; those of the control have it in their last columns.
+        controls: number of components of the control.
+        gap_ns: longest time without messages of the control.
     """
     data, is_control = events.data.copy(), events.source == CONTROL
     ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
@@ -181,12 +182,12 @@ def interpolate_control(
         for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
             data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
         ready[inside], waiting[begin : at[-1]] = True, False
-    again = events._replace(wants_estimate=events.wants_estimate & ~ready)  # one estimate is enough
+    again = events._replace(wants_estimate=events.wants_estimate & ~ready)  # one estimate suffices
     return select_events(events._replace(data=data), ready), select_events(again, waiting)
 
 
 def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
-    """Fill the known control of events where sensors read it."""
+    """Copy the interpolated control to the events of sensors that read it."""
     data = events.data.copy()
     for number, sensor in enumerate(stage.sensors):
         if sensor.control is not None:
@@ -197,14 +198,12 @@ def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
 
 
 def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
-    """Hold the last control for events that wait for one that does not come, for up to a gap.
-
-    `initial` holds in a run in which there was none.
+    """Hold the last control for events that wait for the next one at the end of a log, up to a gap.
 
     Args:
-        events: that wait, the last message of the control first where there was one.
-        initial: the control before its first message.
-        gap_ns: how long the control may be missing.
+        events: waiting events; the first one of a run is its last message of the control, if any.
+        initial: control of runs without a message of the control.
+        gap_ns: longest time without messages of the control.
     """
     data = events.data.copy()
     for begin, end in pairwise(events.offsets):
@@ -220,18 +219,18 @@ def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float =
 def add_output_times(
     events: FilterEvents, start_ns: Integers, next_output: Integers, every_ns: int
 ) -> tuple[FilterEvents, Integers]:
-    """Add regular times of output between events, at which an estimate is wanted.
+    """Add events at regular output times, which request an estimate.
 
-    From the prior on, or, where that is more than EARLY such times before the run's first event, from
-    there on.
+    Output starts at the prior, or at the run's first event if that is more than EARLY intervals later.
 
     Args:
-        events: in order.
+        events: events in order.
         start_ns: (runs,) stamps of the priors.
-        next_output: (runs,) the number of the next time.
-        every_ns: how far apart the times are; they are its multiples.
+        next_output: (runs,) number of the next output time.
+        every_ns: interval of output; the times are its multiples.
 
-    Returns the events, and the next numbers (runs,).
+    Returns:
+        The events, and the next numbers (runs,).
     """
     times, runs, next_outputs = [], [], next_output.copy()
     for number, (begin, end) in enumerate(pairwise(events.offsets)):
