@@ -1,5 +1,5 @@
-"""Predicts and updates recursive Gaussian filters, and lists the methods made of these steps.
+"""Kalman filters: prediction, update, and the methods that consist of these steps.
 
-Begin with `reference`, an extended Kalman filter in two short functions. `predict` and `update` compute
-the same compiled, as `steps` defines them.
+Begin with `reference`, an extended Kalman filter in two short functions. `predict` and `update` are the
+compiled equivalents, in the form that `steps` defines.
 """

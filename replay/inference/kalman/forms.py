@@ -1,7 +1,7 @@
-"""Puts the extended filter and those of samples together of the parts of one form.
+"""Steps of extended and sampling filters, composed of parts for one form of covariances.
 
-What a filter carries is a mean and what stands for its covariance, see `Form`. Plain filters carry the
-covariance itself; the parts of square-root forms are in `fuselog.replay.inference.kalman.square_root`.
+A filter stores a mean and some form of its covariance; see `Form`. Plain filters store the covariance
+itself; the parts for square-root filters are in `fuselog.replay.inference.kalman.square_root`.
 """
 
 from collections.abc import Callable
@@ -25,13 +25,13 @@ from fuselog.replay.inference.model.stage import Stage
 
 
 class Parts(NamedTuple):
-    """Holds what the filters of one form are put together of; each part makes a function for a stage.
+    """Parts of the filters of one form; each part makes a function for a bound model.
 
     Attributes:
-        form: what stands for a covariance.
-        linear_motion, sampled_motion: (stage), (stage, samples) -> `predict`, see `gaussian_filter`.
-        linear_update, sampled_update: (stage, number), (stage, number, samples) -> a sensor's update.
-        gap_motion: (stage) -> the prediction in a gap of the control.
+        form: the form in which covariances are stored.
+        linear_motion, sampled_motion: (stage), (stage, samples) -> `predict`; see `gaussian_filter`.
+        linear_update, sampled_update: (stage, number), (stage, number, samples) -> update by a sensor.
+        gap_motion: (stage) -> prediction in a gap of the control.
     """
 
     form: Form
@@ -62,7 +62,7 @@ def extended(stage: Stage, parts: Parts = PLAIN) -> Steps:
 
 
 def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
-    """Make steps by regression at samples; what is linear is passed on exactly."""
+    """Make the steps of a filter by regression at samples; linear functions are applied exactly."""
     model, motion = stage.model, stage.motion
     dimensions: list[int] = []
     shapes: list[tuple[int, tuple[str, ...]]] = []

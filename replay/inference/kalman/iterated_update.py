@@ -1,4 +1,4 @@
-"""Updates a Gaussian by a sensor that is linearised again at every iterate, until it settles."""
+"""Iterated updates: the sensor is linearized again at every iterate until convergence."""
 
 import numpy as np
 
@@ -32,19 +32,19 @@ from fuselog.replay.inference.model.corrections import correcting, relinearising
 from fuselog.replay.inference.model.stage import Stage
 
 ITERATIONS = 50
-SETTLED = 1e-12  # the largest component of the last step
+SETTLED = 1e-12  # largest component of the last step
 
 
 def iterated_update(stage: Stage, number: int) -> Update:
-    """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
+    """Make the update that relinearizes at every iterate: Gauss-Newton on the posterior.
 
-    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
-    gate is tested at the prediction, and so is how much the measurement counts; innovation and
-    likelihood are those of the last iterate.
+    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds, the Jacobian is H at x (+) d times the right
+    Jacobian at d. The gate and the weight of the measurement are determined at the prediction;
+    innovation and likelihood are those of the last iterate.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
@@ -57,7 +57,7 @@ def iterated_update(stage: Stage, number: int) -> Update:
     def relinearise(
         mean: Floats, covariance: Floats, data: Floats, parameters: Settings, work: Workspace
     ) -> None:
-        """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
+        """Compute the innovation about the mean from the Jacobian at mean (+) step."""
         innovation, step, rows = work.innovations[number], work.step, work.rows
         step_to(mean, work)
         linearise(read_state(work.state), read_reference(data), parameters, work)

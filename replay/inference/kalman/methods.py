@@ -1,7 +1,7 @@
-"""Defines what a method is, and the Kalman filters among them: `ekf`, `iekf`, `ukf`, `lrkf`, `analytic`.
+"""Methods, and the Kalman filters among them: `ekf`, `iekf`, `ukf`, `lrkf`, `analytic`, `sqrt`.
 
-Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing but the model's functions;
-`ukf` and `lrkf:SAMPLING` sample them; `analytic` takes the exact moments where the model knows them.
+Each method makes the steps of a filter for one model. `ekf` and `iekf` need only the model's functions;
+`ukf` and `lrkf:SAMPLING` sample them; `analytic` uses the exact moments if the model provides them.
 """
 
 from collections.abc import Callable, Mapping
@@ -45,7 +45,7 @@ from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.sampling import parse_sampling
 from fuselog.replay.inference.sampling.names import Sampling, Unscented
 
-# Makes what goes through a log, a `fuselog.replay.inference.run.filtering.Filter`, which stands above.
+# Makes a `fuselog.replay.inference.run.filtering.Filter`, which this module cannot import.
 MakeFilter = Callable[..., Any]  # type: ignore[explicit-any]
 
 
@@ -54,19 +54,20 @@ def _as_list(value: object) -> object:
 
 
 class MethodParameters(Parameters):  # type: ignore[explicit-any]
-    """Defines the options of every method.
+    """Options of every method.
 
     Attributes:
-        every_s: estimates are given at this interval too, besides those at the sensors' stamps.
-        mode: the motion to use of a model that has several.
-        estimate: names of parameters that become part of the state; each starts from its value.
+        every_s: interval of additional estimates, besides those at the sensors' stamps.
+        mode: name of the motion to use, if the model has several.
+        estimate: names of parameters to add to the state; each starts from its value.
         estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
         estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
-        estimate_time_s: time within about which it returns to its value (Gauss-Markov), in s, by name.
-        topics: which topic stands for one that the model asks for, such as {pose = "/amcl_pose/pose"};
-            an empty name leaves a sensor out, and several, with commas or as a list, are all taken.
-        of_topics: by topic, parameters of its own in place of those of its kind, as
-            --set /gps2/fix.lever_x_m=0.4 gives them.
+        estimate_time_s: time constant of its return to its value (Gauss-Markov process), in s, by name.
+        topics: topics to use for those that the model asks for, such as {pose = "/amcl_pose/pose"}. An
+            empty name leaves a sensor out; several names, separated by commas or in a list, are all
+            used.
+        of_topics: parameters of single topics that replace the general ones, by topic, as set by --set
+            /gps2/fix.lever_x_m=0.4.
     """
 
     every_s: PositiveFloat | None = None
@@ -80,19 +81,19 @@ class MethodParameters(Parameters):  # type: ignore[explicit-any]
 
 
 class UnscentedParameters(MethodParameters):  # type: ignore[explicit-any]
-    """Defines options of methods that may use the unscented transform.
+    """Options of methods that can use the unscented transform.
 
     Attributes:
-        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf
-            has 0.5 unless its name says another, as in lrkf:ukf:kappa=0, so that all points weigh
-            alike; with the same kappa both give the same.
+        kappa: spread of the sigma points: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf uses
+            0.5, which gives all points the same weight, unless its name sets another value, as in
+            lrkf:ukf:kappa=0; with the same kappa, ukf and lrkf:ukf are equal.
     """
 
     kappa: float = 0.0
 
 
 class RegressionParameters(MethodParameters):  # type: ignore[explicit-any]
-    """Defines options of methods that may use samples.
+    """Options of methods that can use samples.
 
     Attributes:
         sampling: name of the sampling: ukf, or gf, rukf or s2kf with a number, such as s2kf-50.
@@ -104,10 +105,10 @@ class RegressionParameters(MethodParameters):  # type: ignore[explicit-any]
 
 
 class SquareRootParameters(UnscentedParameters):  # type: ignore[explicit-any]
-    """Chooses the filter that carries factors of its covariances.
+    """Options of square-root filters.
 
     Attributes:
-        filter: the filter whose covariances are carried as factors.
+        filter: the filter whose covariances are stored as factors.
     """
 
     filter: Literal["ekf", "ukf"] = "ekf"
@@ -115,21 +116,21 @@ class SquareRootParameters(UnscentedParameters):  # type: ignore[explicit-any]
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """Describes one way to estimate the state of any model.
+    """One way to estimate the state of any model.
 
     Attributes:
-        summary: what it is, in one line.
-        parameters: their type.
-        steps: makes the filter's steps for a model with the sensors at hand.
-        sampling: where the samples come from, for methods that take some.
-        lacks: what a model lacks for it, in words; empty where it will do.
-        variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
-        made_for: what the method is with these parameters, where they choose among several; raises
-            BadInput where they name none.
-        filtering: what goes through a log, where that is no
+        summary: description in one line.
+        parameters: type of its parameters.
+        steps: makes the filter's steps for a bound model.
+        sampling: makes the samples, for methods that use them.
+        lacks: describes what a model lacks for the method; empty if it lacks nothing.
+        variant: parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+        made_for: returns the method that the parameters select, if there are several; raises BadInput if
+            they name none of them.
+        filtering: class that runs through a log, if it is not
             `fuselog.replay.inference.run.filtering.Filter`.
-        takes_all_modes: whether it takes all modes of a model, not one of its motions.
-        is_random: whether it draws random numbers, beside those of its samples.
+        takes_all_modes: whether it uses all modes of a model instead of one motion.
+        is_random: whether it draws random numbers other than those of its samples.
     """
 
     summary: str
@@ -166,7 +167,7 @@ def _analytic(stage: Stage) -> Steps:
 
 
 def no_steps(stage: Stage) -> Steps:
-    """Refuse to make steps: for a method that `Method.made_for` makes for its parameters."""
+    """Raise AssertionError, as a placeholder for methods whose steps `Method.made_for` selects."""
     raise AssertionError("the method was not made for its parameters")
 
 
@@ -208,9 +209,9 @@ def _exact_sensor(stage: Stage, number: int) -> Innovate:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """Name a sensor whose linearised components depend on one another at every state, in noise and all.
+    """Name a sensor whose linearized components are dependent at every state, including their noise.
 
-    As those of a point and its square do: the innovation covariance is then singular.
+    The innovation covariance is then singular, as for a coordinate and its square.
     """
     parameters = trial_parameters(model)
     for sensor in model.sensors:
@@ -221,7 +222,7 @@ def _lacks_slopes(model: Model) -> str:
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
                 sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
-            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
+            except Exception:  # reported when the model is bound, see `validation.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
                 return f"a regular linearisation of its sensor {sensor.topic}"
@@ -275,14 +276,14 @@ _SQUARE_ROOTS = {
 
 
 def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
-    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that rests on it.
-
-    Raises BadInput where there is no such filter; `use` says what for.
+    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that uses it.
 
     Args:
-        text: as it is given.
-        method: the method that rests on the filter.
-        use: in words, for the error.
+        text: the given name.
+        method: name of the method that uses the filter.
+        use: use of the filter in words, for the error.
+
+    Raises BadInput if there is no such filter.
     """
     name, _, variant = text.partition(":")
     if name not in FILTERS:
@@ -294,7 +295,7 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=64)
 def filter_with(name: str, variant: str) -> Method:
-    """Set the variant of a filter, as in `lrkf:s2kf-50`."""
+    """Return a filter with its variant set, as in `lrkf:s2kf-50`."""
     chosen = FILTERS[name]
     if chosen.made_for is not None:
         given = {str(chosen.variant): variant} if variant else {}

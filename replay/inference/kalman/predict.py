@@ -1,4 +1,4 @@
-"""Predicts a Gaussian through a model's motion by its Jacobian, and adds the motion's noise."""
+"""Prediction of a Gaussian through a model's motion by its Jacobian, and noise of the motion."""
 
 from typing import Protocol
 
@@ -18,7 +18,7 @@ from fuselog.replay.inference.model.stage import Stage
 
 
 class LineariseMotion(Protocol):
-    """Fills the moved state (n,) and the derivatives that are wanted, see `motion_derivative`."""
+    """Function that fills the moved state (n,) and requested derivatives; see `motion_derivative`."""
 
     def __call__(
         self,
@@ -32,7 +32,7 @@ class LineariseMotion(Protocol):
 
 
 class AddMotionNoise(Protocol):
-    """Adds the noise of a motion from a state (n,) over a duration to a covariance (t, t)."""
+    """Function that adds a motion's noise from a state (n,) over a duration to a covariance (t, t)."""
 
     def __call__(
         self,
@@ -46,10 +46,11 @@ class AddMotionNoise(Protocol):
 
 
 def linear_motion(stage: Stage) -> Predict:
-    """Make the prediction by the Jacobian at the mean, which is exact where the motion is linear.
+    """Make the prediction by the Jacobian at the mean, which is exact if the motion is linear.
 
-    Returns `predict(mean, covariance, interval, work)`: in place, the mean (n,) becomes f(x, u) and the
-    covariance (t, t) F P F' + Q.
+    Returns:
+        `predict(mean, covariance, interval, work)`, which replaces the mean (n,) by f(x, u) and the
+        covariance (t, t) by F P F' + Q, in place.
     """
     model, motion = stage.model, stage.motion
     n, read_control = model.size, tuple_of(model.controls)
@@ -72,16 +73,17 @@ def linear_motion(stage: Stage) -> Predict:
 
 
 def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> LineariseMotion:
-    """Make the function that moves a state and takes the derivatives that are wanted.
+    """Make the function that moves a state and computes the requested derivatives.
 
     Args:
-        model: the model, for the kinds of its state and control.
-        motion: the motion whose `move` is differentiated.
-        by_state: whether F, the derivative by the state, is wanted.
+        model: model, for the kinds of its state and control.
+        motion: motion whose `move` is differentiated.
+        by_state: whether F, the derivative by the state, is requested.
 
-    Returns `linearise(state, control, duration_s, parameters, work)`. It fills `work.state` (n,),
-    `transition` (t, t) where F is wanted, `gain` (t, controls) where the control is noisy, and
-    `noise_gain` (t, noises) where noise enters other than by addition.
+    Returns:
+        `linearise(state, control, duration_s, parameters, work)`. It fills `work.state` (n,),
+        `transition` (t, t) if F is requested, `gain` (t, controls) if the control is noisy, and
+        `noise_gain` (t, noises) if noise enters other than by addition.
     """
     if motion.jacobians is not None:
         move, jacobians, fill = motion.move, motion.jacobians, filling(model.size)
@@ -103,14 +105,15 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Linear
 
 
 def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
-    """Make the function that adds the noise of a motion, whatever its kind, to a covariance.
+    """Make the function that adds the noise of a motion, of any kind, to a covariance.
 
     Args:
-        model: the model, for the sizes of its tangent space and control.
-        motion: the motion whose noise it is.
+        model: model, for the sizes of its tangent space and control.
+        motion: the motion.
 
-    Returns `add(state, covariance, duration_s, parameters, work)`, for a covariance (t, t). What enters
-    by the control, or other than by addition, does so through the workspace's derivatives.
+    Returns:
+        `add(state, covariance, duration_s, parameters, work)`, for a covariance (t, t). Noise of the
+        control, and noise that is not additive, enters through the derivatives in the workspace.
     """
     pieces: list[AddMotionNoise] = []
     if motion.control_noise is not None:
@@ -125,7 +128,7 @@ def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
 
 
 def nothing(*_: object) -> None:
-    """Do nothing, in place of what a model does not need."""
+    """Do nothing, in place of a function that a model does not need."""
     return
 
 

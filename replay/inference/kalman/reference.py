@@ -1,8 +1,8 @@
-"""Gives the extended Kalman filter as two short functions: what the compiled filters compute.
+"""The extended Kalman filter in two short functions that compute the same as the compiled filters.
 
 Begin here to read how a filter works. `fuselog.replay.inference.kalman.predict` and
-`fuselog.replay.inference.kalman.update` do the same without making an array, for states with angles and
-rotations, and for measurements that lack components; a test compares both.
+`fuselog.replay.inference.kalman.update` compute the same without making arrays, also for states with
+angles and rotations and for measurements that lack components; a test compares both.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ def update(
         mean: the mean x (n,).
         covariance: the covariance P (n, n).
         measurement: the measurement y (m,).
-        h: what a sensor measures of a state, (m,).
+        h: measurement function: takes a state and returns the expected measurement, (m,).
         H: its Jacobian (m, n) at a state.
         R: the covariance (m, m) of the measurement's noise.
 

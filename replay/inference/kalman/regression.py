@@ -1,9 +1,9 @@
-"""Passes a Gaussian through a function by statistical linear regression at weighted samples.
+"""Propagation of a Gaussian through a function by statistical linear regression at weighted samples.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
-(24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
-vectors, and means are intrinsic: the weighted differences from them sum to zero. Where an angle is
-hardly known, samples are taken nearer to the mean: see `fuselog.replay.inference.kalman.wide_angles`.
+(24) prints y_{k,i} where the noise sample is meant. On manifolds, samples are the mean plus tangent
+vectors, and means are intrinsic: the weighted differences from them sum to zero. If an angle is very
+uncertain, samples are drawn closer to the mean; see `fuselog.replay.inference.kalman.wide_angles`.
 """
 
 from collections.abc import Sequence
@@ -48,21 +48,22 @@ from fuselog.replay.inference.model.model import Motion, Sensor
 from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.sampling.sets import SampleSets
 
-MEANS = 30  # at most so many steps to an intrinsic mean
+MEANS = 30  # maximum number of iterations of an intrinsic mean
 
 
 @varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
-    """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
+    """Samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
         points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
-        unsuspected: the standard deviation up to which angles are no matter, see `narrowing`.
+        unsuspected: standard deviation up to which angles need no special treatment; see `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
-        offsets: (L, N) the samples' tangent vectors from the mean.
-        point, noise: (n,), one sample, and (noises,), the variances.
-        values: (L, v), the function's values as tangent vectors from a centre.
-        centre, shift: (n of the values,), (v,), their mean, and what the values are away from it.
+        offsets: (L, N) tangent vectors from the mean to the samples.
+        point, noise: (n,) one sample, and (noises,) the variances of the noise.
+        values: (L, v) values of the function, as tangent vectors from a centre.
+        centre, shift: (n of the values,) and (v,): the mean of the values, and the weighted mean of
+        their tangent vectors.
     """
 
     points: Floats
@@ -82,12 +83,12 @@ class SampleMemory(NamedTuple):
 def sample_memory(
     sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
 ) -> SampleMemory:
-    """Make memory for the regression of a function of a state and its noise.
+    """Allocate memory for the regression of a function of a state and its noise.
 
     Args:
         sets: samples of N(0, I) in t + noises dimensions.
-        kinds: of the state's components.
-        noises: how many numbers of noise the function gets.
+        kinds: kinds of the state's components.
+        noises: number of noise components of the function.
         outputs: kinds of the function's values.
     """
     _, count, dimension = sets.points.shape
@@ -106,7 +107,7 @@ def sample_memory(
 
 
 class Sampled(Protocol):
-    """Evaluates what is sampled at a state (n,) and its noise (noises,); `arguments` are all others."""
+    """Function to be sampled, of a state (n,), its noise (noises,) and all other `arguments`."""
 
     def __call__(
         self, state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...], /
@@ -114,7 +115,10 @@ class Sampled(Protocol):
 
 
 class Sample(Protocol):
-    """Evaluates a function at samples about a mean (n,), see `sampling`; returns their weights (L,)."""
+    """Function that evaluates another at samples about a mean (n,) and returns their weights (L,).
+
+    See `sampling`.
+    """
 
     def __call__(
         self,
@@ -128,7 +132,7 @@ class Sample(Protocol):
 
 
 class Regress(Protocol):
-    """Passes a mean (n,) and a covariance (t, t) through a function, see `regression`."""
+    """Function that propagates a mean (n,) and a covariance (t, t) through another; see `regression`."""
 
     def __call__(
         self,
@@ -145,7 +149,7 @@ class Regress(Protocol):
 
 
 class Settle(Protocol):
-    """Moves a centre (n,) to the intrinsic mean of values (L, v), see `settling`."""
+    """Function that moves a centre (n,) to the intrinsic mean of values (L, v); see `settling`."""
 
     def __call__(self, weights: Floats, values: Floats, centre: Floats, shift: Floats, /) -> None: ...
 
@@ -160,11 +164,19 @@ def sampling(
 ) -> Sample:
     """Make the evaluation of `function(state, noise, arguments)` at weighted samples.
 
-    Returns `sample(mean, arguments, variances, sample_index, memory)`, before which the leading block of
-    `memory.factor` is the state's factor. It takes the set of samples number `sample_index`, and returns
-    their weights (L,). It fills `memory.offsets`, `memory.centre` with the intrinsic mean of the values,
-    and `memory.values`, which are away from there by them less `memory.shift`. `variances` is a tuple of
-    those of the noise.
+    Args:
+        function: function to evaluate.
+        kinds: kinds of the state's components.
+        noises: number of noise components.
+        outputs: kinds of the function's values.
+        is_motion: whether the function is a motion.
+
+    Returns:
+        `sample(mean, arguments, variances, sample_index, memory)`, which uses sample set `sample_index`
+        and returns its weights (L,). It requires the state's factor in the leading block of
+        `memory.factor`. It fills `memory.offsets`, `memory.centre` with the intrinsic mean of the
+        values, and `memory.values`; the tangent vectors from the mean are `memory.values` minus
+        `memory.shift`. `variances` is the tuple of the noise's variances.
     """
     t, components = tangent_size(kinds), len(kinds)
     size = t + noises
@@ -227,9 +239,18 @@ def regression(
 ) -> Regress:
     """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
 
-    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
-    fills `spread` (v, v) with the covariance of the values and `cross` (t, v) with that with the state;
-    False where the state's covariance is not positive definite. `spread` may be that covariance itself.
+    Args:
+        function: function to evaluate.
+        kinds: kinds of the state's components.
+        noises: number of noise components.
+        outputs: kinds of the function's values.
+        is_motion: whether the function is a motion.
+
+    Returns:
+        `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It fills
+        `spread` (v, v) with the covariance of the values and `cross` (t, v) with their covariance with
+        the state, and returns False if the state's covariance is not positive definite. `spread` may be
+        the same array as `covariance`.
     """
     t, v = tangent_size(kinds), tangent_size(outputs)
     sample = sampling(function, kinds, noises, outputs, is_motion=is_motion)
@@ -256,10 +277,10 @@ def regression(
 
 @lru_cache(maxsize=64)
 def settling(kinds: tuple[str, ...]) -> Settle:
-    """Make `settle(weights, values, centre, shift)`: it moves a centre to the intrinsic mean of values.
+    """Make `settle(weights, values, centre, shift)`, which moves a centre to the values' intrinsic mean.
 
-    The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
-    afterwards.
+    The values (L, v) are tangent vectors from the centre. Afterwards, those from the mean are `values`
+    minus `shift` (v,).
     """
     v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
     add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
@@ -279,18 +300,18 @@ def settling(kinds: tuple[str, ...]) -> Settle:
 
 
 def no_variances(*_: object) -> Numbers:
-    """List the variances of no noise."""
+    """Return no variances, for functions without noise."""
     return ()
 
 
 def sampled_motion(stage: Stage, number: int) -> Predict:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
-    Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
+    Noise of the control enters through the derivative at the mean, noise of the motion through samples.
 
     Args:
-        stage: the model as the method takes it.
-        number: of the samples in the workspace.
+        stage: the bound model.
+        number: index of the samples in the workspace.
     """
     model, motion = stage.model, stage.motion
     entering = motion.noise if motion.noises else None
@@ -321,7 +342,7 @@ def sampled_motion(stage: Stage, number: int) -> Predict:
 
 
 def moved_with_noise(motion: Motion) -> Sampled:
-    """Make `function(state, noise, arguments)` of a motion, for `sampling`."""
+    """Convert a motion to the form `function(state, noise, arguments)`, for `sampling`."""
     move = motion.move
     if motion.noises:
 
@@ -340,9 +361,9 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Innovate:
     """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
-        samples: the number of its samples in the workspace.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
+        samples: index of its samples in the workspace.
     """
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
@@ -367,7 +388,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Innovate:
 
 
 def measured_with_noise(sensor: Sensor) -> Sampled:
-    """Make `function(state, noise, arguments)` of what a sensor measures, for `sampling`."""
+    """Convert a sensor's measurement function to the form `function(state, noise, arguments)`."""
     measure = sensor.measure
     if sensor.noises:
 

@@ -1,10 +1,10 @@
-"""Makes the parts of square-root filters, extended and unscented: they carry factors of covariances.
+"""Parts of extended and unscented square-root filters, which store factors of covariances.
 
-Of the columns X of the state's factor, or its weighted samples, of Y, what a function makes of them, and
-of a factor N of its noise, one factorisation makes a prediction or an update:
+Let X be the columns of the state's factor or its weighted samples, Y their images under a function, and
+N a factor of the noise. One factorization then computes a prediction or an update:
 
-    [Y  N]     [L  0]    of a motion, L is the factor of P-, and W = G L with the smoother's gain G;
-    [X  0]  =  [W  V]    of a sensor, L is that of S, W = K L with Kalman's gain, and V that of P+.
+    [Y  N]     [L  0]    for a motion, L is the factor of P-, and W = G L with the smoother's gain G;
+    [X  0]  =  [W  V]    for a sensor, L is that of S, W = K L with the Kalman gain K, and V that of P+.
 
 Kaminski, Bryson and Schmidt, IEEE TAC 16(6), 1971; Van der Merwe and Wan, ICASSP 2001.
 """
@@ -59,11 +59,11 @@ from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
 from fuselog.replay.inference.model.stage import Stage
 
 Into = tuple[Floats, Floats]  # rows, and the weights of their columns
-Given = tuple[AnyArgument, ...]  # the arguments of a motion or a sensor behind the state
+Given = tuple[AnyArgument, ...]  # the arguments of a motion or a sensor after the state
 
 
 class Spread(Protocol):
-    """Fills in Y and X of a factor (t, t) at a state (n,), see the module."""
+    """Function that fills Y and X for a factor (t, t) at a state (n,); see the module."""
 
     def __call__(
         self, state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into, /
@@ -71,15 +71,15 @@ class Spread(Protocol):
 
 
 class VariancesOf(Protocol):
-    """Gives the variances of the noise that is sampled, at a state (n,)."""
+    """Function that returns the variances of the sampled noise at a state (n,)."""
 
     def __call__(self, state: Numbers, given: Given, /) -> Numbers: ...
 
 
 def _linear(linearise: Linearise, slopes: str) -> Spread:
-    """Make `spread(state, factor, given, index, work, into)`: it fills in Y and X of a factor.
+    """Make `spread(state, factor, given, index, work, into)`, which fills Y and X for a factor.
 
-    By the derivative that `linearise(state, *given, work)` puts into the workspace's `slopes`.
+    It uses the derivative that `linearise(state, *given, work)` writes to the workspace's `slopes`.
     """
 
     def spread(
@@ -99,7 +99,7 @@ def _linear(linearise: Linearise, slopes: str) -> Spread:
 
 
 def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int, samples: int) -> Spread:
-    """Make the same of samples, whose mean goes into the workspace's `mean_of`."""
+    """Make the function that fills Y and X at samples, and the workspace's `mean_of` with their mean."""
     fill = filling(size)
 
     def spread(
@@ -120,14 +120,14 @@ def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int,
 
 
 def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> bool:
-    """Fill in N of a noise, which it uses up, and find the factor; False where there is none."""
+    """Fill N for a noise, which is overwritten, and compute the factor; return False on failure."""
     first = len(weights) - len(noise)
     weights[first:] = 1.0
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
 
 
 def _predicting(stage: Stage, spread: Spread, add_noise: AddMotionNoise, samples: int = -1) -> Predict:
-    """Make the prediction by what `spread` makes of the factor, or of these samples."""
+    """Make the prediction by a `spread` that uses derivatives, or the given samples."""
     t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
     read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
 
@@ -174,7 +174,7 @@ def _gap_motion(stage: Stage) -> Predict:
 
 
 def _sampled_motion(stage: Stage, samples: int) -> Predict:
-    """Sample a motion; the control's noise enters by the derivative at the mean, its own as a sample."""
+    """Make the sampled prediction; noise of the control enters through the derivative at the mean."""
     model, motion = stage.model, stage.motion
     linearise: Linearise = nothing
     if motion.control_noise:
@@ -203,7 +203,7 @@ def _updating(
 ) -> Update:
     """Make the update by sensor `number`; see `fuselog.replay.inference.kalman.update.kalman_update`.
 
-    A component that is missing counts as one of a noise of its own, which is as predicted.
+    A missing component is replaced by independent noise whose value is as predicted.
     """
     model, sensor = stage.model, stage.sensors[number]
     t, m, read_reference = model.tangent, len(sensor.measured), message_layout(sensor).reference

@@ -1,8 +1,8 @@
-"""Defines the steps of a recursive filter, which methods make for one model, and their memory.
+"""Steps of a recursive filter, which methods make for one model, and their working memory.
 
-A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
-`linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by moments that the model
-knows. All work in one workspace, and the Kalman update after them is the same (`update.kalman_update`).
+A method propagates a Gaussian through motion and sensors by exact derivatives (`linear_motion`,
+`linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by exact moments that the
+model provides. All use one workspace, followed by the same Kalman update (`update.kalman_update`).
 """
 
 from collections.abc import Callable
@@ -29,11 +29,11 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
-NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
+NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # in addition to ALL_WELL, -1
 
-# What a method believes of all runs, what one core works in, the estimates that it fills in, and its
-# samples, such as `Gaussian`, `Workspace`, `recursion.EstimateRows` and `SampleMemory`. All are the
-# method's own; a loop over events only hands them on.
+# A method's belief in all runs, the working memory of a core, the estimates that it fills, and its
+# samples, such as `Gaussian`, `Workspace`, `recursion.EstimateRows` and `SampleMemory`. Their types are
+# the method's own; the loop over events only passes them on.
 Belief = Any  # type: ignore[explicit-any]
 CoreMemory = Any  # type: ignore[explicit-any]
 EstimatesToFill = Any  # type: ignore[explicit-any]
@@ -41,9 +41,9 @@ Samples = Any  # type: ignore[explicit-any]
 
 
 class Gaussian(NamedTuple):
-    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t).
+    """A Gaussian for every run: means (runs, n) and covariances (runs, t, t).
 
-    What stands for the covariances is up to the filter, see `Steps.form`.
+    The covariances are stored in the filter's form; see `Steps.form`.
     """
 
     mean: Floats
@@ -51,13 +51,13 @@ class Gaussian(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """Holds what a prediction goes by, beside the belief.
+    """Inputs of a prediction besides the belief.
 
     Attributes:
-        control: (controls,), what drives the state; NaN in a gap.
-        duration_s: how long it goes.
-        parameters: the motion's.
-        event: the number of the event that it leads to, which numbers sets of randomised samples too.
+        control: (controls,) control; NaN in a gap.
+        duration_s: duration of the step.
+        parameters: parameters of the motion.
+        event: index of the event at its end, which also selects the set of random samples.
     """
 
     control: Floats
@@ -67,13 +67,13 @@ class Interval(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Holds what an update goes by, beside the belief.
+    """Inputs of an update besides the belief.
 
     Attributes:
-        data: the numbers of the message, see `update.message_layout`.
-        parameters: the sensor's.
-        gate: (m + 1,), bounds of the NIS by the number of components.
-        event: the number of the event, see `Interval`.
+        data: numbers of the message; see `update.message_layout`.
+        parameters: parameters of the sensor.
+        gate: (m + 1,) bounds of the NIS by number of components.
+        event: index of the event; see `Interval`.
     """
 
     data: Floats
@@ -82,18 +82,21 @@ class Measurement(NamedTuple):
     event: int
 
 
-# (sets of samples, one for each of `Steps.sampled`) -> what one core works in.
+# (sets of samples, one for each of `Steps.sampled`) -> working memory of one core.
 MakeMemory = Callable[[tuple[Samples, ...]], CoreMemory]
 
 
 class PredictRun(Protocol):
-    """Moves the belief of a run in place over an interval; returns whether all is well."""
+    """Function that moves a run's belief in place over an interval; returns whether it succeeded."""
 
     def __call__(self, run: int, belief: Belief, interval: Interval, memory: CoreMemory, /) -> bool: ...
 
 
 class UpdateRun(Protocol):
-    """Updates the belief of a run in place; returns ALL_WELL, NOTHING_MEASURED or a failure."""
+    """Function that updates the belief of a run in place.
+
+    It returns ALL_WELL, NOTHING_MEASURED or a failure.
+    """
 
     def __call__(
         self,
@@ -107,7 +110,7 @@ class UpdateRun(Protocol):
 
 
 class EstimateRun(Protocol):
-    """Fills a row of the estimates from the belief of a run."""
+    """Function that fills a row of the estimates from the belief of a run."""
 
     def __call__(
         self, run: int, belief: Belief, estimates: EstimatesToFill, row: int, memory: CoreMemory, /
@@ -115,7 +118,10 @@ class EstimateRun(Protocol):
 
 
 class Predict(Protocol):
-    """Moves a mean (n,) and a covariance (t, t) in place over an interval; returns if all is well."""
+    """Function that moves a mean (n,) and a covariance (t, t) in place over an interval.
+
+    It returns whether it succeeded.
+    """
 
     def __call__(
         self, mean: Floats, covariance: Floats, interval: Interval, work: CoreMemory, /
@@ -123,9 +129,10 @@ class Predict(Protocol):
 
 
 class Innovate(Protocol):
-    """Fills a sensor's innovation in the workspace; returns whether its covariance was one.
+    """Function that fills a sensor's innovation in the workspace.
 
-    Of a mean (n,) and a covariance (t, t), both unchanged.
+    The mean (n,) and the covariance (t, t) stay unchanged. It returns whether the covariance was
+    positive definite.
     """
 
     def __call__(
@@ -134,7 +141,7 @@ class Innovate(Protocol):
 
 
 class Update(Protocol):
-    """Updates a mean (n,) and a covariance (t, t) in place; returns as `UpdateRun`."""
+    """Function that updates a mean (n,) and a covariance (t, t) in place and returns as `UpdateRun`."""
 
     def __call__(
         self,
@@ -148,19 +155,19 @@ class Update(Protocol):
 
 
 class Steps(NamedTuple):
-    """Holds the steps of a recursive filter of one model, as the recursion calls them.
+    """Steps of a recursive filter for one model, as the recursion calls them.
 
     Attributes:
-        memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, interval, memory) -> whether all is well; moves the belief in place.
+        memory: (sets) -> working memory of one core; `sets` are the samples, one for each of `sampled`.
+        predict: (run, belief, interval, memory) -> whether it succeeded; moves the belief in place.
         updates: for every sensor, (run, belief, measurement, memory, record) -> a failure, ALL_WELL or
             NOTHING_MEASURED; see `kalman_update`.
-        estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
-            covariance, and what the method keeps beside them.
-        sampled: the dimensions in which it takes samples, the motion's first.
-        resumes_after_gap: whether it goes on after a gap of the control: `predict` then takes NaN for a
-            control.
-        form: what stands for the covariances in beliefs; the estimates have the covariances themselves.
+        estimate: (run, belief, estimates, row, memory) fills a row of the results: mean, covariance, and
+            further results of the method.
+        sampled: dimensions of the sampled functions, that of the motion first.
+        resumes_after_gap: whether the filter continues after a gap of the control; `predict` is then
+            called with NaN as the control.
+        form: form of the covariances in beliefs; estimates contain the covariances themselves.
     """
 
     memory: MakeMemory
@@ -173,11 +180,11 @@ class Steps(NamedTuple):
 
 
 class InnovationRecord(NamedTuple):
-    """Holds the innovation of one update: one row of the results.
+    """The innovation of one update: one row of the results.
 
     Attributes:
         difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
-        numbers: NIS, log-likelihood, and 1 where the gate let the measurement in, (3,).
+        numbers: (3,) NIS, log-likelihood, and 1 if the gate accepted the measurement.
     """
 
     difference: Floats
@@ -186,20 +193,21 @@ class InnovationRecord(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Holds the arrays that the steps of one core work in.
+    """Working arrays of the steps, for one core.
 
     Attributes:
-        state: (n,), the moved state.
-        transition: (t, t).
-        product: (t, t), after a prediction the covariance of the moved state with the one before.
-        rest: (t, t), what `factors` needs besides to retrace a prediction.
+        state: (n,) moved state.
+        transition: (t, t) derivative by the state.
+        product: (t, t) after a prediction, the covariance of the moved state with the one before.
+        rest: (t, t) what `factors` also needs to reverse a prediction.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
-        rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
-        step, turned, slope: (t,), the correction of the state, and along what it bends.
+        rows, predicted: (m, t), (m,) Jacobian and mean of a measurement.
+        step, turned, slope: (t,) correction of the state, an auxiliary vector, and the slope along which
+        the correction bends.
         innovations: one for each sensor.
-        samples: what `fuselog.replay.inference.kalman.regression` works in, motion first, one for each
-            of `sampled`.
+        samples: memory of `fuselog.replay.inference.kalman.regression` for each of `sampled`, motion
+            first.
     """
 
     state: Floats
@@ -220,11 +228,12 @@ class Workspace(NamedTuple):
 
 
 def workspace(stage: Stage, samples: tuple[Samples, ...] = ()) -> Workspace:
-    """Make the workspace of a model with the sensors at hand.
+    """Allocate the workspace of a bound model.
 
     Args:
-        stage: the model, with n components of the state, t of the tangent space, m of a sensor at most.
-        samples: the memories of `regression`, motion first, one for each of `Steps.sampled`.
+        stage: the bound model, with n components of the state, t of the tangent space, and at most m of
+            a sensor.
+        samples: memories of `regression`, motion first, one for each of `Steps.sampled`.
     """
     model, t = stage.model, stage.model.tangent
     m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
@@ -261,17 +270,18 @@ def gaussian_filter(
     """Make the steps of a filter whose belief is one Gaussian.
 
     Args:
-        stage: the model as a method takes it.
-        predict: `predict(mean, covariance, interval, work)` moves one run's mean (n,) and covariance
-            (t, t) in place; returns whether all is well.
+        stage: the bound model.
+        predict: `predict(mean, covariance, interval, work)` moves one run's mean (n,) and covariance (t,
+            t) in place and returns whether it succeeded.
         updates: for every sensor, `update(mean, covariance, measurement, work, record)`; see
             `kalman_update`.
-        memory: (sets) -> the workspace; `workspace(stage)` unless given.
+        memory: (sets) -> the workspace; `workspace(stage)` by default.
         sampled: see `Steps.sampled`.
-        form: what stands for the covariance.
-        gap_motion: (stage) -> the prediction in a gap of the control; `keeping` unless given.
+        form: form in which covariances are stored.
+        gap_motion: (stage) -> prediction in a gap of the control; `keeping` by default.
 
-    Returns the steps, which pass over gaps of the control where the motion has a `gap_noise`.
+    Returns:
+        The steps; they continue after gaps of the control if the motion has a `gap_noise`.
     """
     has_gaps, to_covariance = stage.motion.gap_noise is not None, form.to_covariance
     if has_gaps:
@@ -300,7 +310,7 @@ def gaussian_filter(
 
 
 def _predicting_gap(predict_gap: Predict, predict_driven: Predict) -> Predict:
-    """Make the prediction of one kind where the control is NaN, else of the other."""
+    """Make the prediction that calls the first function if the control is NaN, otherwise the second."""
 
     def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
         if np.isnan(interval.control[0]):
@@ -311,7 +321,7 @@ def _predicting_gap(predict_gap: Predict, predict_driven: Predict) -> Predict:
 
 
 def keeping(stage: Stage) -> Predict:
-    """Make the prediction in a gap of the control: it keeps the mean and adds the gap noise."""
+    """Make the prediction in a gap of the control, which keeps the mean and adds the gap noise."""
     model, gap_noise = stage.model, stage.motion.gap_noise
     assert gap_noise is not None
     read_state, add = tuple_of(model.size), adding_noise(model.tangent)

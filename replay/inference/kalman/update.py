@@ -1,4 +1,4 @@
-"""Updates a Gaussian by a sensor: linearises it, forms the innovation, applies the Kalman gain."""
+"""Update of a Gaussian by a sensor: linearization, innovation, and Kalman gain."""
 
 from typing import NamedTuple, Protocol
 
@@ -37,7 +37,7 @@ from fuselog.replay.inference.model.stage import Stage
 
 
 class MessageLayout(NamedTuple):
-    """Says how a sensor's message stands in an event's data: measurement, reference, its own noise."""
+    """Layout of a sensor's message in an event's data: measurement, reference, and its own noise."""
 
     width: int
     measured: ReadTuple
@@ -46,13 +46,13 @@ class MessageLayout(NamedTuple):
 
 
 class Subtract(Protocol):
-    """Fills what is measured, the first of the data, minus what is predicted (m,)."""
+    """Function that fills the measurement (the start of the data) minus the prediction, (m,)."""
 
     def __call__(self, data: Floats, predicted: Floats, difference: Floats, /) -> None: ...
 
 
 class MeasurementNoise(Protocol):
-    """Adds the measurement noise R to S (m, m)."""
+    """Function that adds the measurement noise R to S (m, m)."""
 
     def __call__(
         self, spread: Floats, data: Floats, parameters: Settings, work: CoreMemory, /
@@ -60,7 +60,7 @@ class MeasurementNoise(Protocol):
 
 
 class LineariseSensor(Protocol):
-    """Fills the workspace's `predicted` h (m,), `rows` H (m, t) and `noise_gain` at a state (n,)."""
+    """Function that fills the workspace's `predicted` h (m,), `rows` H (m, t) and `noise_gain`."""
 
     def __call__(
         self, state: Numbers, reference: Numbers, parameters: Settings, work: CoreMemory, /
@@ -68,7 +68,7 @@ class LineariseSensor(Protocol):
 
 
 class CompareLinear(Protocol):
-    """Forms the innovation of a linearised measurement in the workspace, see `linear_innovation`."""
+    """Function that computes the innovation of a linearized measurement; see `linear_innovation`."""
 
     def __call__(
         self, covariance: Floats, data: Floats, parameters: Settings, work: Workspace, /
@@ -76,19 +76,19 @@ class CompareLinear(Protocol):
 
 
 class WhitenResidual(Protocol):
-    """Expresses a linearised measurement in units of its noise, see `whitening`."""
+    """Function that expresses a linearized measurement in units of its noise; see `whitening`."""
 
     def __call__(self, data: Floats, parameters: Settings, work: Workspace, /) -> tuple[int, float]: ...
 
 
 class WriteInnovation(Protocol):
-    """Writes a sensor's innovation at its components' places in the record."""
+    """Function that writes a sensor's innovation to its components' slots in the record."""
 
     def __call__(self, innovation: Innovation, record: InnovationRecord, /) -> None: ...
 
 
 def message_layout(sensor: Sensor) -> MessageLayout:
-    """Find where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
+    """Return the layout of a sensor's message; its noise is the rows of a lower triangle."""
     m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return MessageLayout(
@@ -97,9 +97,9 @@ def message_layout(sensor: Sensor) -> MessageLayout:
 
 
 def residual_of(sensor: Sensor) -> Subtract:
-    """Make `subtract(data, predicted, difference)`: what is measured minus what is predicted, (m,).
+    """Make `subtract(data, predicted, difference)`: measurement minus prediction, (m,).
 
-    Angles differ by no more than half a turn.
+    Differences of angles are at most half a turn.
     """
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
 
@@ -111,7 +111,7 @@ def residual_of(sensor: Sensor) -> Subtract:
 
 
 def sensor_noise(sensor: Sensor) -> MeasurementNoise:
-    """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
+    """Make `add(spread, data, parameters, work)`, which adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
     if sensor.covariance:
         read, add_message = message_layout(sensor).noise, adding_noise(m)
@@ -139,11 +139,13 @@ def sensor_noise(sensor: Sensor) -> MeasurementNoise:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
-    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`.
+    """Make `linearise(state, reference, parameters, work)`, which fills the measurement's derivatives.
+
+    It fills `predicted` (m,), `rows` (m, t) and `noise_gain` in the workspace.
 
     Args:
-        model: the model, for the kinds of its state.
-        sensor: with n components of the state and m measured ones: `rows` (m, t).
+        model: model, for the kinds of its state.
+        sensor: the sensor, with m measured components.
     """
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
@@ -161,14 +163,15 @@ def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
 
 
 def linear_sensor(stage: Stage, number: int) -> Innovate:
-    """Make the innovation by the derivative at the mean.
-
-    Returns `innovate(mean, covariance, measurement, work)`, which fills that of the sensor in
-    `work.innovations`.
+    """Make the computation of the innovation by the derivative at the mean.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
+
+    Returns:
+        `innovate(mean, covariance, measurement, work)`, which fills the sensor's innovation in
+        `work.innovations`.
     """
     sensor = stage.sensors[number]
     read_state, read_reference = tuple_of(stage.model.size), message_layout(sensor).reference
@@ -186,15 +189,16 @@ def linear_sensor(stage: Stage, number: int) -> Innovate:
 
 
 def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = None) -> CompareLinear:
-    """Make the function that forms the innovation of a linearised measurement.
+    """Make the function that computes the innovation of a linearized measurement.
 
     Args:
         sensor: the sensor, with m measured components.
-        number: its number, which says where its innovation stands in the workspace.
-        pattern: which entries of H are known; None where none are.
+        number: index of its innovation in the workspace.
+        pattern: known entries of H; None if no entry is known.
 
-    Returns `compare(covariance, data, parameters, work)`: from the workspace's `predicted` h (m,) and
-    `rows` H (m, t), it fills v = y - h, C = P H' and S = H C + R.
+    Returns:
+        `compare(covariance, data, parameters, work)`. From the workspace's `predicted` h (m,) and `rows`
+        H (m, t), it fills v = y - h, C = P H' and S = H C + R.
     """
     subtract, add_noise = residual_of(sensor), sensor_noise(sensor)
     measure_covariance = measuring_covariance(pattern)
@@ -209,16 +213,17 @@ def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = Non
 
 
 def whitening(sensor: Sensor, number: int) -> WhitenResidual:
-    """Make the function that expresses a linearised measurement in units of its noise.
+    """Make the function that expresses a linearized measurement in units of its noise.
 
     Args:
         sensor: the sensor, with m measured components.
-        number: its number, which says where its innovation stands in the workspace.
+        number: index of its innovation in the workspace.
 
-    Returns `whiten_residual(data, parameters, work)`. From the workspace's `predicted` and `rows`, with
-    R = L L', the innovation's difference becomes L^-1 (y - h), its cross-covariance H' L^-T. It returns
-    how many components were measured, and the square of the residual, NaN where R is not positive
-    definite.
+    Returns:
+        `whiten_residual(data, parameters, work)`. From the workspace's `predicted` and `rows`, with R =
+        L L', it sets the innovation's difference to L^-1 (y - h) and its cross-covariance to H' L^-T. It
+        returns the number of measured components and the squared residual, NaN if R is not positive
+        definite.
     """
     m, subtract, add_noise = len(sensor.measured), residual_of(sensor), sensor_noise(sensor)
 
@@ -238,7 +243,7 @@ def whitening(sensor: Sensor, number: int) -> WhitenResidual:
 
 
 def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
-    """List all components that these sensors measure, by name with kinds: those of the innovations."""
+    """Return the names and kinds of all measured components; raise BadInput if two kinds conflict."""
     components: dict[str, str] = {}
     for sensor in sensors:
         for name, kind in sensor.measured.items():
@@ -250,7 +255,7 @@ def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
 
 
 def writing_innovation(stage: Stage, number: int) -> WriteInnovation:
-    """Make `write_innovation(innovation, record)`: sensor `number`'s, at its components' places."""
+    """Make `write_innovation(innovation, record)`, which writes to the slots of sensor `number`."""
     components = list(innovation_components(stage.sensors))
     places = tuple(components.index(name) for name in stage.sensors[number].measured)
 
@@ -266,11 +271,11 @@ def writing_innovation(stage: Stage, number: int) -> WriteInnovation:
 
 
 def is_unmeasured(data: Floats, components: int) -> bool:
-    """Tell whether a message has none of a sensor's components.
+    """Test whether a message lacks all components of a sensor.
 
     Args:
-        data: of the message, NaN where not measured; the components stand first.
-        components: how many there are.
+        data: data of the message, NaN for missing components; the components come first.
+        components: number of components.
     """
     measured = 0
     for i in range(components):
@@ -281,21 +286,22 @@ def is_unmeasured(data: Floats, components: int) -> bool:
 def kalman_update(stage: Stage, number: int, innovate: Innovate) -> Update:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
-    The gain K itself is not formed. With S = L L' and W = C L^-T, K v is W L^-1 v, see
+    The gain K is not computed explicitly. With S = L L' and W = C L^-T, K v is W L^-1 v, see
     `gaussian.kalman_step`, and K S K' is W W', see `gaussian.downdate`.
 
-    Missing components are left out of v, S and C, and so are those of which the model predicts nothing
-    (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. What the gate lets in may still count less, see `inflation`.
+    Missing components are removed from v, S and C, as are those for which the model predicts NaN; the
+    log-likelihood is that of the remaining components. It is zero if the gate rejects the measurement or
+    if no component remains. Accepted measurements may still be down-weighted; see `inflation`.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
         innovate: `innovate(mean, covariance, measurement, work)` fills the innovation v (m,), S (m, m),
-            C (t, m) of the sensor; returns whether the covariance was one.
+            C (t, m) of the sensor and returns whether the covariance was positive definite.
 
-    Returns `update(mean, covariance, measurement, work, record)`, in place, for a mean (n,) and a
-    covariance (t, t). It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
+    Returns:
+        `update(mean, covariance, measurement, work, record)`, which works in place on a mean (n,) and a
+        covariance (t, t). It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
     model, m, write_innovation = (
         stage.model,
@@ -346,9 +352,9 @@ def write_numbers(
     accepted: bool,
     factor: float,
 ) -> None:
-    """Write the NIS, the log-likelihood (zero where the gate is shut) and whether it is open.
+    """Write the NIS, the log-likelihood (zero if rejected), and whether the measurement is accepted.
 
-    The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
+    The NIS uses the predicted covariance; the likelihood uses one that is `factor` times larger.
     """
     record.numbers[0] = squared
     record.numbers[1] = 0.0

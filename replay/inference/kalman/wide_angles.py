@@ -1,9 +1,9 @@
-"""Keeps samples within half a turn where an angle is hardly known, so that its variance is not lost.
+"""Treatment of very uncertain angles in sampling: samples stay within half a turn.
 
-An angle a of standard deviation s has samples at a + r s. Beyond half a turn they come back from the
-other side, and what they are away from the mean is no longer r s: for s = 3 rad the three-dimensional
-unscented set, r = 3^1/2, gives 5.196 - 2 pi = -1.09 rad, and a prediction that measures nothing would
-turn 3 rad into 0.63 rad. Two rules prevent that:
+An angle with standard deviation s has samples at a + r s. Samples beyond half a turn wrap around, and
+their difference from the mean is no longer r s: for s = 3 rad, the three-dimensional unscented set with
+r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measurement would reduce 3 rad to
+0.63 rad. Two rules prevent this:
 
 - **A smaller spread.** A function f is regressed at the samples m + c (x - m) of N(m, c^2 P), with the
   largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for what f adds.
@@ -11,22 +11,23 @@ turn 3 rad into 0.63 rad. Two rules prevent that:
 
       E[(x - m) y'] / c = P A',     E[(y - E y)(y - E y)'] / c^2 = A P A' + V / c^2,
 
-  where A is the slope of f within the quarter turn, and V the covariance of what the line leaves over.
-  So the values' differences are divided by c. For an affine f this is exact for every c: a prediction
-  keeps the variance of an angle that it only adds to. What is not affine is overstated, never
-  understated. This is the scaled unscented transformation (Julier, "The scaled unscented
-  transformation", ACC 2002) with a scale that the angles determine, except for the mean, which is that
-  of the narrowed samples: on a circle it is bounded, and the second-order term of the scaled
-  transformation is not.
+  where A is the slope of f within the quarter turn, and V the covariance of the residuals of the linear
+  fit. Therefore the differences of the values are divided by c. For an affine f this is exact for every
+  c: a prediction keeps the variance of an angle that it only adds to. The effect of nonlinearity is
+  overestimated, never underestimated. This is the scaled unscented transformation (Julier, "The scaled
+  unscented transformation", ACC 2002) with a scale that the angles determine, except that the mean is
+  that of the narrowed samples: on a circle it is bounded, unlike the second-order term of the scaled
+  transformation.
 
-- **No wider than uniform.** An angle that may be anywhere has the standard deviation pi / 3^1/2 =
+- **No wider than uniform.** An angle without any information has the standard deviation pi / 3^1/2 =
   1.81 rad (Mardia and Jupp, Directional Statistics, 2000, section 3.5), and no belief about an angle is
-  wider. A motion samples a wider one as that, of each axis of a rotation too: it scales the rows of the
-  covariance's factor.
+  wider. A motion limits wider angles, and each axis of a rotation, to this value by scaling the rows of
+  the covariance's factor.
 
-A Gaussian says little about an angle beyond 1 rad: it has 0.2 % of its probability beyond half a turn
-there, and 8 % at 1.81 rad, where its mean means nothing. Samples are unchanged to the last bit while
-every angle's standard deviation is at most 1 rad and no sample is beyond half a turn.
+A Gaussian is a poor description of an angle beyond 1 rad: at 1 rad, 0.2 % of its probability is beyond
+half a turn, and at 1.81 rad, where its mean is meaningless, 8 %. Samples are bit-identical to the
+ordinary ones while every angle's standard deviation is at most 1 rad and no sample is beyond half a
+turn.
 """
 
 from functools import lru_cache
@@ -37,15 +38,15 @@ import numpy as np
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
 
-WIDE_RAD = 1.0  # a standard deviation, up to which samples within half a turn are taken as they are
+WIDE_RAD = 1.0  # standard deviation up to which samples within half a turn are not changed
 UNIFORM_RAD = np.pi / np.sqrt(3.0)
 QUARTER_RAD = 0.5 * np.pi
 
 
 def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
-    """List the angles, axes and rotations of a state: first tangent component, size, turns.
+    """List the angles, axes and rotations of a state: first tangent component, size, multiplicity.
 
-    An axis comes back after half a turn: its angle counts twice.
+    An axis repeats after half a turn, so its angle counts twice.
     """
     return tuple(
         (tangent, width, 2.0 if kind == "axis" else 1.0)
@@ -55,22 +56,22 @@ def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
 
 
 def unsuspected_rad(points: Floats) -> float:
-    """Return the standard deviation up to which no angle at points (..., L, N) needs a closer look."""
+    """Return the largest standard deviation at which angles at points (..., L, N) stay as they are."""
     radius = np.sqrt(np.max(np.sum(points**2, axis=-1), initial=1.0))
     return float(min(WIDE_RAD, np.pi / radius))
 
 
 class Narrow(Protocol):
-    """Scales a factor (N, N) of the samples' covariance and returns the scale c, see the module.
+    """Function that scales a factor (N, N) of the samples' covariance and returns the scale c.
 
-    `points` (L, N) are the samples of N(0, I); see `SampleMemory.unsuspected` for the last argument.
+    `points` (L, N) are the samples of N(0, I); for the last argument, see `SampleMemory.unsuspected`.
     """
 
     def __call__(self, factor: Floats, points: Floats, unsuspected: float, /) -> float: ...
 
 
 class Regressed(Protocol):
-    """Holds samples and what became of them, see `regression.SampleMemory`."""
+    """Samples and their images; see `regression.SampleMemory`."""
 
     @property
     def offsets(self) -> Floats: ...
@@ -82,19 +83,19 @@ class Regressed(Protocol):
 
 @lru_cache(maxsize=64)
 def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
-    """Make `narrow(factor, points, unsuspected)`: it returns c, and scales the factor (N, N) by it.
+    """Make `narrow(factor, points, unsuspected)`, which returns c and scales the factor (N, N) by it.
 
     See the module. With `bounded`, angles that are wider than uniform become uniform first.
 
     Args:
-        kinds: of the state's components.
-        size: of the factor, N.
-        bounded: whether it is a motion that is sampled.
+        kinds: kinds of the state's components.
+        size: size N of the factor.
+        bounded: whether angles are limited to uniform ones, as for motions.
     """
     turns = turning(kinds)
 
     def squared_length(factor: Floats, first: int, width: int) -> float:
-        """Sum the variances of so many tangent components."""
+        """Sum the variances of `width` tangent components."""
         squared = 0.0
         for row in range(first, first + width):
             for k in range(row + 1):
@@ -102,7 +103,7 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
         return squared
 
     def bound(factor: Floats, row: int, times: float) -> float:
-        """Return the standard deviation of one component, after it is bounded."""
+        """Return the standard deviation of one component, after bounding it."""
         wide: float = times * np.sqrt(squared_length(factor, row, 1))
         if bounded and wide > UNIFORM_RAD:
             for k in range(row + 1):
@@ -111,7 +112,7 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
         return wide
 
     def reach_of(factor: Floats, points: Floats, first: int, width: int) -> float:
-        """Return how far from the mean the farthest sample of some components is."""
+        """Return the largest distance of a sample from the mean in some components."""
         most = 0.0
         for index in range(len(points)):
             squared = 0.0
@@ -148,7 +149,7 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
 
 
 def widen(share: float, memory: Regressed) -> None:
-    """Divide offsets and values of narrowed samples by c."""
+    """Divide the offsets and values of narrowed samples by c."""
     for index in range(len(memory.offsets)):
         for row in range(memory.offsets.shape[1]):
             memory.offsets[index, row] /= share
