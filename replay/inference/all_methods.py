@@ -1,4 +1,4 @@
-"""Lists all methods by name, and makes estimators of them: of one model, or of any.
+"""All methods by name, and functions that make estimators of them, for one model or for any model.
 
 A method is registered by its entry in METHODS, and by an entry point that names this module and the
 method, as `fuselog.replay.inference.all_methods:ekf`.
@@ -29,16 +29,17 @@ METHODS: Mapping[str, Method] = {
 
 
 def modelled(model: Model, method: str) -> AnyEstimator:
-    """Make the estimator of the state of one model by one method, named as on the command line.
+    """Make the estimator that applies one method to one model.
 
     Args:
         model: how the state moves and what sensors measure of it.
-        method: as `fuselog models NAME` lists them, such as "ukf", "lrkf:s2kf-50" or "imm:ekf".
+        method: the method's name, as `fuselog models NAME` lists it, such as "ukf", "lrkf:s2kf-50" or
+            "imm:ekf".
 
     Returns:
-        The estimator, which `replay` takes.
+        An estimator that can be passed to `replay`.
 
-    Raises BadInput where there is no such method or variant, or the model lacks what it needs.
+    Raises BadInput if the method or variant does not exist, or if the model lacks something it needs.
 
     >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> modelled(ROBOT, "particles:500").parameters().particles
@@ -53,7 +54,7 @@ def modelled(model: Model, method: str) -> AnyEstimator:
 
 @cache
 def __getattr__(method: str) -> AnyEstimator:
-    """Make the estimator of any model by a method: what an entry point and `-e ekf` mean."""
+    """Make the estimator that applies a method to any model, for an entry point or `-e ekf`."""
     if method not in METHODS:
         raise AttributeError(method)
     return of_any_model(METHODS[method])

@@ -1,4 +1,4 @@
-"""Makes estimators of a model and a method, and binds them to the topics of a log."""
+"""Estimators made of a model and a method, and their binding to the topics of a log."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -64,7 +64,7 @@ from fuselog.replay.inference.run.reading import reading_of
 
 @lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
-    """Return the parameters of a model and of a method, in one type."""
+    """Return the parameter type that combines the parameters of a model and of a method."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
     return _created(name, (method.parameters, model.parameters))
 
@@ -72,13 +72,13 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, AnyArgument] | None = None
 ) -> type[CombinedParameters]:
-    """Make a type of parameters that has the meanings of its bases."""
+    """Create a parameter type that inherits the fields and meanings of its bases."""
     made: type[CombinedParameters] = create_model(name, __base__=bases, **(fields or {}))
     return made
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, object]) -> type[ModelParameters]:
-    """Make a type of parameters with other defaults for some of them."""
+    """Create a parameter type that overrides some of the defaults of another type."""
     fields: dict[str, AnyArgument] = {}
     for name, value in defaults.items():
         field = kind.model_fields[name]
@@ -87,7 +87,7 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, object]) 
 
 
 def _accepted(field: FieldInfo) -> AnyArgument:
-    """Return what a parameter accepts: its type with its bounds."""
+    """Return the type that a parameter accepts, including its bounds."""
     bounds = tuple(field.metadata)
     return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
@@ -95,9 +95,16 @@ def _accepted(field: FieldInfo) -> AnyArgument:
 def modelled_by(
     model: Model, method: Method, name: str, settings: Mapping[str, object] | None = None
 ) -> AnyEstimator:
-    """Make the estimator of one model by a method of that name; `settings` are its own defaults.
+    """Make the estimator that applies a method to one model.
 
-    Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
+    Args:
+        model: the model whose state is estimated.
+        method: the method.
+        name: name of the method, with its variant, for the summary, the label and errors.
+        settings: defaults that the method's variant sets, by parameter name.
+
+    Raises BadInput if the method does not accept the settings, or if the model lacks something that the
+    method needs.
     """
     where, settings = f"method {name}", settings or {}
     values = build(method.parameters, settings, where)
@@ -119,18 +126,18 @@ def modelled_by(
 
 
 def model_of(estimator: AnyEstimator) -> Model | None:
-    """Find the model of which `modelled_by` made an estimator; None where another made it."""
+    """Return the model that `modelled_by` made an estimator of; None for other estimators."""
     made = estimator.bind
     return made.keywords["model"] if isinstance(made, partial) and made.func is bind_model else None
 
 
 def of_any_model(method: Method) -> AnyEstimator:
-    """Make the estimator that estimates, by one method, the registered model that fits a log."""
+    """Make the estimator that applies one method to whichever registered model fits a log."""
     return _OfAnyModel(method)
 
 
 class _OfAnyModel(AnyEstimator):
-    """Makes its requirements and parameters from all models when they are asked for."""
+    """An estimator whose requirements and parameters are collected from all models on demand."""
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
@@ -142,24 +149,24 @@ class _OfAnyModel(AnyEstimator):
 
     @cached_property
     def requirements(self) -> str:
-        """Return what a log must have."""
+        """Describe what the log must contain, for every registered model."""
         return " or ".join(
             f"({name}) {requirements_of(model)}" for name, model in registered_models().items()
         )
 
     @cached_property
     def parameters(self) -> type[Parameters]:
-        """Return those of all models, and of the method."""
+        """The parameters of all models and of the method."""
         return _any_parameters(vars(self)["_method"])
 
     def parameters_with(self, name: str, variant: Mapping[str, object]) -> type[Parameters]:
-        """Return those of all models, and of the method that the variant of a name chooses."""
+        """Return the parameters of all models and of the method that the variant selects."""
         return _any_parameters(self._made(name, variant))
 
     def parameters_by_model(
         self, name: str, variant: Mapping[str, object]
     ) -> dict[str, type[Parameters]]:
-        """Return those of each model that the method can estimate, and of the method."""
+        """Return the parameters for each model that the method can estimate, by model name."""
         method = self._made(name, variant)
         models = registered_models().items()
         return {each: combined(model, method) for each, model in models if not method.lacks(model)}
@@ -170,7 +177,10 @@ class _OfAnyModel(AnyEstimator):
 
 
 def registered_models() -> dict[str, Model]:
-    """Return the models by name; one that does not load is left out, and says why where it is named."""
+    """Return the registered models by name, without those that fail to load.
+
+    Naming such a model raises the error.
+    """
     found = {}
     for name in available("models"):
         with suppress(BadInput):
@@ -180,9 +190,9 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """Collect all parameters of all models, none of them set, with a method's and the model's name.
+    """Collect the parameters of all models, all unset, with those of a method and the model's name.
 
-    What one model wants of a parameter is checked when it is known which model fits the log.
+    The requirements of a model on its parameters are checked once it is known which model fits the log.
     """
     fields: dict[str, AnyArgument] = {"model": (str | None, Field(None, description=_MODEL))}
     models_of: dict[str, dict[str, list[str]]] = {}
@@ -205,23 +215,24 @@ _MODEL = "name of the model to estimate; without one, that which fits the log."
 
 
 def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
-    """Say what a parameter means to the models that have it, where it is not the same to all."""
+    """Describe a parameter, model by model if its meaning differs between models."""
     if len(meanings_of) == 1:
         return next(iter(meanings_of))
     return " ".join(f"{', '.join(models)}: {meaning}" for meaning, models in meanings_of.items())
 
 
-# What the last few logs have of each model: a log is bound again and again, with other parameters.
+# Topics found for each model in the last few logs, since a log is often bound again with other
+# parameters.
 _FOUND = Findings()
 
 
 def _bind_fitting(
     label: str, topics: Mapping[str, Topic], values: Parameters, *, method: Method
 ) -> list[Bound]:
-    """Bind the model that is named, or else the one that fits; nothing where none does.
+    """Bind the model that the parameters name, or the only registered model that fits the log.
 
-    Raises BadInput where the one named does not fit, several do, the method cannot serve it, or it has
-    no such parameter.
+    Raises BadInput if the named model does not fit, if no model or several models fit, if the method
+    cannot estimate the model, or if the model has no such parameter.
     """
     models = registered_models()
     given = {name: getattr(values, name) for name in values.model_fields_set}
@@ -255,7 +266,7 @@ def _bind_fitting(
     chooses = elsewhere(models, topics, renamed)
     if chooses:
         raise BadInput(f"estimator {label}: {chooses}")
-    for exactly in (False, True):  # the prior's components tell
+    for exactly in (False, True):  # first by all components of the prior, then by exactly these
         if len(fitting) > 1:
             named_alike = [
                 name
@@ -291,7 +302,7 @@ def bind_model(
     model: Model,
     method: Method,
 ) -> list[Bound]:
-    """Return a filter for everything in the log that is of this model."""
+    """Return one bound estimator for every object in the log that this model describes."""
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -302,7 +313,7 @@ def bind_model(
     things = [with_more(label, model, each, topics, more) for each in topics_of(model, topics, renamed)]
     tables, kind, given = parameters.of_topics or {}, model, parameters
     check_tables(label, model, things, tables)
-    stages: dict[tuple[Model, tuple[Sensor, ...]], Stage] = {}  # one for all with the same sensors
+    stages: dict[tuple[Model, tuple[Sensor, ...]], Stage] = {}  # shared by objects with the same sensors
     for found in things:
         found = in_its_plane(label, kind, found, topics)
         model, found, parameters = with_own_parameters(kind, found, tables, given)
@@ -366,7 +377,7 @@ def _check_topics(
     renamed: Mapping[str, str],
     more: Mapping[str, Sequence[str]],
 ) -> None:
-    """Raise BadInput where a topic stands for one that the model does not ask for, or is not there."""
+    """Raise BadInput if a renamed topic has an unknown role or is not in the log."""
     named = [*renamed.items(), *((role, name) for role, names in more.items() for name in names)]
     for role, name in named:
         refuse_named_truths(label, {role: name}, topics, {model.truth})
@@ -381,7 +392,7 @@ def _check_topics(
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """Make the estimator that reprocesses late messages; raises BadInput where the filter cannot."""
+    """Make the estimator that reprocesses late messages; raise BadInput if the filter cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
@@ -392,13 +403,13 @@ def _reprocessing(
 
 
 def _together(bound: Recursive, filtering: Filter, settings: Floats) -> Recursive:
-    """Make the estimator whose runs have settings (runs, 1 + sensors, fields) of their own."""
+    """Make the estimator whose runs each use their own settings (runs, 1 + sensors, fields)."""
     each = replace(filtering, each_run=settings)
     return replace(bound, start=each.start, run=each.run, finish=each.finish)
 
 
 def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Method:
-    """Choose the method that the parameters name.
+    """Return the variant of a method that the parameters select; prefix its BadInput with `where`.
 
     BadInput that begins with `where`, if there is none.
     """
@@ -409,7 +420,7 @@ def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Met
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
-    """Find the motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    """Return the motion of the named mode, or the model's own motion if no mode is named."""
     if mode is None:
         return model.motion
     if not model.modes:

@@ -1,4 +1,4 @@
-"""Writes a model's functions and their derivatives as formulas, by its components' names."""
+"""Formulas of a model's functions and their derivatives, written with the names of its components."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -13,26 +13,27 @@ from fuselog.replay.tracing.formulas import formulas_of
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Names = Sequence[str]
-# What a function is given, by the argument's name: the names of a tuple's entries or of an array's
-# rows and columns; of a number and of parameters nothing.
+# The names of each argument's entries, by argument: the names of a tuple's entries or of an array's
+# rows and columns. Numbers and parameters need no names.
 Given = Mapping[str, Names | tuple[Names, ...] | None]
 DIFFERENTIATED = ("state", "control", "noise")
 
 
 def formulas(model: str | Model) -> str:
-    """Return the functions of a model and their derivatives, as text that a person can read.
+    """Return the functions of a model and their derivatives as readable text.
 
-    A component after a step of the motion is called next_...; what a function uses more than once has a
-    line of its own, v1 and so on. Derivatives that are not there are zero. They are by the components as
-    they stand, those of an orientation too; methods carry them on to its tangent space.
+    The components after a step of the motion are called next_...; an expression that a function uses
+    more than once gets a line of its own (v1 and so on). Derivatives that are not listed are zero.
+    Derivatives are taken with respect to the stored components, also for orientations; the methods
+    convert them to the tangent space.
 
     Args:
-        model: a registered one's name (`models` has them), or a model.
+        model: name of a registered model (see `models`), or a model.
 
     Returns:
-        The text, a paragraph for each function.
+        The text, one paragraph per function.
 
-    Raises BadInput for an unknown name, or a function that cannot be traced.
+    Raises BadInput if the name is unknown or a function cannot be traced.
 
     >>> print(formulas("robot").partition("v3")[0].strip())
     motion, move:
@@ -46,7 +47,7 @@ def formulas(model: str | Model) -> str:
 
 
 def formulas_by_function(model: str | Model) -> dict[str, list[str]]:
-    """Return the lines of `formulas` by the function that they are of, such as "motion, move"."""
+    """Return the lines of `formulas` for each function, by titles such as "motion, move"."""
     found = load("models", model, Model) if isinstance(model, str) else model
     motions = found.modes or {"": found.motion}
     stage = stage_of(found, found.motion, found.all_sensors, tuple(motions.values()))
@@ -66,7 +67,7 @@ def formulas_by_function(model: str | Model) -> dict[str, list[str]]:
 
 
 def _of_motion(model: Model, motion: Motion) -> Iterator[tuple[str, list[str]]]:
-    """Return the functions of a motion by name, each with its lines; none where there is no function."""
+    """Yield the name and the lines of each function of a motion; missing functions have no lines."""
     state, axes = list(model.state), _axes(model)
     control = model.control.components if model.control else ()
     noise = [f"noise{number}" for number in range(1, motion.noises + 1)]
@@ -86,7 +87,7 @@ def _of_motion(model: Model, motion: Motion) -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
-    """Return the functions of a sensor by name, as those of a motion."""
+    """Yield the name and the lines of each function of a sensor."""
     state, axes, measured = list(model.state), _axes(model), list(sensor.measured)
     noise = [f"noise{number}" for number in range(1, sensor.noises + 1)]
     entering = {"noise": noise} if noise else {}
@@ -112,12 +113,12 @@ def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
 
 
 def _axes(model: Model) -> list[str]:
-    """Return the components of the tangent space."""
+    """Return the names of the components of the tangent space."""
     return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
 
 def reference_names(sensor: Sensor) -> list[str]:
-    """Return what the entries of `reference` are, see `Sensor.reference_size`."""
+    """Return the names of the entries of `reference`; see `Sensor.reference_size`."""
     names = [f"{_topic(each.topic)}_{name}" for each in sensor.maps for name in each.components]
     names += sensor.control.components if sensor.control else ()
     for name, size in sensor.fields.items():
@@ -130,7 +131,7 @@ def _topic(name: str) -> str:
 
 
 def _spread(axes: Names, block: int = 0) -> list[str]:
-    """Return what rows of a covariance's lower triangle are, and variances behind its block of axes."""
+    """Name the entries of a covariance: the first axes' lower triangle, then the other variances."""
     block = block or len(axes)
     names = [
         f"variance of {axes[row]}" if row == column else f"covariance of {axes[row]} and {axes[column]}"
@@ -143,14 +144,14 @@ def _spread(axes: Names, block: int = 0) -> list[str]:
 def _lines(
     function: object, given: Given, returned: Names = (), by: Names = DIFFERENTIATED
 ) -> list[str]:
-    """Write the formulas of a traced function.
+    """Write the formulas of a traced function; fewer returned values than names are variances.
 
     Where it returns less than is named, these are variances.
     """
     if function is None:
         return []
     assert isinstance(function, TracedFunction)
-    function = TracedFunction(function.function, function.arguments)  # a graph that nothing else was in
+    function = TracedFunction(function.function, function.arguments)  # a graph without earlier traces
     result = function.result
     if len(returned) > len(result.returned):
         returned = [name for name in returned if name.startswith("variance")]
@@ -167,7 +168,7 @@ def _lines(
 
 
 def _entries(argument: str, named: AnyArgument, kind: Argument) -> Iterator[tuple[object, str]]:
-    """Return the places within an argument, and their names."""
+    """Yield the index of each entry of an argument, and its name."""
     if isinstance(kind, Shape):
         for place in np.ndindex(kind.sizes):
             parts = ", ".join(names[index] for names, index in zip(named, place, strict=True))

@@ -1,10 +1,11 @@
-"""Measures observability from a log: what the measurements of a window say of the state at its start.
+"""Observability of the state at the start of a window, from the measurements of the window.
 
-The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, carried back by
-the derivatives Phi of the motion along one trajectory, the smoothed one. Scaled, D W D with D the
-prior's standard deviations, an eigenvalue of one is worth as much as the prior. Along a trajectory that
-is only estimated, what is not observable at all fills up with a little false information: what is below
-ten priors is called weaker than the prior. F and H are the extended filter's.
+The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, propagated back by
+the derivatives Phi of the motion along one trajectory, the smoothed one. After scaling, D W D with the
+prior's standard deviations D, an eigenvalue of one contains as much information as the prior. Along an
+estimated trajectory, unobservable directions collect a little spurious information; therefore
+eigenvalues below ten are reported as weaker than the prior. F and H are those of the extended Kalman
+filter.
 
 Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
 """
@@ -68,16 +69,16 @@ from fuselog.replay.inference.run.recursion import (
 from fuselog.replay.inference.smoothing.affine import carrying
 from fuselog.replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
 
-RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
-WEAK = 10.0  # priors
+RANK_TOLERANCE = 1e-10  # relative to the largest eigenvalue, times the number of components
+WEAK = 10.0  # eigenvalues in multiples of the prior's information
 
 
 class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
-    """States windows and scales of the Gramian.
+    """Windows and scales of the observability Gramian.
 
     Attributes:
-        window_s: length of a window; without one, the whole run.
-        scales: standard deviation that counts as one in place of the prior's, by component, in its unit.
+        window_s: length of a window; by default, the whole run.
+        scales: standard deviations to use in place of the prior's, by component, in its unit.
     """
 
     window_s: PositiveFloat | None = None
@@ -85,7 +86,7 @@ class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
 
 
 class Gramian(NamedTuple):
-    """Holds what is carried along: Phi and W (runs, t, t), and how many messages are in W (runs,)."""
+    """The propagated Phi and W (runs, t, t), and the number of messages in W (runs,)."""
 
     transition: Floats
     information: Floats
@@ -93,7 +94,7 @@ class Gramian(NamedTuple):
 
 
 class LinearizationTrajectory(NamedTuple):
-    """Holds the trajectory: states (nodes, n), every event's node, and memory for one offset."""
+    """States along the trajectory (nodes, n), each event's node, and memory for one tangent vector."""
 
     mean: Floats
     node: Integers
@@ -101,12 +102,12 @@ class LinearizationTrajectory(NamedTuple):
 
 
 def gramian_steps(stage: Stage) -> Steps:
-    """Make the steps that sum the Gramian along a trajectory, the only one of `memory`'s sets."""
+    """Make the steps that accumulate the Gramian along the trajectory, the only set of `memory`."""
     motion = _carried_by_motion(stage)
     sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
 
     def estimate(run: int, belief: Gramian, found: EstimateRows, row: int, _: Workspace) -> None:
-        """Note the Gramian, and as the mean how many messages are in it; begin anew."""
+        """Store the Gramian, with the number of its messages as the mean, and reset it."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
         belief.messages[run] = 0
@@ -188,10 +189,10 @@ def _summing(stage: Stage) -> tuple[OverRuns, Steps]:
 
 
 class Observability(IteratedSmoother):
-    """Runs the smoothed trajectory of every run, and the Gramians of its windows along it."""
+    """A smoother that computes the Gramians of each run's windows along its smoothed trajectory."""
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Return one message for every window, at its last stamp."""
+        """Return one message per window, stamped at the end of the window."""
         state, _ = self.ended(state)
         if not state.kept:
             return []
@@ -222,12 +223,12 @@ class Observability(IteratedSmoother):
 
     @property
     def components(self) -> list[str]:
-        """Return the names of the tangent space's components."""
+        """Names of the components of the tangent space."""
         model = self.stage.model
         return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
     def _scales(self, state: FilterState) -> Floats:
-        """Return what a scaled component of one stands for (runs, t)."""
+        """Return the scale of every tangent component (runs, t)."""
         scales: Floats = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
         model = self.stage.model
         for name, scale in named_now(self.parameters.scales, list(model.state), model.kinds).items():
@@ -240,7 +241,7 @@ class Observability(IteratedSmoother):
         return scales
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
-        """Find the window of every node; what is left behind a run's last whole one belongs to it."""
+        """Return the window of every node; what remains after the last whole window is part of it."""
         run = run_of_rows(way.offsets)
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:
@@ -254,7 +255,7 @@ class Observability(IteratedSmoother):
     def _gramians(
         self, state: FilterState, way: Way, window_of: Integers
     ) -> tuple[EstimateRows, Integers]:
-        """Return the Gramians at the last stamps of windows, and how many messages are in each."""
+        """Return the Gramian and the number of messages of every window, and the offsets of the runs."""
         stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
         t, (loop, steps) = stage.model.tangent, _summing(stage)
         ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
@@ -287,7 +288,7 @@ class Observability(IteratedSmoother):
 
 
 class Spectrum(NamedTuple):
-    """Holds a scaled Gramian's eigenvalues, ascending (t,), rank, and the least's direction (t,)."""
+    """Eigenvalues of a scaled Gramian, ascending (t,), its rank, and the weakest direction (t,)."""
 
     eigenvalues: Floats
     rank: int
@@ -295,9 +296,11 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(information: Floats, scales: Floats) -> Spectrum:
-    """Return rank and eigenvalues of D W D, and D e of the least, of length one in state units.
+    """Compute the rank and the eigenvalues of D W D, and its weakest direction.
 
-    A component whose scale is zero, as something known exactly, has no part: its eigenvalue is infinite.
+    The direction is D e for the eigenvector e of the smallest eigenvalue, in state units, of length one.
+    A component whose scale is zero is known exactly; it is left out, and its eigenvalue counts as
+    infinite.
 
     Args:
         information: W (t, t), of the state at the start of a window.
@@ -345,5 +348,5 @@ OBSERVABILITY = of_any_model(METHOD)
 
 
 def observability_of(model: Model) -> AnyEstimator:
-    """Return the same of one model; raises BadInput where that lacks what it needs."""
+    """Make the observability estimator for one model; raise BadInput if the model lacks a part."""
     return modelled_by(model, METHOD, "observability")

@@ -1,4 +1,4 @@
-"""Says in words what a model requires of a log, in lists and for a log that lacks something."""
+"""Descriptions of what a model requires of a log, for lists and for errors about missing topics."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from fuselog.replay.inference.model.model import (
     Model,
 )
 
-# What to do with a log that no registered model fits; docs/your-model.md
+# Advice for a log that no registered model fits; see docs/your-model.md.
 OWN_MODEL = (
     'use a model of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model '
     "in the documentation"
@@ -18,7 +18,7 @@ OWN_MODEL = (
 
 
 def requirements_of(model: Model) -> str:
-    """Say in words what a model requires of a log; of one that can start without, what it may have."""
+    """Describe what a model requires of a log, or may use if it can start without a prior."""
     words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
     if model.start is None or model.control is None or not model.needs_sensor:
         return "; ".join(words)
@@ -28,7 +28,7 @@ def requirements_of(model: Model) -> str:
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
-    """Find which of the models comes nearest to fitting a log, and what the log lacks for it."""
+    """Describe which of the models comes nearest to fitting a log, and what the log lacks."""
     tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
@@ -41,9 +41,9 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
-    """Find the model of the log's prior, where only its control has another name; empty where none is.
+    """Explain that the log's prior is of a model whose control topic has another name; otherwise empty.
 
-    As with several inertial units, of which one has to be chosen.
+    An example is a log with several inertial units, one of which has to be chosen.
     """
     for name, model in models.items():
         control = model.control
@@ -67,7 +67,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
 
 
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Requirement"]:
-    """Return what a model needs, under the prefix of a log that has most of it."""
+    """Return the requirements of a model under the prefix of the log that satisfies most of them."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
     return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
 
@@ -77,14 +77,14 @@ def _fit(parts: Sequence["Requirement"]) -> int:
 
 
 class Requirement(NamedTuple):
-    """Describes something that a model needs, and whether a log has it."""
+    """Something that a model needs, and whether a log contains it."""
 
     words: str
     is_here: bool
 
 
 def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
-    """Return all that a model needs under one prefix."""
+    """Return all requirements of a model under one prefix."""
 
     def part(name: str, schema: Schema, system: str = "") -> Requirement:
         place, known = here.place(name), here.topics.get(here.place(name))
@@ -118,6 +118,6 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
 
 
 def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
-    """Tell whether a prior names all components of a model's state, and no others if `exactly`."""
+    """Test whether a prior names all components of a model's state, and no others if `exactly`."""
     named = set(prior.metadata.get("components", "").split(","))
     return named == set(model.state) if exactly else named >= set(model.state)

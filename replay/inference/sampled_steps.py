@@ -1,6 +1,7 @@
-"""Traces functions at weighted samples as graphs, see `fuselog.replay.inference.kalman.regression`.
+"""Traces of functions at weighted samples as graphs; see `fuselog.replay.inference.kalman.regression`.
 
-Samples and rounds are left to loops: a graph is of one sample, or of one round of a mean.
+The loops over samples and over iterations of a mean are not traced: a graph computes one sample or one
+iteration.
 """
 
 from functools import lru_cache
@@ -24,26 +25,28 @@ from fuselog.replay.inference.step_graphs import Step, StepFunction, TracedValue
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Kinds = tuple[str, ...]
-SETTLING = (3,)  # which argument of `SampledFunction.recentre` differs from sample to sample: value
+SETTLING = (3,)  # index of the argument of `SampledFunction.recentre` that differs by sample
 
 
 class SampledFunction(NamedTuple):
-    """Holds a function of a state, its noise and arguments at weighted samples, with v values.
+    """A function of a state, its noise and other arguments at weighted samples, with v values.
 
-    Its graphs are of what the step is given, (mean, covariance, ...).
+    Each graph takes the arguments of the step, (mean, covariance, ...), and those named below.
 
     Attributes:
-        points, weights: (L, t + noises), (L,), samples of N(0, I).
-        variances: the noise's, `variance` (noises).
-        centre: the function at the mean, without noise: `centre`, of its values.
-        value: of (..., away, centre), the function at the mean moved by a tangent vector, behind which
-            is the noise (t + noises): `value` (v), the tangent vector to there from the centre.
-        move: of (mean, covariance, shift, centre): `centre`, moved by the shift (v).
-        recentre: of (mean, covariance, shift, value): `value` from the moved centre, and `again`,
-            whether the values may still not sum to zero; None where they are linear.
-        given: how many arguments the step is given.
-        turns: the state's angles and rotations, by which samples are narrowed, see `wide_angles`.
-        unsuspected: the standard deviation up to which they are not.
+        points, weights: samples (L, t + noises) of N(0, I), and their weights (L,).
+        variances: gives `variance` (noises), the variances of the noise.
+        centre: gives `centre`, the values of the function at the mean without noise.
+        value: takes (..., away, centre) and gives `value` (v), the tangent vector from the centre to the
+            function's value at one sample. `away` (t + noises) is a tangent vector from the mean,
+            followed by the noise.
+        move: takes (mean, covariance, shift, centre) and gives `centre`, moved by the shift (v).
+        recentre: takes (mean, covariance, shift, value) and gives `value` seen from the moved centre,
+            and `again`, whether another iteration may be necessary. None if all values are linear.
+        given: number of arguments of the step.
+        turns: angles and rotations of the state, which limit the spread of the samples; see
+            `wide_angles`.
+        unsuspected: standard deviation up to which the spread is not limited.
     """
 
     points: Floats
@@ -59,35 +62,35 @@ class SampledFunction(NamedTuple):
 
     @property
     def steps(self) -> list[Step]:
-        """List its graphs."""
+        """All graphs."""
         found = [self.variances, self.centre, self.value, self.move]
         return found if self.recentre is None else [*found, self.recentre]
 
     @property
     def varying(self) -> tuple[int]:
-        """Return which argument of `value` differs from sample to sample: away."""
+        """Index of the argument of `value` that differs between samples: away."""
         return (self.given,)
 
     @property
     def noises(self) -> int:
-        """Count the numbers of noise."""
+        """Number of noise components."""
         return len(self.variances.outputs)
 
     @property
     def size(self) -> int:
-        """Count the tangent components of its values."""
+        """Number of tangent components of the values."""
         return len(self.value.outputs)
 
 
 class Sampled(NamedTuple):
-    """Says what is sampled.
+    """A function to be sampled, and its arguments.
 
     Attributes:
-        what: it is, for errors.
-        function: of (state, noise, arguments).
-        variances: (state, what the step is given) -> the noise's.
-        arguments: (what the step is given) -> the function's.
-        kinds, outputs: of the state, and of the function's values.
+        what: name of the function, for errors.
+        function: function of (state, noise, arguments).
+        variances: gives the variances of the noise, from the state and the arguments of the step.
+        arguments: gives the arguments of the function, from those of the step.
+        kinds, outputs: kinds of the components of the state, and of the function's values.
     """
 
     what: str
@@ -103,7 +106,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
 
     Args:
         sampled: the function.
-        sets: samples that serve every step.
+        sets: sample sets, of which the first serves every step.
         given: arguments of the step, mean and covariance first.
     """
     what, function, variances, arguments, kinds, outputs = sampled
@@ -158,7 +161,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
 def _by_block(
     function_of: StepFunction, kinds: Kinds, first: TracedValue, second: TracedValue
 ) -> list[TracedValue]:
-    """Apply a function to every number, angle, axis and orientation of two states."""
+    """Apply a function to each pair of numbers, angles, axes and orientations of two states."""
     found: list[TracedValue] = []
     for kind, component, _, _ in manifold_blocks(kinds):
         own = slice(component, component + WIDTHS[kind])
@@ -168,7 +171,7 @@ def _by_block(
 
 @lru_cache(maxsize=8)
 def _difference(kind: str) -> TracedFunction:
-    """Make one minus another: a graph of its own, so that conditions of several do not multiply."""
+    """Trace the difference of two values separately, so that the branches of several do not multiply."""
     width = WIDTHS[kind]
     subtract = boxminus((kind,) * width)
 
@@ -182,7 +185,7 @@ def _difference(kind: str) -> TracedFunction:
 
 @lru_cache(maxsize=8)
 def _recentred(kind: str) -> TracedFunction:
-    """Make a tangent vector from a centre one from its shift, behind whether it may not be settled."""
+    """Trace how a tangent vector changes with its centre, preceded by whether to repeat the shift."""
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 

@@ -1,7 +1,7 @@
-"""Traces the parts of a filter's steps: functions that return arrays by name become graphs.
+"""Traces of the parts of a filter's steps: functions that return arrays by name become graphs.
 
-They are called with traced numbers, so that a graph has their operations in their order, and what is
-known to be zero stands in none of them.
+The functions are called with traced numbers, so a graph contains their operations in the same order,
+without terms that are known to be zero.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,27 +13,27 @@ from fuselog.recorders.errors import BadInput
 from fuselog.replay.tracing.functions import Argument, trace
 from fuselog.replay.tracing.graph import Graph, Node
 
-# An array, a tuple or a number, of traced numbers.
+# An array, a tuple or a number, whose entries are traced numbers.
 TracedValue = Any  # type: ignore[explicit-any]
-# Gives traced values of such, often by name; what it takes is up to the step.
+# Returns traced values, often by name; its arguments depend on the step.
 StepFunction = Callable[..., TracedValue]  # type: ignore[explicit-any]
 
 _SPARSE = ("F", "H", "G", "N")
 
 
 class Step(NamedTuple):
-    """Holds a step, or a part of one, as a graph.
+    """A step of a filter, or a part of one, as a graph.
 
     Attributes:
         graph: the graph.
-        outputs: what it gives, by the array's name and place; of F, H, G and N without what is zero.
+        outputs: its output nodes, by array name and index; F, H, G and N without zero entries.
     """
 
     graph: Graph
     outputs: Mapping[tuple[str, tuple[int, ...]], Node]
 
     def has(self, name: str) -> bool:
-        """Tell whether it gives an array of this name."""
+        """Test whether the step returns an array of this name."""
         return any(each == name for each, _ in self.outputs)
 
     def columns(self, name: str, rows: int) -> list[list[int]]:
@@ -46,11 +46,11 @@ def traced_step(what: str, function: StepFunction, arguments: tuple[Argument, ..
     """Trace a function that returns arrays by name.
 
     Args:
-        what: it is, for the error.
-        function: of the arguments.
-        arguments: as `fuselog.replay.tracing.functions.trace` takes them.
+        what: name of the step, for errors.
+        function: the function.
+        arguments: its arguments, as for `fuselog.replay.tracing.functions.trace`.
 
-    Raises BadInput where it is no graph.
+    Raises BadInput if the function cannot be traced.
     """
     graph, places = Graph(), list[tuple[str, tuple[int, ...]]]()
 
@@ -74,5 +74,5 @@ def traced_step(what: str, function: StepFunction, arguments: tuple[Argument, ..
 
 
 def zeros(*sizes: int) -> TracedValue:
-    """Make an array of zeros that takes traced numbers."""
+    """Make an array of zeros that can store traced numbers."""
     return np.zeros(sizes).astype(object)

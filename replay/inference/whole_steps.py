@@ -1,8 +1,8 @@
-"""Traces a filter's whole steps: its prediction, each sensor's innovation, and the correction.
+"""Traces of a filter's complete steps: prediction, innovation of each sensor, and correction.
 
-The functions that kernels are compiled from are called with traced numbers, see `step_graphs`. Products
-of covariances with Jacobians are left to loops, which go over the entries that the graphs give, and so
-are samples, see `sampled_steps`.
+The functions that kernels are compiled from are called with traced numbers; see `step_graphs`. Products
+of covariances and Jacobians are not traced: loops compute them from the entries that the graphs return.
+The same applies to samples; see `sampled_steps`.
 """
 
 from collections.abc import Callable
@@ -30,23 +30,26 @@ from fuselog.replay.tracing.functions import Argument, Shape, traced
 
 
 class WholeSteps(NamedTuple):
-    """Holds the steps of a filter with n components of the state, t of its tangent space.
+    """The steps of a filter whose state has n components and a tangent space of t components.
 
-    All are of (mean, covariance, ...). What is added to a covariance is a gain G of noise with the
-    variances u of its columns, and N (t, t) or (m, m).
+    All steps take (mean, covariance, ...). What is added to a covariance is G diag(u) G' + N: a gain G
+    with the variances u of its columns, and N, (t, t) or (m, m).
 
     Attributes:
-        predict: of (..., control, duration_s, parameters), it gives G, u, N, and mean and F (t, t), or
-            no more where the motion is sampled.
-        innovate: of (..., data, parameters), for every sensor of m components: v (m), G, u, N, and H
-            (m, t). Where it is sampled it is of (..., data, parameters, centre), without H. Where
-            updates are iterated it is of (..., data, parameters, step, slope): at the mean moved by a
-            step, as an innovation about the mean.
-        direction: of the state: `a` (t), along which the correction bends; None where it does not.
-        correct: of (..., step, slope), it gives the mean, and F where covariances go with it by that.
-        gap: as `predict` it gives N, added over a gap of the control; None where it ends there.
-        sampled: of the motion and of every sensor, what is sampled; None where that is linearised.
-        is_iterated: whether updates are.
+        predict: takes (..., control, duration_s, parameters) and gives G, u, N, the mean and F (t, t);
+            only the first three if the motion is sampled.
+        innovate: one step for each sensor of m components; takes (..., data, parameters) and gives v
+            (m), G, u, N and H (m, t). If the sensor is sampled, it takes (..., data, parameters, centre)
+            and does not give H. If updates are iterated, it takes (..., data, parameters, step, slope)
+            and gives the innovation about the mean, linearized at the mean moved by the step.
+        direction: gives `a` (t), the direction along which the correction bends; None if it does not
+            bend.
+        correct: takes (..., step, slope) and gives the mean, and F if the correction also transforms the
+            covariance by F.
+        gap: takes the arguments of `predict` and gives N, added over a gap of the control; None if the
+            estimate ends at a gap.
+        sampled: for the motion and every sensor, the function that is sampled; None if it is linearized.
+        is_iterated: whether updates are iterated.
     """
 
     predict: Step
@@ -59,7 +62,7 @@ class WholeSteps(NamedTuple):
 
     @property
     def all(self) -> list[Step]:
-        """List all graphs."""
+        """All graphs."""
         found = [self.predict, *self.innovate, self.direction, self.correct, self.gap]
         found += [step for each in self.sampled if each is not None for step in each.steps]
         return [each for each in found if each is not None]
@@ -80,10 +83,10 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 
     Args:
         filtering: the filter, bound to a log.
-        kind: EXTENDED for derivatives, ITERATED where updates take them again at every iterate, SAMPLED
-            for regression at samples.
+        kind: EXTENDED to use derivatives, ITERATED to linearize again at every iteration of an update,
+            SAMPLED to use regression at samples.
 
-    Raises BadInput where a step is no graph.
+    Raises BadInput if a step cannot be traced.
     """
     stage = filtering.stage
     model, motion, names = stage.model, stage.motion, number_fields(stage.model.parameters)
@@ -127,13 +130,13 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
     return WholeSteps(predict, tuple(innovations), direction, correct, gap, tuple(sampled), is_iterated)
 
 
-# --- what is traced: functions that return arrays by name -------------------------------------------
+# --- traced functions that return arrays by name ----------------------------------------------------
 
 
 def _motion(
     model: Model, motion: Motion, memory: Callable[[], TracedValue], *, is_sampled: bool
 ) -> StepFunction:
-    """Make the motion's derivatives, or where it is sampled what is added to it alone."""
+    """Make the step with the motion's derivatives, or only its added noise if the motion is sampled."""
     linearise = motion_derivative(model, motion, by_state=not is_sampled)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     t, add = model.tangent, adding_noise(model.tangent, motion.noise_block)
@@ -292,7 +295,7 @@ def _correcting(model: Model, memory: Callable[[], TracedValue]) -> StepFunction
 
 
 def _of_objects(value: TracedValue) -> TracedValue:
-    """Make a workspace that takes traced numbers."""
+    """Make a copy of a workspace whose arrays can store traced numbers."""
     if isinstance(value, np.ndarray):
         return value.astype(object) if value.dtype == float else value
     if isinstance(value, tuple):
