@@ -1,4 +1,4 @@
-"""Runs several filters side by side: interacting multiple models, and Gaussian sums.
+"""Methods that run several filters in parallel: interacting multiple models, and Gaussian sums.
 
 Begin with `imm`.
 """

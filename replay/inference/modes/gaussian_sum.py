@@ -1,9 +1,9 @@
-"""Filters a Gaussian sum (`bank`): narrow Gaussians from a prior too wide in an angle for one of them.
+"""Gaussian-sum filter (`bank`): narrow Gaussians from a prior that is too wide in an angle for one.
 
-The prior is split across the widest direction of its angles, such as an unknown heading, into Gaussians
-side by side. Each is filtered by itself; every message weighs them by its likelihood, and what is told
-is their mixture. A member that is next to impossible ends, and where those that are left agree they
-become one, so that in the end the bank costs what its filter costs.
+The prior is split along the widest direction of its angles, such as an unknown heading, into adjacent
+Gaussians. Each is filtered separately; every message weights them by its likelihood, and the estimate is
+their mixture. Members with negligible probability are removed, and the remaining ones are merged when
+they agree, so that eventually the sum costs as much as one filter.
 
 Magill, Optimal Adaptive Estimation of Sampled Stochastic Processes, IEEE TAC 10(4), 1965.
 """
@@ -47,18 +47,18 @@ from fuselog.replay.inference.modes.mixing import MixtureMemory, likeliest_of, m
 from fuselog.replay.inference.modes.mixture import MixtureFilter, Mixtures, UpdateMixture, mixture_update
 from fuselog.replay.inference.run.filtering import FilterState
 
-IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
-ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says
-AGREED = 0.1  # members become one where their means are on average so near, as a squared distance
+IMPOSSIBLE = 1e-6  # a member with less than this fraction of the highest probability is removed
+ALIKE = 1e-9  # relative difference below which variances count as equal, because of rounding
+AGREED = 0.1  # mean squared distance below which the members are merged
 
 
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """States the filter of every member, and the number of members.
+    """The filter of every member, and the number of members.
 
-    Members lie side by side, and the standard deviation of each is half their distance, so that their
-    sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not split.
-    The number is odd: of an even one, each member has another opposite, and whether that is half a turn
-    to the left or to the right, and so the mean of all, rounding would say.
+    Members are adjacent, and the standard deviation of each is half their distance, so that their sum is
+    smooth. A narrower prior has fewer members; one that is no wider than a member is not split. The
+    number is odd: with an even number, every member has an exact opposite, and rounding would determine
+    whether it is half a turn to the left or to the right, and thereby the mean.
 
     Attributes:
         filter: the filter of every member: ekf, iekf, ukf, lrkf, analytic or sqrt.
@@ -77,13 +77,13 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 class GaussianSumBelief(NamedTuple):
-    """Holds the Gaussians of all runs, first axis = run: those of M that are left, in front.
+    """The Gaussians of all runs, the first axis; the remaining ones of M members come first.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
         probability, log_probability: (runs, M).
-        member: (runs, M), which of the first members it is.
-        left: (runs,), how many there are.
+        member: (runs, M) index of each among the original members.
+        left: (runs,) number of remaining members.
     """
 
     mean: Floats
@@ -95,7 +95,7 @@ class GaussianSumBelief(NamedTuple):
 
 
 class GaussianSumMemory(NamedTuple):
-    """Holds what the steps of one core work in: the members' filter, their mixture, `factor` (t, t)."""
+    """Working memory of one core: the members' filter, their mixture, and `factor` (t, t)."""
 
     filters: tuple[CoreMemory]
     mixture: MixtureMemory
@@ -103,12 +103,12 @@ class GaussianSumMemory(NamedTuple):
 
 
 def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
-    """Make the steps of a Gaussian sum of so many of these filters.
+    """Make the steps of a Gaussian sum with at most `members` filters.
 
     Args:
-        stage: the model with the sensors at hand.
-        inner: the steps of the filter of one member.
-        members: how many there are at most.
+        stage: the bound model, with the sensors of the log.
+        inner: steps of the filter of one member.
+        members: largest number of members.
     """
     t = stage.model.tangent
     to_common_tangent, mix = mixing(stage.model.kinds, inner.form)
@@ -125,7 +125,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         return well
 
     def keep_possible(run: int, belief: GaussianSumBelief) -> None:
-        """End what is next to impossible: the others move to the front."""
+        """Remove members with negligible probability, and move the others to the front."""
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
         count = belief.left[run]
@@ -145,7 +145,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         belief.left[run] = kept
 
     def merge_agreeing(run: int, belief: GaussianSumBelief, memory: GaussianSumMemory) -> None:
-        """Make one Gaussian of all, where their means differ by next to nothing of what is unknown."""
+        """Merge all Gaussians into one if their means differ by little relative to the covariance."""
         count = belief.left[run]
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
@@ -214,12 +214,13 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
-    """Find the direction (t,) in which a covariance (t, t) is widest of all turns, and its variance.
+    """Find the direction (t,) in which a covariance (t, t) is widest among all angles, and its variance.
 
-    Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
+    If several directions are equally wide, the result is that of the first angle or orientation, as
+    close as possible to the first of its axes.
 
     Args:
-        kinds: of the state's components.
+        kinds: kinds of the state's components.
         covariance: (t, t), in the tangent space.
     """
     direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
@@ -230,7 +231,7 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
             if variances[-1] > (1.0 + ALIKE) * variance:
                 direction[:], variance = 0.0, float(variances[-1])
                 alike = axes[:, variances >= (1.0 - ALIKE) * variance]
-                within = alike @ alike.T  # of every axis what is in the directions that are widest
+                within = alike @ alike.T  # projection of every axis onto the widest directions
                 axis = within[:, np.argmax(np.round(np.diagonal(within), 9))]
                 direction[begin:end] = axis / np.linalg.norm(axis)
         begin = end
@@ -238,16 +239,17 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
 
 
 def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
-    """Return a Gaussian as a row of narrower ones, across its widest turn.
+    """Split a Gaussian into a row of narrower ones along its widest angle.
 
     Args:
-        kinds: of the state's components.
+        kinds: kinds of the state's components.
         mean, covariance: (n,), (t, t).
-        members: how many at most, spread over a whole turn.
+        members: largest number of members, spread over a whole turn.
 
     Returns:
-        the weights (members,), zero where there is no member; the means (members, n); the covariance
-        (t, t) of each. That of the mixture is the Gaussian's own, but for what is beyond a half turn.
+        The weights (members,), zero for unused members; the means (members, n); the covariance (t, t) of
+        each. The covariance of the mixture is that of the given Gaussian, except for its part beyond
+        half a turn.
     """
     direction, variance = widest(kinds, covariance)
     apart = 2.0 * np.pi / members
@@ -265,16 +267,16 @@ def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int
 
 
 class GaussianSumFilter(MixtureFilter):
-    """Runs a bank of filters; the probabilities of its members are on the topic `modes`."""
+    """A Gaussian-sum filter; the probabilities of its members are on the topic `modes`."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Compute how far each member is turned from the prior's mean."""
+        """Names of the members, by their angle from the prior's mean."""
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Return the state at every run's prior, which is split; see `Filter.start`."""
+        """Make the state at every run's prior, which is split; see `Filter.start`."""
         state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief
         runs = len(mean)
@@ -307,7 +309,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _gaussian_sum(name: str, variant: str, members: int) -> Method:
-    """Make the method of so many filters of this name."""
+    """Make the method that uses `members` filters of this name."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

@@ -1,14 +1,14 @@
-"""Filters by interacting multiple models: one filter for each mode, and the modes' probabilities.
+"""Interacting multiple models (IMM): one filter for each mode, and the modes' probabilities.
 
-Over dt seconds a thing goes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt). To every
-later stamp the modes' Gaussians are mixed,
+Over dt seconds an object changes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt).
+Before a prediction the modes' Gaussians are mixed,
 
     c_j = sum_i mu_i Pi_ij,  mu_(i|j) = mu_i Pi_ij / c_j,
 
 each mode predicts its own mixture, and every message makes mu_j proportional to mu_j N(v_j; 0, S_j).
-Mixtures lie in the tangent space of the likeliest mode; covariances are carried there, and from there to
-that of the mixture's mean, by the right Jacobian. Probabilities are kept as logarithms too: those of a
-mode that fits badly lie below the smallest number.
+Mixtures are formed in the tangent space of the most probable mode; covariances are transformed to it,
+and from there to that of the mixture's mean, by the right Jacobian. Probabilities are also stored as
+logarithms, because those of a mode that fits badly are below the smallest floating-point number.
 
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
 """
@@ -67,12 +67,12 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """States the filter of every mode, and what is written.
+    """The filter of every mode, and additional outputs.
 
     Attributes:
         filter: the filter of every mode: ekf, iekf, ukf, lrkf, analytic or sqrt.
-        smoothed_modes: whether the probabilities of the modes given all data are written too, at the end
-            of the run and on a topic of their own; the state is not smoothed.
+        smoothed_modes: whether to also write the probabilities of the modes given all data, at the end
+            of the run and on a separate topic; the state is not smoothed.
     """
 
     filter: str = "ekf"
@@ -85,15 +85,15 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
             raise ValueError("imm takes all modes of a model; leave out `mode`, or use a filter of one")
 
 
-# The steps
+# Steps
 
 
 def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
-    """Make the steps of an interacting multiple model whose modes have these filters.
+    """Make the steps of an interacting multiple model filter whose modes have these filters.
 
     Args:
-        stage: the model with all its modes, and the sensors at hand.
-        filters: the steps of every mode's filter, in the order of the modes.
+        stage: the bound model with all its modes and the sensors of the log.
+        filters: steps of every mode's filter, in the order of the modes.
     """
     model, switching = stage.model, stage.model.switching
     assert switching is not None
@@ -162,26 +162,26 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap, form)
 
 
-# As an estimator
+# Estimator
 
 
 class InteractingFilter(MixtureFilter):
-    """Runs a filter of all modes of a model."""
+    """A filter for all modes of a model."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Return the modes."""
+        """Names of the modes."""
         return tuple(self.stage.model.modes or ())
 
     @cached_property
     def chain(self) -> tuple[Floats, Floats]:
-        """Return the rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
+        """The rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
         model = self.stage.model
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Return the state at every run's prior, the same in all modes; see `Filter.start`."""
+        """Make the state at every run's prior, which is the same in all modes; see `Filter.start`."""
         state, (_, initial) = super().start(static), self.chain
         mean, covariance = (
             np.repeat(each[:, None], len(initial), axis=1) for each in state.carried.belief
@@ -206,7 +206,7 @@ class InteractingFilter(MixtureFilter):
         return after, made
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter what waited for a control, and smooth the modes' probabilities where asked for."""
+        """Filter the events that still wait, and smooth the modes' probabilities if requested."""
         state, made = self.ended(state)
         return [*made, self.smoothed(join(state.kept))] if state.kept else made
 
@@ -219,7 +219,7 @@ class InteractingFilter(MixtureFilter):
         return self.modes("smoothed_modes", time_ns, probability, modes.offsets)
 
 
-# As a method
+# Method
 
 
 def _lacks(model: Model, inner: Method) -> str:
@@ -232,7 +232,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _interacting(name: str, variant: str) -> Method:
-    """Make the method that gives every mode this filter."""
+    """Make the method that uses this filter for every mode."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

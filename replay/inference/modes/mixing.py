@@ -1,4 +1,4 @@
-"""Mixes the Gaussians of modes: the transition matrix, the weights of mixtures, and their moments."""
+"""Mixing of the Gaussians of modes: transition matrix, weights of mixtures, and their moments."""
 
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -19,20 +19,23 @@ from fuselog.replay.inference.linear_algebra.manifold import (
 from fuselog.replay.inference.linear_algebra.tuples import total
 from fuselog.replay.inference.model.stage import Stage
 
-TINY = 1e-280  # below it a probability loses digits
-LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
-Matrix = tuple[tuple[float, ...], ...]  # its rows
+TINY = 1e-280  # smaller probabilities lose digits
+LONGEST, TERMS = (
+    0.125,
+    10,
+)  # series of expm: largest argument; terms for an error of 3e-18
+Matrix = tuple[tuple[float, ...], ...]  # rows of a matrix
 
 
 class MixtureMemory(NamedTuple):
-    """Holds what a mixture of M Gaussians is made and updated in.
+    """Working memory for a mixture of M Gaussians.
 
     Attributes:
-        centre: (n,), the mean in whose tangent space mixtures are made.
-        away, carried: (M, t), (M, t, t), the Gaussians there.
-        shift: (t,), of a mixture.
-        records: what every Gaussian's update tells, first axis = mode.
-        open_gate: (m + 1,), bounds that let everything in.
+        centre: (n,) mean in whose tangent space mixtures are formed.
+        away, carried: (M, t), (M, t, t) the Gaussians in that tangent space.
+        shift: (t,) mean of a mixture in that tangent space.
+        records: innovations of every Gaussian's update; the first axis is the mode.
+        open_gate: (m + 1,) bounds that accept every measurement.
     """
 
     centre: Floats
@@ -44,7 +47,7 @@ class MixtureMemory(NamedTuple):
 
 
 def mixture_memory(stage: Stage, count: int) -> MixtureMemory:
-    """Make what mixtures of so many Gaussians are made and updated in."""
+    """Allocate memory for mixtures of `count` Gaussians."""
     n, t, m = stage.model.size, stage.model.tangent, len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
     records = InnovationRecord(np.empty((count, m)), np.empty((count, m, m)), np.empty((count, 3)))
@@ -53,14 +56,14 @@ def mixture_memory(stage: Stage, count: int) -> MixtureMemory:
 
 
 class InteractingMemory(NamedTuple):
-    """Holds what the steps of one core work in.
+    """Working memory of the steps of one core.
 
     Attributes:
-        filters: the memory of every mode's filter.
+        filters: memory of every mode's filter.
         rates, transition: (M (M - 1),), and Pi (M, M).
-        weights: (M, M), row j those of all modes in the mixture of mode j.
-        predicted: (M,), the logarithms of c.
-        mixture: for the modes' Gaussians.
+        weights: (M, M) row j has the weights of all modes in the mixture of mode j.
+        predicted: (M,) logarithms of c.
+        mixture: memory for the modes' Gaussians.
     """
 
     filters: tuple[CoreMemory, ...]
@@ -72,13 +75,13 @@ class InteractingMemory(NamedTuple):
 
 
 class FillTransition(Protocol):
-    """Fills Pi (M, M) of rates (M (M - 1),) between modes over a duration."""
+    """Function that fills Pi (M, M) from the rates (M (M - 1),) between modes over a duration."""
 
     def __call__(self, rates: Floats, duration_s: float, transition: Floats, /) -> None: ...
 
 
 class FillWeights(Protocol):
-    """Moves probabilities (M,) and their logarithms over the change of modes, and fills the weights."""
+    """Function that predicts probabilities (M,) and their logarithms, and fills the mixing weights."""
 
     def __call__(
         self, probability: Floats, log_probability: Floats, memory: InteractingMemory, /
@@ -86,7 +89,10 @@ class FillWeights(Protocol):
 
 
 class ToCommonTangent(Protocol):
-    """Carries means (M, n) and covariances (M, t, t) to the tangent space of the likeliest."""
+    """Function that transforms means (M, n) and covariances (M, t, t) to one common tangent space.
+
+    It is that of the most probable mode.
+    """
 
     def __call__(
         self, mean: Floats, covariance: Floats, probability: Floats, memory: MixtureMemory, /
@@ -94,7 +100,7 @@ class ToCommonTangent(Protocol):
 
 
 class MixModes(Protocol):
-    """Fills mean (n,) and covariance (t, t) of a mixture with these weights (M,)."""
+    """Function that fills the mean (n,) and covariance (t, t) of a mixture with these weights (M,)."""
 
     def __call__(
         self, weights: Floats, memory: MixtureMemory, mean: Floats, covariance: Floats, /
@@ -103,11 +109,12 @@ class MixModes(Protocol):
 
 @lru_cache(maxsize=16)
 def transition_matrix(modes: int) -> FillTransition:
-    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformisation.
+    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformization.
 
-    With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
-    negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
-    series is short, and the result squared as often; what that leaves of the rows' sums is one.
+    With L dt added to the diagonal, where L is the fastest rate at which a mode is left, the matrix has
+    no negative entries, so that no digits cancel; the factor exp(-L dt) compensates for this. The
+    duration is halved until the series is short, and the result is squared as often; finally the rows
+    are normalized to a sum of one.
     """
     changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
     rate_of = tuple(
@@ -157,10 +164,10 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
 
 
 def mixing_weights(modes: int) -> FillWeights:
-    """Make `fill_weights(probability, log_probability, memory)`: the probabilities become c.
+    """Make `fill_weights(probability, log_probability, memory)`, which replaces probabilities by c.
 
-    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still hold
-    it; a mode that none with any probability leads to keeps its own Gaussian.
+    Row j of the memory's weights becomes mu_(i|j). If c_j is tiny, it is computed from logarithms; a
+    mode that cannot be reached from any mode with positive probability keeps its own Gaussian.
     """
 
     def weigh_by_logarithms(end: int, log_probability: Floats, memory: InteractingMemory) -> float:
@@ -203,11 +210,12 @@ def mixing_weights(modes: int) -> FillWeights:
 
 
 def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[ToCommonTangent, MixModes]:
-    """Make the two halves of mixing the Gaussians of all modes.
+    """Make the two functions that mix the Gaussians of all modes.
 
-    Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent
-    space of the likeliest, and `mix(weights, memory, mean, covariance)`, which fills mean and covariance
-    of a mixture of them.
+    Returns:
+        `to_common_tangent(mean, covariance, probability, memory)`, which transforms the Gaussians to the
+        tangent space of the most probable mode, and `mix(weights, memory, mean, covariance)`, which
+        fills mean and covariance of a mixture of them.
     """
     add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
     reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
@@ -243,7 +251,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[ToCommonTa
 
 
 def likeliest_of(probability: Floats) -> int:
-    """Return the first mode than which none is more probable."""
+    """Return the index of the most probable mode, the first one if there are several."""
     likeliest = 0
     for mode in range(1, len(probability)):
         if probability[mode] > probability[likeliest]:

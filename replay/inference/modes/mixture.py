@@ -1,4 +1,4 @@
-"""Predicts and updates several Gaussians of one state, and the probabilities of each."""
+"""Prediction and update of several Gaussians of one state, and of their probabilities."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class ModeBelief(NamedTuple):
-    """Holds what is believed of the states, first axis = run: a Gaussian for each of M modes.
+    """Belief of all runs, the first axis: one Gaussian for each of M modes.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
-        probability, log_probability: (runs, M), of the modes.
+        probability, log_probability: (runs, M) of the modes.
     """
 
     mean: Floats
@@ -43,7 +43,7 @@ class ModeBelief(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Holds estimates as the filter fills them in, see `recursion.EstimateRows`, and probabilities."""
+    """Estimates with probabilities, which the filter fills; see `recursion.EstimateRows`."""
 
     end: Integers
     time_ns: Integers
@@ -53,7 +53,7 @@ class Mixtures(NamedTuple):
 
 
 class MixtureWork(Protocol):
-    """Holds what each Gaussian's filter works in, and what their mixture does."""
+    """Working memory of each Gaussian's filter and of their mixture."""
 
     @property
     def filters(self) -> tuple[CoreMemory, ...]: ...
@@ -62,7 +62,7 @@ class MixtureWork(Protocol):
 
 
 class PredictModes(Protocol):
-    """Predicts the Gaussian of every mode; returns whether all are well."""
+    """Function that predicts the Gaussian of every mode and returns whether all succeeded."""
 
     def __call__(
         self, belief: Gaussian, interval: Interval, memories: tuple[CoreMemory, ...], /
@@ -70,7 +70,10 @@ class PredictModes(Protocol):
 
 
 class UpdateMixture(Protocol):
-    """Updates several Gaussians and the probabilities (M,) of their modes, see `mixture_update`."""
+    """Function that updates several Gaussians and the probabilities (M,) of their modes.
+
+    See `mixture_update`.
+    """
 
     def __call__(
         self,
@@ -84,10 +87,11 @@ class UpdateMixture(Protocol):
 
 
 def predicting(filters: Sequence[Steps]) -> PredictModes:
-    """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well.
+    """Make `predict(belief, ...)`, which predicts every mode's Gaussian and returns whether all succeed.
 
-    Steps take the number of a run and Gaussians whose first axis is the run; here, and in
-    `mixture_update`, both are of one run, and the mode's number stands in its place.
+    Steps take the number of a run, and Gaussians whose first axis is the run. Here and in
+    `mixture_update`, all Gaussians belong to one run, and the number of the mode takes the place of the
+    run.
     """
     predictions = tuple(each.predict for each in filters)
 
@@ -102,17 +106,18 @@ def predicting(filters: Sequence[Steps]) -> PredictModes:
 
 
 def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateMixture:
-    """Make the update of several Gaussians by sensor `number`, and of the probabilities of their modes.
+    """Make the update of several Gaussians, and of the probabilities of their modes, by one sensor.
 
-    `update(gaussians, (probability, log_probability), ...)`, in place; see `Steps.updates`. A
-    measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
-    do not compare. The innovation that is recorded is that of the mixture, whose covariance has the
-    spread of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+    It is called as `update(gaussians, (probability, log_probability), ...)` and works in place; see
+    `Steps.updates`. A measurement within the gate of one mode is accepted by all modes, because
+    likelihoods of different measurements cannot be compared. The recorded innovation is that of the
+    mixture, whose covariance includes the spread of the modes' innovations; the log-likelihood is log
+    sum_j mu_j N(v_j; 0, S_j).
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
-        update_mode: the update of one Gaussian by it, see `Steps.updates`.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
+        update_mode: update of one Gaussian by this sensor; see `Steps.updates`.
     """
     components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
     places = tuple(components.index(name) for name in measured)
@@ -120,7 +125,7 @@ def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateM
     m, write_innovation = len(measured), writing_innovation(stage, number)
 
     def blend(probability: Floats, memory: MixtureWork, record: InnovationRecord) -> float:
-        """Note the innovation of the mixture of all modes; returns its NIS."""
+        """Record the innovation of the mixture of all modes, and return its NIS."""
         innovation, records = memory.filters[0].innovations[number], memory.mixture.records
         difference, covariance, _ = innovation
         for i in range(m):
@@ -139,7 +144,7 @@ def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateM
                 covariance[i, j] = covariance[j, i] = entry
         write_innovation(innovation, record)
         squared = whiten(innovation, drop_missing(innovation))[0]
-        if np.isnan(squared):  # singular but for digits that only factors have: the mean of the modes'
+        if np.isnan(squared):  # singular at the precision of covariances: use the mean of the modes' NIS
             squared = 0.0
             for mode in range(len(probability)):
                 squared += probability[mode] * records.numbers[mode, 0]
@@ -178,7 +183,7 @@ def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateM
         return ALL_WELL
 
     def reweigh_modes(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
-        """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
+        """Weight the modes by their likelihoods, and return the logarithm of the total likelihood."""
         highest, total = -np.inf, 0.0
         for mode in range(len(probability)):
             log_probability[mode] += numbers[mode, 1]
@@ -196,28 +201,28 @@ def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateM
 
 
 class MixtureFilter(Filter, ABC):
-    """Runs a filter whose belief is several Gaussians; puts out their probabilities beside the state."""
+    """A filter whose belief is several Gaussians, whose probabilities are a further output."""
 
     @property
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """Return what the Gaussians are of."""
+        """Names of the Gaussians."""
 
     def no_results(
         self, due: Integers, recorded: Integers, components: int
     ) -> tuple[Mixtures, InnovationRows]:
-        """Return estimates and innovations to be filled in."""
+        """Make arrays of estimates and innovations to fill."""
         (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
         probability = np.empty((len(mean), len(self.names)))
         return Mixtures(end, time_ns, mean, covariance, probability), innovations
 
     def output_streams(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
-        """Return the streams of the state and of the modes' probabilities."""
+        """Make the streams of the state and of the modes' probabilities."""
         modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
         return [self.states(EstimateRows(*mixtures[:4]), offsets), modes]
 
     def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
-        """Return the stream of the modes' probabilities (n, M)."""
+        """Make the stream of the modes' probabilities (n, M)."""
         stream = make_stream(
             f"/estimates/{self.name}/{name}",
             schemas.MODE_PROBABILITIES,

@@ -1,4 +1,4 @@
-"""Smooths the probabilities of modes, given all data of a run.
+"""Smoothing of the probabilities of modes, given all data of a run.
 
 Kim, Journal of Econometrics 60, 1994.
 """
@@ -15,25 +15,25 @@ from fuselog.replay.inference.modes.mixing import transition_matrix
 
 
 class SmoothingMemory(NamedTuple):
-    """Holds what one core works in: Pi (M, M), and the ratios of smoothed and predicted (M,)."""
+    """Working memory of one core: Pi (M, M), and ratios of smoothed to predicted probabilities (M,)."""
 
     transition: Floats
     ratio: Floats
 
 
 def smoothing_memory(modes: int) -> SmoothingMemory:
-    """Make memory for the smoothing of so many modes' probabilities."""
+    """Allocate memory for smoothing the probabilities of `modes` modes."""
     return SmoothingMemory(np.empty((modes, modes)), np.empty(modes))
 
 
 @lru_cache(maxsize=16)
 def smoothing_over_runs(modes: int) -> OverRuns:
-    """Compile `smoothing` over all runs."""
+    """Make the loop of `smoothing` over all runs, which is compiled when first called."""
     return compile_over_runs(smoothing(modes), title="the smoother of modes")
 
 
 def smoothing(modes: int) -> RunOnce:
-    """Make `smooth(run, ...)`: probabilities (n, M) given data so far become those given all of the run.
+    """Make `smooth(run, ...)`, which replaces probabilities (n, M) by those given all data of the run.
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
     """
