@@ -1,1 +1,1 @@
-"""Estimates any model's state by particles; begin with `particles`."""
+"""Particle filters for any model; begin with `particles`."""

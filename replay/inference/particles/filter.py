@@ -1,4 +1,4 @@
-"""Runs the particle filter as an estimator, seeded by a run's first measurement, and as a method."""
+"""The particle filter as an estimator, which is seeded by a run's first measurement, and as a method."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -47,18 +47,18 @@ MOST_PARTICLES = 1_000_000
 
 
 class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
-    """States the number of particles, and when they are resampled.
+    """Number of particles, and when they are resampled.
 
     Random numbers depend on `seed` and on the run's first measurement.
 
     Attributes:
         particles: number of particles.
-        resample_below: particles are resampled where their effective number, 1 / sum w^2, is below this
-            share of all.
+        resample_below: fraction of the particles; they are resampled if their effective number, 1 / sum
+            w^2, is lower.
         seed: seed of the random numbers.
-        cloud: whether every estimate comes with all its particles.
-        progressive: whether a measurement that would leave fewer effective ones than `resample_below`
-            is taken in by parts, and particles are spread by a Gaussian kernel where they are resampled.
+        cloud: whether to also write all particles of every estimate.
+        progressive: whether to process a measurement in several parts if it would reduce the effective
+            number below `resample_below`, and to spread resampled particles by a Gaussian kernel.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000
@@ -80,9 +80,9 @@ def particle_steps(stage: Stage, particles: int, resample_below: float, *, progr
     """Make the steps of a bootstrap filter.
 
     Args:
-        stage: the model as the method takes it.
-        particles: how many.
-        resample_below: the share of them; they are resampled where fewer are effective.
+        stage: the bound model.
+        particles: number of particles.
+        resample_below: fraction of effective particles below which they are resampled.
         progressive: see `ParticleParameters`.
     """
     model, motion, sensors = stage.model, stage.motion, stage.sensors
@@ -130,10 +130,10 @@ _draw_normals = compiled(fill_normals)
 
 
 class ParticleFilter(Filter):
-    """Runs a filter whose runs begin when their first measurement, which seeds them, is there."""
+    """A particle filter, whose runs start when their first measurement arrives, which seeds them."""
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Return the state at every run's prior, see `Filter.start`."""
+        """Make the state at every run's prior; see `Filter.start`."""
         state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
@@ -155,7 +155,7 @@ class ParticleFilter(Filter):
         return "all particles would have to be kept for every message of the window"
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Filter events of the runs in which something was measured; those of the others wait."""
+        """Filter the events of runs that have a measurement; the events of other runs wait."""
         if state.kept is not None:
             events = join_events(state.kept, events)
         sensed = np.flatnonzero(events.source >= 0)
@@ -171,7 +171,7 @@ class ParticleFilter(Filter):
         return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
-        """Say on the topic `started` of runs that begin at these rows which parameters cannot change."""
+        """Report on the topic `started` which parameters of newly started runs cannot change."""
         options = self.parameters
         moving = {*(options.estimate_time_s or ())}
         moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
@@ -191,7 +191,7 @@ class ParticleFilter(Filter):
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter what waited for a control or a measurement that did not come.
+        """Filter events that wait for a control or a measurement; the prior then seeds the run.
 
         Then the prior seeds the run.
         """
@@ -223,7 +223,7 @@ class ParticleFilter(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Clouds, InnovationRows]:
-        """Make estimates, with particles where they are wanted, and innovations to be filled in."""
+        """Make arrays of estimates, with particles if requested, and of innovations to fill."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.stage.model.size))
@@ -231,7 +231,7 @@ class ParticleFilter(Filter):
         return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
     def output_streams(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
-        """Make the streams of estimates, of the effective number and, where wanted, of particles."""
+        """Make the streams of estimates, of the effective number and, if requested, of particles."""
         model, (rows, particles) = self.stage.model, clouds.weight.shape
         stem = f"/estimates/{self.name}"
         effective = make_stream(
@@ -265,14 +265,14 @@ class ParticleFilter(Filter):
 
 
 def draw(model: Model, cloud: Cloud, run: int) -> int:
-    """Draw the particles of a run from its prior; returns its counter after that."""
+    """Draw the particles of a run from its prior, and return its counter."""
     states, t = cloud.states[run], model.tangent
     numbers = np.empty(-(-len(states) * t // WORDS) * WORDS)
     counter = _draw_normals(numbers, np.empty(len(numbers), np.uint64), cloud.key[run], 0)
     lower = np.linalg.cholesky(cloud.prior.covariance[run])
     drawn = numbers[: len(states) * t].reshape(len(states), t)
     states[:] = cloud.prior.mean[run]
-    # not by the matrix product, whose round-off depends on the number of cores
+    # not a matrix product, whose rounding depends on the number of cores
     boxplus(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
     return counter
 
@@ -290,7 +290,7 @@ def _made_for(parameters: ParticleParameters) -> Method:
 
 
 def _lacks_likelihood(model: Model) -> str:
-    """Return a sensor whose noise enters other than linearly, and which states no likelihood."""
+    """Name a sensor whose noise does not enter linearly and that has no likelihood function."""
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
@@ -305,7 +305,7 @@ def _lacks_likelihood(model: Model) -> str:
                     )
                     for k in range(3)
                 ]
-            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
+            except Exception:  # reported when the model is bound, see `validation.check_sensor`
                 continue
         if not np.allclose(at[2] - at[1], at[1] - at[0], rtol=1e-9, atol=1e-9, equal_nan=True):
             return f"a likelihood of its sensor {sensor.topic}"

@@ -1,8 +1,8 @@
-"""Predicts and resamples the bootstrap particle filter: every particle moves with noise of its own.
+"""Prediction and resampling of the bootstrap particle filter, in which every particle has its own noise.
 
-Wherever noise enters, by addition, through the control or by the motion itself, it is drawn. What was
-measured weighs the particles by its likelihood; they are resampled before a prediction where few of them
-count. Mean and covariance are those of the weighted particles, in the tangent space.
+All noise is drawn, whether it enters by addition, through the control or in the motion. A measurement
+weights the particles by its likelihood; they are resampled before a prediction if few of them are
+effective. Mean and covariance are those of the weighted particles, in the tangent space.
 
 Gordon, Salmond and Smith, IEE Proceedings F 140(2), 1993; systematic resampling: Kitagawa 1996.
 """
@@ -34,15 +34,16 @@ from fuselog.replay.inference.sampling.resampling import choose_systematically
 
 
 class Cloud(NamedTuple):
-    """Holds the particles of all runs; first axis = run.
+    """The particles of all runs; the first axis is the run.
 
     Attributes:
-        prior: what they are drawn from.
+        prior: Gaussian that the particles are drawn from.
         states: (runs, N, n).
-        weight: (runs, N), of sum 1.
-        offsets, shift: (runs, N, t), (runs, t) to work in: the states as seen from their mean.
-        key, counter: (runs, 2), (runs,) of the run's random numbers; the counter is 0 where nothing was
-            drawn yet.
+        weight: (runs, N), with sum 1.
+        offsets, shift: (runs, N, t), (runs, t) working memory: tangent vectors from the mean to the
+        states.
+        key, counter: (runs, 2), (runs,) state of the run's random generator; the counter is 0 before the
+        first draw.
     """
 
     prior: Gaussian
@@ -55,7 +56,7 @@ class Cloud(NamedTuple):
 
 
 class Clouds(NamedTuple):
-    """Holds estimates as the recursion fills them in (`recursion.EstimateRows`), with particles or none.
+    """Estimates that the recursion fills (`recursion.EstimateRows`), with or without particles.
 
     `effective` (n,) is the effective number of particles.
     """
@@ -70,14 +71,15 @@ class Clouds(NamedTuple):
 
 
 class SensorMemory(NamedTuple):
-    """Holds what the update by one sensor of m components works in.
+    """Working memory of the update by one sensor of m components.
 
     Attributes:
-        innovation: of the cloud as a whole.
-        differences: (N, m) measured less predicted.
-        noise: (1 or N, m, m) its covariance, then its factor; one for each particle where it differs.
+        innovation: innovation of the cloud as a whole.
+        differences: (N, m) measurement minus prediction.
+        noise: (1 or N, m, m) covariance of the noise, later its factor; one for each particle if they
+            differ.
         determinant: (1 or N,) log det of the covariance.
-        kept: (m,) the components that are used.
+        kept: (m,) indices of the components that are used.
     """
 
     innovation: Innovation
@@ -88,12 +90,13 @@ class SensorMemory(NamedTuple):
 
 
 class Kernel(NamedTuple):
-    """Holds what resampled particles are spread with, see `progressive`.
+    """Working memory to spread resampled particles; see `progressive`.
 
     Attributes:
-        width: of the Gaussian kernel, as a share of the cloud's own deviation.
-        numbers, words, drawn: normals, what they are made of, and normals as (N, t).
-        mean, covariance: (n,), (t, t) of the cloud, then the factor of that.
+        width: width of the Gaussian kernel, relative to the standard deviation of the cloud.
+        numbers, words, drawn: normal random numbers, the words they are made from, and the numbers as
+        (N, t).
+        mean, covariance: (n,), (t, t) of the cloud; the covariance is later replaced by its factor.
         trial: (N,) weights.
     """
 
@@ -107,18 +110,19 @@ class Kernel(NamedTuple):
 
 
 class ParticleMemory(NamedTuple):
-    """Holds what the steps of one core work in.
+    """Working memory of the steps of one core.
 
     Attributes:
-        least_effective: the effective number below which particles are resampled.
-        numbers, words, drawn: normals, what they are made of, and normals as (N, noises of the motion).
-        control, noise: (controls,), (noises of the motion,) as drawn for one particle.
+        least_effective: effective number below which particles are resampled.
+        numbers, words, drawn: normal random numbers, the words they are made from, and the numbers as
+        (N, noises of the motion).
+        control, noise: (controls,), (noises of the motion,) drawn for one particle.
         lower: (t, t) factor of the covariance of additive noise.
         chosen, spare: (N,), (N, n) for resampling.
         likelihood: (N,) logarithms.
         sensors: one for each sensor.
-        work: for derivatives by noise.
-        kernel: to spread them; of no particles where they are not.
+        work: workspace for derivatives by noise.
+        kernel: memory to spread the particles; for zero particles if it is not used.
     """
 
     least_effective: float
@@ -137,19 +141,19 @@ class ParticleMemory(NamedTuple):
 
 
 class Renew(Protocol):
-    """Resamples the particles of a run; returns whether all is well."""
+    """Function that resamples the particles of a run and returns whether it succeeded."""
 
     def __call__(self, run: int, cloud: Cloud, memory: ParticleMemory, /) -> bool: ...
 
 
 class Drive(Protocol):
-    """Gives a particle's control (controls,)."""
+    """Function that returns a particle's control (controls,)."""
 
     def __call__(self, interval: Interval, drawn: Floats, memory: ParticleMemory, /) -> Numbers: ...
 
 
 class MoveParticle(Protocol):
-    """Gives a state (n,) after the motion, with noise that is drawn."""
+    """Function that returns a state (n,) after the motion, including drawn noise."""
 
     def __call__(
         self,
@@ -163,7 +167,10 @@ class MoveParticle(Protocol):
 
 
 class SpreadParticles(Protocol):
-    """Fills offsets (N, t) with draws of the additive noise at states (N, n); False if it is none."""
+    """Function that fills offsets (N, t) with draws of the additive noise at states (N, n).
+
+    It returns False if a covariance is not positive semidefinite.
+    """
 
     def __call__(
         self, states: Floats, offsets: Floats, interval: Interval, memory: ParticleMemory, /
@@ -171,12 +178,12 @@ class SpreadParticles(Protocol):
 
 
 def moving(stage: Stage, by_control: int, renew: Renew) -> PredictRun:
-    """Make the prediction: every particle moves with noise of its own, after resampling where due.
+    """Make the prediction, in which every particle moves with its own noise after any resampling.
 
     Args:
-        stage: the model as the method takes it.
-        by_control: how many of a particle's draws, the first ones, are errors of the control.
-        renew: `renew(run, cloud, memory)` resamples, and says whether all is well.
+        stage: the bound model.
+        by_control: number of a particle's draws, at the start, that are errors of the control.
+        renew: `renew(run, cloud, memory)` resamples and returns whether it succeeded.
     """
     model, motion = stage.model, stage.motion
     read_state, fill, add = tuple_of(model.size), filling(model.size), boxplus(model.kinds)
@@ -205,21 +212,21 @@ def moving(stage: Stage, by_control: int, renew: Renew) -> PredictRun:
 
 
 def resampling(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
-    """Resample, and leave the particles where they are; returns True."""
+    """Resample without moving the particles, and return True."""
     states, weight, key = cloud.states[run], cloud.weight[run], cloud.key[run]
     cloud.counter[run] = resample(states, weight, key, cloud.counter[run], memory)
     return True
 
 
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
-    """Resample, so that all weigh the same; returns the counter after it.
+    """Resample the particles, so that all have the same weight, and return the new counter.
 
     Args:
         states: (N, n).
         weight: (N,).
-        key: (2,) of the run.
-        counter: of its generator.
-        memory: to work in.
+        key: (2,) key of the run's random generator.
+        counter: counter of the generator.
+        memory: working memory.
     """
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
     for i in range(len(weight)):
@@ -230,7 +237,7 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
 
 
 def effective_number(weight: Floats) -> float:
-    """Count how many particles of equal weight are worth as much as these (N,): 1 / sum w^2."""
+    """Compute the effective number 1 / sum w^2 of particles with these weights (N,)."""
     squared = 0.0
     for i in range(len(weight)):
         squared += weight[i] * weight[i]
@@ -238,17 +245,17 @@ def effective_number(weight: Floats) -> float:
 
 
 def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
-    """Multiply weights of sum 1 by a power of likelihoods, and norm them.
+    """Multiply weights of sum 1 by a power of likelihoods, and normalize them.
 
-    Where a likelihood is NaN, the particle gets the mean of the others.
+    A particle whose likelihood is NaN gets the mean of the others.
 
     Args:
         weight: (N,), changed in place.
-        likelihood: (N,), logarithms.
-        power: of the likelihoods.
+        likelihood: (N,) logarithms.
+        power: exponent of the likelihoods.
 
     Returns:
-        log sum w p^power; NaN, and weights of no use, where none is above zero.
+        log sum w p^power; NaN, with meaningless weights, if no likelihood is positive.
     """
     best = -np.inf
     for i in range(len(weight)):
@@ -267,7 +274,7 @@ def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
 
 
 def _driving(stage: Stage) -> Drive:
-    """Make `drive(interval, drawn, memory)`: a particle's control, as a tuple."""
+    """Make `drive(interval, drawn, memory)`, which returns a particle's control as a tuple."""
     controls, variances = stage.model.controls, stage.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
@@ -287,7 +294,7 @@ def _driving(stage: Stage) -> Drive:
 
 
 def _moved(stage: Stage, first: int) -> MoveParticle:
-    """Make `moved(state, driven, drawn, interval, memory)`: a state after the motion."""
+    """Make `moved(state, driven, drawn, interval, memory)`, which returns a state after the motion."""
     move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
     if not noises:
 
@@ -317,10 +324,11 @@ def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: Parti
 
 
 def _additive_noise(stage: Stage, first: int) -> SpreadParticles:
-    """Make `spread(states, offsets, interval, memory)`: draws of the additive noise.
+    """Make `spread(states, offsets, interval, memory)`, which draws the additive noise.
 
-    They are tangent vectors, at the states before they move. Noise is factored anew only where it is
-    not that of the particle before. False where a covariance is not positive semidefinite.
+    The draws are tangent vectors at the states before they move. The noise is factored only if it
+    differs from that of the previous particle. The function returns False if a covariance is not
+    positive semidefinite.
     """
     t, noise = stage.model.tangent, stage.motion.noise
     assert noise is not None
@@ -353,7 +361,7 @@ def _additive_noise(stage: Stage, first: int) -> SpreadParticles:
 
 
 def summing_up(model: Model) -> EstimateRun:
-    """Make the estimate: intrinsic mean and covariance of weighted particles, and these where wanted."""
+    """Make the estimate: intrinsic mean and covariance, and the particles if requested."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)
     weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}
@@ -371,7 +379,7 @@ def summing_up(model: Model) -> EstimateRun:
             settle(weight, offsets, mean, shift)
             moments(weight, offsets, offsets, shift, covariance, covariance)
         clouds.effective[row] = effective_number(weight)
-        kept = clouds.states.shape[1]  # all particles, or none where they are not wanted
+        kept = clouds.states.shape[1]  # all particles, or zero if they are not requested
         clouds.weight[row] = weight[:kept]
         clouds.states[row] = states[:kept]
 

@@ -1,9 +1,10 @@
-"""Takes measurements in by parts, and spreads resampled particles: good ones do not stay few.
+"""Progressive particle updates, which process a measurement in parts and spread resampled particles.
 
-A measurement far narrower than the cloud leaves a handful of particles, and without noise of the motion
-all later ones are copies of these. So its likelihood is raised to a power that leaves enough of them
-effective, they are resampled, and the rest of it follows. Resampled particles are drawn of a Gaussian
-kernel around each, shrunk to their mean so that mean and covariance stay.
+A measurement that is much narrower than the cloud leaves only a few particles, and without noise of the
+motion all later ones are copies of these. Therefore the likelihood is raised to a power that leaves
+enough particles effective, the particles are resampled, and the rest of the likelihood follows.
+Resampled particles are drawn from a Gaussian kernel around each, shrunk towards their mean so that mean
+and covariance stay the same.
 
 Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised particle filters", 2001, in
 Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
@@ -31,15 +32,15 @@ from fuselog.replay.inference.particles.particles import (
     reweigh,
 )
 
-MOST_PARTS = 100  # of one measurement
-_HALVINGS = 10  # of the interval in which the power lies, and more where it is less than all of these
+MOST_PARTS = 100  # maximum number of parts of one measurement
+_HALVINGS = 10  # bisections of the interval of the power; more if the power is below all of these
 _MOST_HALVINGS = 60
 
 
 def kernel_of(particles: int, n: int, t: int) -> Kernel:
-    """Make what so many particles of n components and t tangent ones are spread with.
+    """Allocate memory to spread particles with n components and t tangent components.
 
-    The width is the best one for Gaussians: Silverman, Density Estimation, 1986, eq. 4.14.
+    The width is optimal for Gaussians: Silverman, Density Estimation, 1986, eq. 4.14.
     """
     size = -(-particles * t // WORDS) * WORDS
     numbers = np.empty(size)
@@ -55,9 +56,9 @@ def kernel_of(particles: int, n: int, t: int) -> Kernel:
 
 
 def renewing(model: Model) -> Renew:
-    """Make `renew(run, cloud, memory)`: it resamples, and spreads what it has resampled.
+    """Make `renew(run, cloud, memory)`, which resamples particles and spreads them.
 
-    Returns False where the covariance of the particles is no covariance.
+    It returns False if the covariance of the particles is not positive semidefinite.
     """
     t = model.tangent
     subtract, add, settle = boxminus(model.kinds), boxplus(model.kinds), settling(model.kinds)
@@ -90,7 +91,10 @@ def renewing(model: Model) -> Renew:
 
 
 class Look(Protocol):
-    """Prepares the likelihood for particles that moved; returns how many components it uses."""
+    """Function that prepares the likelihood for moved particles.
+
+    It returns the number of components that are used.
+    """
 
     def __call__(
         self, states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int, /
@@ -98,7 +102,7 @@ class Look(Protocol):
 
 
 class Likelihood(Protocol):
-    """Gives log p at particle i of states (N, n); NaN where that does not predict the measurement."""
+    """Function that returns log p at particle i of states (N, n); NaN if it predicts no measurement."""
 
     def __call__(
         self, states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int, /
@@ -106,7 +110,7 @@ class Likelihood(Protocol):
 
 
 class Take(Protocol):
-    """Weighs and moves the particles of a run by a measurement, see `taking_in_parts`."""
+    """Function that weights and moves the particles of a run by a measurement; see `taking_in_parts`."""
 
     def __call__(
         self,
@@ -122,16 +126,16 @@ class Take(Protocol):
 
 
 def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
-    """Make `take(run, cloud, data, parameters, memory, own, kept)`: it weighs and moves the particles.
+    """Make `take(run, cloud, data, parameters, memory, own, kept)`, which weights and moves particles.
 
-    Returns the log-likelihood, NaN where no particle explains what was measured, and whether all is
-    well otherwise.
+    It returns the log-likelihood, NaN if no particle explains the measurement, and whether everything
+    else succeeded.
 
     Args:
-        model: whose state the particles have.
-        look: `look(states, data, parameters, memory, kept)` prepares what the likelihood needs of
-            particles that moved, and says how many components are used.
-        likelihood: log p at one particle, see `update.weighing`.
+        model: model whose state the particles have.
+        look: `look(states, data, parameters, memory, kept)` prepares what the likelihood needs for moved
+            particles and returns the number of components that are used.
+        likelihood: log p at one particle; see `update.weighing`.
     """
     renew = renewing(model)
 
@@ -167,7 +171,7 @@ def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
 
 
 def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemory) -> float:
-    """Find the largest power up to what is left that leaves enough particles effective."""
+    """Find the largest power, at most `left`, that leaves enough particles effective."""
     least = memory.least_effective
     if not effective_after(weight, likelihood, left, memory.kernel.trial) < least:
         return left
@@ -184,11 +188,11 @@ def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemo
 
 
 def effective_after(weight: Floats, likelihood: Floats, power: float, trial: Floats) -> float:
-    """Count the effective particles after a power of the likelihoods.
+    """Compute the effective number of particles after weighting by a power of the likelihoods.
 
     Args:
-        weight, likelihood, power: as for `reweigh`, but the weights stay.
-        trial: (N,), to work in.
+        weight, likelihood, power: as for `reweigh`, but the weights are not changed.
+        trial: (N,) working memory.
     """
     trial[:] = weight
     reweigh(trial, likelihood, power)

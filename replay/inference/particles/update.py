@@ -1,4 +1,4 @@
-"""Updates particles: weighs each by the likelihood of what was measured."""
+"""Update of particles, which weights each by the likelihood of the measurement."""
 
 from typing import Protocol
 
@@ -38,7 +38,7 @@ from fuselog.replay.inference.particles.progressive import Likelihood, Look, Tak
 
 
 class CompareParticles(Protocol):
-    """Fills a sensor's differences at particles (N, n), and its noise."""
+    """Function that fills a sensor's differences at particles (N, n), and its noise."""
 
     def __call__(
         self, states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, /
@@ -46,16 +46,16 @@ class CompareParticles(Protocol):
 
 
 def weighing(stage: Stage, number: int, *, progressive: bool) -> UpdateRun:
-    """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
+    """Make the update by sensor `number`, which weights particles by the likelihood of the measurement.
 
-    The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
+    The recorded innovation, its NIS and the gate use the first two moments of the cloud; the
     log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
-    and a particle that lacks another one keeps its share of the weight.
+    and a particle that does not predict one of the others keeps its share of the weight.
 
     Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
-        progressive: whether a measurement is taken in by parts.
+        stage: the bound model, with the sensors of the log.
+        number: number of the sensor among these.
+        progressive: whether a measurement may be processed in parts.
     """
     sensor = stage.sensors[number]
     m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
@@ -99,7 +99,7 @@ def weighing(stage: Stage, number: int, *, progressive: bool) -> UpdateRun:
 
 
 def _at_once(likelihood: Likelihood) -> Take:
-    """Make `take`, see `taking_in_parts`, of a measurement that is taken in at once."""
+    """Make `take`, see `taking_in_parts`, which processes a measurement as a whole."""
 
     def take(
         run: int,
@@ -119,7 +119,7 @@ def _at_once(likelihood: Likelihood) -> Take:
 
 
 def _looking(compare: CompareParticles, number: int) -> Look:
-    """Make `look`, see `taking_in_parts`, where the likelihood is that of Gaussian noise."""
+    """Make `look`, see `taking_in_parts`, for the likelihood of Gaussian noise."""
 
     def look(
         states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int
@@ -135,12 +135,12 @@ def _looking(compare: CompareParticles, number: int) -> Look:
 def _as_before(
     states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int
 ) -> int:
-    """Prepare nothing, for a likelihood that asks for nothing but the state."""
+    """Return `kept`, for a likelihood that depends only on the state and needs no preparation."""
     return kept
 
 
 def _comparing(stage: Stage, number: int) -> CompareParticles:
-    """Make `compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
+    """Make `compare(states, data, parameters, memory)`, which fills a sensor's differences and noise."""
     model, sensor = stage.model, stage.sensors[number]
     measure, fill = sensor.measure, filling(len(sensor.measured))
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
@@ -180,7 +180,7 @@ def _comparing(stage: Stage, number: int) -> CompareParticles:
 
 
 def keep_predicted(own: SensorMemory) -> int:
-    """Note the components that are measured and that some particle predicts; returns how many."""
+    """Store the measured components that at least one particle predicts, and return their number."""
     size = 0
     for j in range(len(own.kept)):
         for i in range(len(own.differences)):
@@ -192,7 +192,7 @@ def keep_predicted(own: SensorMemory) -> int:
 
 
 def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
-    """Tell whether a particle predicts all components that are used."""
+    """Test whether a particle predicts all components that are used."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
             return False
@@ -200,15 +200,15 @@ def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
 
 
 def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, ...]) -> None:
-    """Fill the innovation of the cloud: mean and covariance of the differences, and the noise.
+    """Fill the innovation of the cloud: mean and covariance of the differences, plus the noise.
 
-    The differences are taken from that of the first particle which has one, where no angle is cut.
+    Angles are unwrapped relative to the difference of the first particle that has one.
 
     Args:
         weight: (N,).
-        own: the sensor's memory, with differences and noise.
-        size: how many components are used.
-        angular: (m,) which are angles.
+        own: memory of the sensor, with differences and noise.
+        size: number of components that are used.
+        angular: (m,) which components are angles.
     """
     mean, spread, _ = own.innovation
     mean[:], spread[:, :] = np.nan, 0.0
@@ -241,9 +241,9 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
 
 
 def factor_kept(own: SensorMemory, size: int) -> None:
-    """Factor the noise of the components that are used, at the front, with log det.
+    """Factor the noise of the components that are used, move it to the front, and compute log det.
 
-    That is NaN where the covariance is not positive definite.
+    The latter is NaN if the covariance is not positive definite.
     """
     for number in range(len(own.noise)):
         noise, determinant = own.noise[number], 1.0
@@ -259,9 +259,10 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 
 
 def _likelihood(stage: Stage, number: int) -> Likelihood:
-    """Make `likelihood(states, i, data, parameters, own, size)`: log p of the measurement at particle i.
+    """Make `likelihood(states, i, data, parameters, own, size)`: log p of a measurement at particle i.
 
-    The model's own, or that of Gaussian noise; NaN where the particle does not predict it.
+    This is the model's own likelihood, or that of Gaussian noise; NaN if the particle does not predict
+    the measurement.
     """
     sensor = stage.sensors[number]
     if sensor.log_likelihood is None:
@@ -280,15 +281,15 @@ def _likelihood(stage: Stage, number: int) -> Likelihood:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int
 ) -> float:
-    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v.
+    """Compute log p of Gaussian noise, see `inflation`; the difference is replaced by L^-1 v.
 
     Args:
-        states: (N, n), not read: the differences are known.
-        i: which particle.
-        data: (width,), of the event; not read.
-        parameters: the sensor's row, for `inflation`.
-        own: the sensor's memory, with differences and the factors of noise.
-        size: how many components are used.
+        states: (N, n), not used: the differences are known.
+        i: index of the particle.
+        data: (width,) data of the event, not used.
+        parameters: parameters of the sensor, for `inflation`.
+        own: memory of the sensor, with differences and the factors of noise.
+        size: number of components that are used.
     """
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
