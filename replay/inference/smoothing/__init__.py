@@ -1,4 +1,4 @@
-"""Smooths by a backward pass over a filter, or by iteration, and computes the posterior bound.
+"""Smoothers with a backward pass over a filter or with iteration, and the posterior bound.
 
 Begin with `backward_pass`.
 """

@@ -1,13 +1,13 @@
-"""Filters about a trajectory with affine steps: the forward pass of Gauss-Newton.
+"""Affine filter about a trajectory: the forward pass of a Gauss-Newton iteration.
 
-With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
-vectors d_k from there, which lie in flat space:
+With motion and sensors linearized at the latest states x_k of a run, the unknowns are the tangent
+vectors d_k from these, which are in flat space:
 
     d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
 
-with the rotation E and the right Jacobian Jr, units but for orientations. No inverse of Q is needed:
-where it is singular, x_k keeps to what noise can reach, and the cost is that of the noise. A robust loss
-takes part by reweighting.
+with the rotation E and the right Jacobian Jr, which are identities except for orientations. No inverse
+of Q is needed: if it is singular, x_k is restricted to what noise can reach, and the cost is that of the
+noise. A robust loss is applied by reweighting.
 
 Bell, SIAM J. Optim. 4(3), 1994.
 """
@@ -52,14 +52,15 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 )
 
 LOSSES = ("square", "huber", "cauchy")
-NOTHING_LEFT = 1e-12  # of a variance, beside what other components say of it
+NOTHING_LEFT = 1e-12  # fraction of a variance that counts as zero after conditioning on other components
 
 
 class Factors(NamedTuple):
-    """Holds covariances of steps as `factor_by_pivots` gives them, first axis = step.
+    """Covariances of steps as factored by `factor_by_pivots`; the first axis is the step.
 
     Attributes:
-        factor, order, rank: (steps, t, t), (steps, t), (steps,); a rank of -1 where none is known.
+        factor, order, rank: (steps, t, t), (steps, t), (steps,); the rank is -1 if the factor is
+        unknown.
     """
 
     factor: Floats
@@ -68,25 +69,26 @@ class Factors(NamedTuple):
 
 
 def no_factors(count: int, t: int) -> Factors:
-    """Make factors of so many steps, of which none is known."""
+    """Allocate unknown factors for `count` steps."""
     return Factors(np.empty((count, t, t)), np.empty((count, t), np.int64), np.full(count, -1))
 
 
 class Trajectory(NamedTuple):
-    """Holds where everything is linearised, and what a pass over it finds.
+    """Trajectory at which everything is linearized, and results of a pass over it.
 
     Attributes:
-        mean: (nodes, n) the states.
-        noises: of the steps to all nodes, as the pass before found them: there the cost was the least,
-            or the pass goes over the same states once more.
-        kept: (nodes, n) the states of the least cost so far.
-        node: (events,) of every event the node of its stamp.
-        scale: (nodes, t) variances of the start; over the damping those of the states as they stand.
-        loss: (2,) an index of LOSSES, and its scale.
-        damping: (1,) of this pass.
-        cost, held: (1,) of the trajectory, with the noise as it is there and as it is at `kept`.
-        noise, found: (t, t) the covariance of a step, and its factor.
-        offset, column: (1, t), (t,).
+        mean: (nodes, n) states.
+        noises: noises of the steps to all nodes, as found in the previous pass; that pass had the least
+            cost, or this pass uses the same states again.
+        kept: (nodes, n) states of the least cost so far.
+        node: (events,) node of each event's stamp.
+        scale: (nodes, t) variances of the start; divided by the damping, they are the variances with
+            which damping measures the current states.
+        loss: (2,) index in LOSSES, and scale of the loss.
+        damping: (1,) damping of this pass.
+        cost, held: (1,) costs of the trajectory, with its own noise and with the noise at `kept`.
+        noise, found: (t, t) covariance of a step, and its factor.
+        offset, column: (1, t), (t,) working memory.
     """
 
     mean: Floats
@@ -105,7 +107,7 @@ class Trajectory(NamedTuple):
 
 
 def affine_steps(stage: Stage) -> Steps:
-    """Make the steps of the affine filter about a `Trajectory`, the only one of `memory`'s sets."""
+    """Make the steps of the affine filter about a `Trajectory`, which is the only set of `memory`."""
     sensors = tuple(affine_sensor(stage, number) for number in range(len(stage.sensors)))
     steps = gaussian_filter(stage, affine_motion(stage), sensors, partial(workspace, stage))
     chained = smoothing_steps(stage, steps)
@@ -122,12 +124,12 @@ def affine_steps(stage: Stage) -> Steps:
 
 
 def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) -> None:
-    """Measure every component of the state as it stands, one after the other, in place.
+    """Apply damping: measure each component of the state as it is, one after the other, in place.
 
     Args:
-        mean, covariance: (t,), about the trajectory's state in its tangent space; (t, t).
-        trajectory: with the damping, and the variances of the start.
-        node: where the state is.
+        mean, covariance: (t,), (t, t) in the tangent space at the trajectory's state.
+        trajectory: trajectory with the damping and the variances of the start.
+        node: index of the state.
     """
     damping, column = trajectory.damping[0], trajectory.column
     if damping == 0.0:
@@ -140,7 +142,7 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
 
 
 def affine_motion(stage: Stage) -> Predict:
-    """Make the prediction of the tangent vector at one stamp to that at the next."""
+    """Make the prediction of the tangent vector from one stamp to the next."""
     model, motion = stage.model, stage.motion
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
@@ -177,21 +179,22 @@ def affine_motion(stage: Stage) -> Predict:
 
 
 class Carry(Protocol):
-    """Multiplies rows (t, m) by E(-offset), by way of `step`; offset and step are (t,)."""
+    """Function that multiplies rows (t, m) by E(-offset); offset and working memory step are (t,)."""
 
     def __call__(self, offset: Floats, rows: Floats, step: Floats, /) -> None: ...
 
 
 class Reach(Protocol):
-    """Finds how far a node's state is from its origin (n,); returns False if that is unknown."""
+    """Function that computes a node's offset from its origin (n,) and returns whether it is known."""
 
     def __call__(self, trajectory: "Trajectory", node: int, origin: Floats, /) -> bool: ...
 
 
 def carrying(kinds: tuple[str, ...]) -> Carry:
-    """Make `carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
+    """Make `carry(offset, rows, step)`, which multiplies rows (t, m) by E(-offset).
 
-    Takes tangent vectors at one state to those at the state that lies `offset` from it.
+    It transforms tangent vectors at one state to those at the state that differs by `offset`. `step` is
+    working memory.
     """
     turn, turn_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
 
@@ -205,10 +208,11 @@ def carrying(kinds: tuple[str, ...]) -> Carry:
 
 
 def reaching(kinds: tuple[str, ...]) -> Reach:
-    """Make `reach(trajectory, node, origin)`: how far a state is from its origin; False if unknown.
+    """Make `reach(trajectory, node, origin)`, which computes a state's offset from its origin.
 
-    Fills `offset`, and adds its square in units of the noise to the costs. Where noise has no part the
-    state is moved to what it can reach.
+    It fills `offset`, and adds its square in units of the noise to the costs. In directions without
+    noise, the state is moved to where noise can reach. It returns False if the offset or its cost is
+    undefined.
     """
     add, subtract = boxplus(kinds), boxminus(kinds)
 
@@ -241,13 +245,13 @@ def reaching(kinds: tuple[str, ...]) -> Reach:
 
 
 def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Floats) -> float:
-    """Compute the square of an offset in units of a noise, where that has a part; fills `whitened`.
+    """Compute the square of an offset in units of a noise, restricted to the directions of the noise.
 
     Args:
         offset: (t,).
-        factors: of the covariances of all steps.
-        step: which of them.
-        whitened: (t,), of which the first rank entries are filled.
+        factors: factors of the covariances of all steps.
+        step: index of the step.
+        whitened: (t,) whose first rank entries are filled.
     """
     factor, order, squared = factors.factor[step], factors.order[step], 0.0
     for k in range(factors.rank[step]):
@@ -260,19 +264,19 @@ def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Float
 
 
 def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floats) -> int:
-    """Factor a positive semidefinite matrix by Cholesky, pivoted.
+    """Compute the pivoted Cholesky factor of a positive semidefinite matrix.
 
-    The row with the largest share of its diagonal entry left comes next; shares below NOTHING_LEFT are
-    round-off.
+    The next row is that with the largest remaining fraction of its diagonal entry; fractions below
+    NOTHING_LEFT are rounding errors.
 
     Args:
         matrix: (t, t).
-        factor: (t, t), filled in its first columns, as many as the rank.
+        factor: (t, t) whose first rank columns are filled.
         order: (t,), filled: row order[k] of the factor ends in column k.
-        left: (t,), to work in.
+        left: (t,) working memory.
 
     Returns:
-        The rank, or -1 where the matrix is not positive semidefinite.
+        The rank, or -1 if the matrix is not positive semidefinite.
     """
     size = len(matrix)
     for row in range(size):
@@ -342,18 +346,18 @@ def affine_sensor(stage: Stage, number: int) -> Update:
             if not variance > 0.0:
                 return NOT_POSITIVE_DEFINITE
             scalar_update(mean, covariance, column, variance, difference)
-        return NOTHING_MEASURED  # that is of interest later: nothing is recorded
+        return NOTHING_MEASURED  # nothing is recorded in these passes
 
     return update
 
 
 def robust(squared: float, loss: Floats) -> tuple[float, float]:
-    """Compute the cost of a residual whose square is given, and the weight that has its derivative.
+    """Compute the cost of a squared residual, and the weight of its derivative.
 
     Args:
-        squared: of the whitened residual.
-        loss: (2,), 0 for squares, 1 for Huber's, 2 for Cauchy's; and the length from which on it
-            counts less.
+        squared: square of the whitened residual.
+        loss: (2,) 0 for squares, 1 for Huber, 2 for Cauchy; and the length above which residuals are
+            down-weighted.
     """
     bound = loss[1] ** 2
     if loss[0] == 1.0 and squared > bound:

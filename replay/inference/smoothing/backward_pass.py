@@ -1,14 +1,14 @@
-"""Corrects a filter's estimates by later measurements: the Rauch-Tung-Striebel backward pass.
+"""Correction of a filter's estimates by later measurements: the Rauch-Tung-Striebel backward pass.
 
-A filter goes forward. At every stamp that has an estimate, a node, it leaves its Gaussian and what ties
-it to the node before; from the last node the way leads back. For a step from k to k + 1 with the
-prediction (m-, P-) and D, the covariance of the state before with the state after it,
+In the forward pass, the filter stores a node at every stamp with an estimate: its Gaussian, and the
+relation to the previous node. The backward pass starts at the last node. For a step from k to k + 1 with
+the prediction (m-, P-) and D, the covariance of the state before the step with the state after it,
 
     G = D P-^-1,  ms_k = m_k (+) G (ms_(k+1) (-) m-),  Ps_k = (P_k - G D') + G Ps_(k+1) G'
 
-with the derivative's D for extended filters and that of the samples for the others. Several predictions
-between two nodes are one such step: their G multiply. Where the state is no vector, (+) and (-) and the
-tangent spaces of the covariances are those of `fuselog.replay.inference.model.corrections`.
+with D from the derivative for extended filters and from the samples for the others. Several predictions
+between two nodes form one such step: their G are multiplied. For states that are not vectors, (+) and
+(-) and the tangent spaces of the covariances are those of `fuselog.replay.inference.model.corrections`.
 
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
@@ -44,18 +44,18 @@ from fuselog.replay.inference.run.recursion import EstimateRows
 FOREVER_NS = np.iinfo(np.int64).max
 
 
-# The way forward
+# Forward pass
 
 
 class Chain(NamedTuple):
-    """Holds what is believed of the states, and of how they came from the last node; first axis = run.
+    """Belief of the states and their relation to the last node; the first axis is the run.
 
     Attributes:
-        mean, covariance: the filter's, (runs, n) and (runs, t, t).
-        predicted, slope: (runs, n) the last prediction, before it was corrected, and (runs, t) its
-            tangent, see `fuselog.replay.inference.model.model.Correction`.
+        mean, covariance: those of the filter, (runs, n) and (runs, t, t).
+        predicted, slope: (runs, n) last prediction before its correction, and (runs, t) its slope; see
+        `fuselog.replay.inference.model.model.Correction`.
         gain, rest: (runs, t, t) G and P - G D' of the predictions since the last node.
-        predictions: (runs,) how many these are.
+        predictions: (runs,) number of these predictions.
     """
 
     mean: Floats
@@ -68,7 +68,7 @@ class Chain(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Holds estimates as the filter fills them in, and how each came from the last; see `Chain`."""
+    """Estimates that the filter fills, and the relation of each to the previous one; see `Chain`."""
 
     end: Integers
     time_ns: Integers
@@ -81,14 +81,14 @@ class Nodes(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+    """Nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
 
     nodes: Nodes
     offsets: Integers
 
 
 class ForwardMemory(NamedTuple):
-    """Holds what the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
+    """Working memory of the steps of one core: the filter's own, and four matrices (t, t)."""
 
     filter: CoreMemory
     rest: Floats
@@ -98,11 +98,11 @@ class ForwardMemory(NamedTuple):
 
 
 def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
-    """Make the steps of a filter that leaves nodes; its `predict` fills `Workspace.product`.
+    """Make the steps of a filter that stores nodes; its `predict` must fill `Workspace.product`.
 
     Args:
-        stage: the model as the method takes it.
-        steps: those of the filter that goes forward.
+        stage: the bound model.
+        steps: steps of the forward filter.
     """
     model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
     retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
@@ -157,15 +157,15 @@ def _with_memory(update: UpdateRun) -> UpdateRun:
 def compose(
     gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
 ) -> None:
-    """Compose the steps so far with the next, which is used up: G G1, and A + G A1 G'.
+    """Compose the steps so far with the next step: G G1, and A + G A1 G'.
 
     Args:
         gain: G (t, t) of the steps so far, changed in place.
         rest: A (t, t) of the steps so far, changed in place.
-        predictions: how many steps there are so far; of none the next one is copied.
+        predictions: number of steps so far; if it is zero, the next step is copied.
         next_gain: G1 (t, t).
-        next_rest: A1 (t, t), used up.
-        product: (t, t) to work in.
+        next_rest: A1 (t, t), overwritten.
+        product: (t, t) working memory.
     """
     t = len(gain)
     if predictions == 0:
@@ -184,16 +184,16 @@ def compose(
 
 
 class Later(NamedTuple):
-    """Holds the node behind a piece: the runs that have one, and these, smoothed, a row for each run."""
+    """The node after a piece: which runs have one, and the smoothed nodes, one row per run."""
 
     is_there: Integers
     nodes: Nodes
 
 
 class Smoothed(NamedTuple):
-    """Holds what smoothing fills in: the nodes of run r before row stop[r], from row start[r] on.
+    """Results of smoothing: the nodes of run r before row stop[r] are written from row start[r] on.
 
-    Each comes back from the last node within the lag.
+    Each estimate is smoothed from the last node within the lag.
     """
 
     stop: Integers
@@ -203,7 +203,7 @@ class Smoothed(NamedTuple):
 
 
 class BackMemory(NamedTuple):
-    """Holds what the backward pass of one core works in: a Gaussian, its gain, and a step's vectors."""
+    """Working memory of the backward pass of one core: a Gaussian, its gain, and vectors of a step."""
 
     mean: Floats
     covariance: Floats
@@ -218,12 +218,12 @@ class BackMemory(NamedTuple):
 
 @lru_cache(maxsize=64)
 def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> OverRuns:
-    """Compile the same over all runs; see `backward_pass`."""
+    """Make the loop of `backward_pass` over all runs, which is compiled when first called."""
     return compile_over_runs(backward_pass(kinds, correct), title="a smoother's way back")
 
 
 class GoBack(Protocol):
-    """Smooths the nodes of one run's piece; `later` then holds the first of them."""
+    """Function that smooths the nodes of one run's piece; `later` then contains the first of them."""
 
     def __call__(
         self, run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory, /
@@ -234,14 +234,14 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
     """Make the loop over the nodes of one run, from its last to its first.
 
     Args:
-        kinds: of the state's components.
+        kinds: kinds of the state's components.
         correct: the model's own correction, if it has one.
     """
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)
 
     def go_back(mean: Floats, covariance: Floats, nodes: Nodes, node: int, work: BackMemory) -> None:
-        """Move the Gaussian of `work` from a node to the one before, whose filtered one is given."""
+        """Move the Gaussian of `work` from a node to the previous one, given its filtered Gaussian."""
         gain, rest, step, change = nodes.gain[node], nodes.rest[node], work.step, work.change[0]
         work.slope[:] = nodes.slope[node]
         compare(nodes.predicted[node], work.mean, work.covariance, work)
@@ -259,7 +259,6 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
         move(work.mean, work.covariance, work)
 
     def smooth(run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory) -> None:
-        """Smooth the nodes of a piece; `later` then holds the first of them."""
         nodes, offsets = piece
         stop, start, lag_ns, estimates = smoothed
         begin, through, reached = offsets[run], offsets[run + 1] - 1, -1
@@ -293,7 +292,7 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
 
 
 def no_later(runs: int, n: int, t: int) -> Later:
-    """Make memory where nothing lies behind a piece, for runs of states with n components.
+    """Allocate a `Later` without nodes, for runs of states with n components.
 
     See `Later`.
     """
@@ -302,6 +301,6 @@ def no_later(runs: int, n: int, t: int) -> Later:
 
 
 def back_memory(n: int, t: int) -> BackMemory:
-    """Make memory for the backward pass of states with n components, and t in the tangent space."""
+    """Allocate memory for the backward pass of states with n components, t in the tangent space."""
     shapes = (n,), (t, t), (t, t), (t, t), (1, t), (n,), (t, t), (t,), (t,)
     return BackMemory(*(np.empty(shape) for shape in shapes))

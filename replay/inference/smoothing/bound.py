@@ -1,10 +1,9 @@
-"""Computes the posterior Cramer-Rao bound: the information of the measurements along the true states.
+"""Posterior Cramer-Rao bound: the information of the measurements along the true states.
 
-At every node, a stamp that has an estimate, stands what the extended Kalman filter would have that
-linearises at the truth, of the filter (`bound`) or of the smoother (`bound:smoother`): the covariance
-along this one trajectory. It needs no inverse of the process noise, which may be singular. Beside it go
-the steps themselves, of which `fuselog.replay.judging.consistency.bounds` makes the bound over an
-ensemble.
+Each node, a stamp with an estimate, has the covariance of an extended Kalman filter that linearizes at
+the truth, or of its smoother (`bound:smoother`), along this one trajectory. This needs no inverse of the
+process noise, which may be singular. The steps themselves are also written;
+`fuselog.replay.judging.consistency.bounds` computes the bound over an ensemble from them.
 
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """
@@ -39,10 +38,10 @@ from fuselog.replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory
 
 
 class BoundParameters(MethodParameters):  # type: ignore[explicit-any]
-    """States whose bound it is, and how truth is read.
+    """The kind of bound, and how truth is read.
 
     Attributes:
-        of: whether the bound of filters or that of smoothers.
+        of: whether to compute the bound of filters or of smoothers.
         gap_limit_s: longest gap over which truth is interpolated.
     """
 
@@ -51,7 +50,7 @@ class BoundParameters(MethodParameters):  # type: ignore[explicit-any]
 
 
 class BackMemory(NamedTuple):
-    """Holds what the backward pass of one core works in: four matrices (t, t)."""
+    """Working memory of the backward pass of one core: four matrices (t, t)."""
 
     predicted: Floats
     turned: Floats
@@ -60,13 +59,13 @@ class BackMemory(NamedTuple):
 
 
 def back_memory(t: int) -> BackMemory:
-    """Make memory for the backward pass of states with t components in the tangent space."""
+    """Allocate memory for the backward pass of states with t components in the tangent space."""
     return BackMemory(*(np.empty((t, t)) for _ in BackMemory._fields))
 
 
 @lru_cache(maxsize=1)
 def smooth_over_runs() -> OverRuns:
-    """Compile `smooth` over all runs."""
+    """Make the loop of `smooth` over all runs, which is compiled when first called."""
     return compile_over_runs(smooth, title="the bound of smoothers")
 
 
@@ -78,16 +77,17 @@ def smooth(
     covariance: Floats,
     memory: BackMemory,
 ) -> None:
-    """Make covariances of a filter those of its smoother along one trajectory, in place.
+    """Replace covariances of a filter by those of its smoother along one trajectory, in place.
 
-    With the gain G = P F' P-^-1, each is P + G (Ps - P-) G', Ps being that of the node after it.
+    With the gain G = P F' P-^-1, each becomes P + G (Ps - P-) G', where Ps is that of the next node.
 
     Args:
-        run: which.
-        offsets: (runs + 1,), where the nodes of each run begin.
+        run: index of the run.
+        offsets: (runs + 1,) first node of each run.
         transition, noise: F and Q of the step to each node, (nodes, t, t).
-        covariance: (nodes, t, t), changed; NaN at its first place where P- is none.
-        memory: to work in.
+        covariance: (nodes, t, t), changed in place; its first entry is set to NaN if P- is not positive
+            definite.
+        memory: working memory.
     """
     predicted, turned, factor, product = memory
     for node in range(offsets[run + 1] - 2, offsets[run] - 1, -1):
@@ -111,7 +111,7 @@ def smooth(
 
 
 class BoundHistory(NamedTuple):
-    """Holds what is kept: the truths of all runs, which came to a node (runs,), and nodes to smooth."""
+    """Truths of all runs, whether each run has reached a node (runs,), and nodes to be smoothed."""
 
     truth: Ragged
     has_begun: Booleans
@@ -119,12 +119,12 @@ class BoundHistory(NamedTuple):
 
 
 class BoundFilter(Filter):
-    """Runs a filter that knows the truth, and puts out every step of it."""
+    """A filter that knows the truth; every step is a further output."""
 
     is_bound = True
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
-        """Return the topics of a log that it starts from; raises BadInput where it has no truth."""
+        """List the topics needed before the start; raise BadInput if the log has no truth."""
         if self.truth not in topics:
             raise BadInput(
                 f"estimator {self.name}: a bound needs the true states, and there is no topic "
@@ -138,7 +138,7 @@ class BoundFilter(Filter):
         return "a bound is that of all messages in the order of their stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Return the state at every run's prior, see `Filter.start`."""
+        """Make the state at every run's prior; see `Filter.start`."""
         state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
@@ -149,7 +149,7 @@ class BoundFilter(Filter):
         return state._replace(carried=state.carried._replace(belief=trajectory), kept=kept)
 
     def truths(self, truth: Ragged, time_ns: Integers, offsets: Integers) -> Floats:
-        """Return the true states (n, components) at stamps of the runs; NaN where there is none."""
+        """Return the true states (n, components) at stamps of the runs; NaN if unknown."""
         components = self.stage.model.state
         columns = match_components(truth.stream.metadata, components, f"topic {self.truth}")
         found = np.full((len(time_ns), len(components)), np.nan)
@@ -164,7 +164,7 @@ class BoundFilter(Filter):
     def filtered(
         self, state: FilterState, events: FilterEvents
     ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
-        """Go through events, with the truths at all of them."""
+        """Process events, with the truth at each of them."""
         truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
         after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
@@ -175,19 +175,19 @@ class BoundFilter(Filter):
         generators: tuple[Samples, ...],
         events: FilterEvents,  # noqa: ARG002
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Return all runs, and what makes a core's memory with the truths."""
+        """Yield all runs, with the function that makes a core's working memory with the truths."""
         yield None, partial(self.steps.memory, generators)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[EstimatesToFill, InnovationRows]:
-        """Return nodes and innovations to be filled in."""
+        """Make arrays of nodes and innovations to fill."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Go through events; smoothed covariances have to wait for the end."""
+        """Process events; nodes to be smoothed are stored until the end."""
         before, kept = state.carried, state.kept
         after, (nodes, offsets), made = self.filtered(state, events)
         kept, first = self.begun(before, kept, nodes, offsets)
@@ -199,14 +199,14 @@ class BoundFilter(Filter):
         return after._replace(kept=kept), made
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Return what waited for a control that does not come any more, and what is smoothed."""
+        """Process the events that still wait, and smooth the nodes if requested."""
         state, made = self.ended(state)
         if self.parameters.of == "smoother" and state.kept.nodes:
             made.append(self.smoothed(state.kept.nodes))
         return made
 
     def smoothed(self, pieces: Sequence[tuple[Nodes, Integers]]) -> Ragged:
-        """Return the estimates at all nodes, run by run."""
+        """Return the smoothed estimates at all nodes, run by run."""
         runs, t = len(pieces[0][1]) - 1, self.stage.model.tangent
         parts = [
             [column[rows[run] : rows[run + 1]] for column in nodes[1:6]]
@@ -219,7 +219,7 @@ class BoundFilter(Filter):
         return self.states(EstimateRows(offsets[1:], times, mean, covariance), offsets)
 
     def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
-        """Return the stream of true states, each with what is known of it there."""
+        """Make the stream of true states, each with the bound of its covariance."""
         found = super().states(estimates, offsets)
         metadata = {**found.stream.metadata, "bound": self.parameters.of}
         return Ragged(replace(found.stream, metadata=metadata), found.offsets)
@@ -227,10 +227,10 @@ class BoundFilter(Filter):
     def begun(
         self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
     ) -> tuple[BoundHistory, Ragged]:
-        """Make the steps to the priors of runs that come to their first node: from nothing.
+        """Make the steps to the priors of runs that reach their first node.
 
-        The noise of such a step is the prior's covariance. Where the first node has the prior's stamp,
-        it is the one that comes from nothing.
+        The noise of such a step is the prior's covariance. If the first node has the prior's stamp, the
+        step to that node is changed to this one.
         """
         first, is_new = offsets[:-1], ~kept.has_begun & (np.diff(offsets) > 0)
         is_there = is_new.copy()
@@ -245,7 +245,7 @@ class BoundFilter(Filter):
         return kept._replace(has_begun=kept.has_begun | is_new), self.step_stream(steps, rows)
 
     def step_stream(self, nodes: Nodes, offsets: Integers) -> Ragged:
-        """Return the stream of the steps to nodes."""
+        """Make the stream of the steps to nodes."""
         t = self.stage.model.tangent
         stream = make_stream(
             f"/estimates/{self.name}/step",

@@ -1,4 +1,4 @@
-"""Predicts and updates the covariance of a filter that linearises at the true states."""
+"""Prediction and update of the covariance of a filter that linearizes at the true states."""
 
 from typing import NamedTuple
 
@@ -35,13 +35,14 @@ from fuselog.replay.inference.model.stage import Stage
 
 
 class TrueTrajectory(NamedTuple):
-    """Holds what is carried along the true trajectories; first axis = run.
+    """Results along the true trajectories; the first axis is the run.
 
     Attributes:
-        mean: (runs, n) the true state.
-        covariance: (runs, t, t) what a filter that linearises there has.
+        mean: (runs, n) true state.
+        covariance: (runs, t, t) covariance of a filter that linearizes at the true state.
         transition, noise: (runs, t, t) since the last node.
-        information: (runs, t, t) of what was measured since then: the sum of H' R^-1 H.
+        information: (runs, t, t) information of the measurements since the last node, the sum of H' R^-1
+            H.
     """
 
     mean: Floats
@@ -52,7 +53,7 @@ class TrueTrajectory(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Holds estimates as the recursion fills them in, with the step to each; see `TrueTrajectory`."""
+    """Estimates that the recursion fills, with the step to each; see `TrueTrajectory`."""
 
     end: Integers
     time_ns: Integers
@@ -64,7 +65,7 @@ class Nodes(NamedTuple):
 
 
 class BoundMemory(NamedTuple):
-    """Holds what one core works in: true states at events (events, n), and noise (m, m) by sensor."""
+    """Working memory of one core: true states at events (events, n), and noise (m, m) by sensor."""
 
     truth: Floats
     noise: tuple[Floats, ...]
@@ -72,7 +73,7 @@ class BoundMemory(NamedTuple):
 
 
 def bound_steps(stage: Stage) -> Steps:
-    """Make the steps of an extended Kalman filter that knows where it is."""
+    """Make the steps of an extended Kalman filter that linearizes at the true states."""
     model, motion = stage.model, stage.motion
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     linearise = motion_derivative(model, motion, by_state=True)
@@ -108,7 +109,7 @@ def bound_steps(stage: Stage) -> Steps:
 
 
 def bound_update(stage: Stage, number: int) -> UpdateRun:
-    """Make the update by sensor `number` as if it had measured what is predicted: nothing moves."""
+    """Make the update by sensor `number` with a zero innovation, which does not move the state."""
     innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
     m = len(stage.sensors[number].measured)
 
@@ -140,19 +141,19 @@ def bound_update(stage: Stage, number: int) -> UpdateRun:
             return NOT_POSITIVE_DEFINITE
         kalman_step(innovation, size, work.step)
         downdate(covariance, innovation.cross_covariance, size)
-        return NOTHING_MEASURED  # there is no innovation to tell of
+        return NOTHING_MEASURED  # no innovation is recorded
 
     return update
 
 
 def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:
-    """Add H' R^-1 H of the first rows; R becomes its factor. NaN where R is not positive definite.
+    """Add H' R^-1 H of the first rows; the result is NaN if R is not positive definite.
 
     Args:
         information: (t, t), added to in place.
-        rows: H (at least size, t), used up.
-        noise: R, of which the first `size` rows and columns count; becomes its factor.
-        size: how many components are measured.
+        rows: H (at least size, t), overwritten.
+        noise: R, of which the first `size` rows and columns are used; replaced by its factor.
+        size: number of measured components.
     """
     t = len(information)
     if not cholesky(noise, noise, size):

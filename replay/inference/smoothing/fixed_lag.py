@@ -1,8 +1,8 @@
-"""Smooths at a fixed lag behind a filter, in constant work per node whatever the lag.
+"""Smoothing at a fixed lag behind a filter, with constant work per node for any lag.
 
-The lag is a window of steps that slides: as they compose, whatever brackets are put, a queue made of two
-stacks has the composition of all its steps at hand, at two compositions a node however many nodes the
-lag has. Where the means of a manifold have a part in the steps they do not compose.
+The lag is a sliding window of steps. Composition of steps is associative, so a queue made of two stacks
+provides the composition of all its steps with two compositions per node, independent of the number of
+nodes in the lag. On manifolds, where the means affect the steps, they cannot be composed.
 """
 
 from functools import lru_cache
@@ -17,12 +17,12 @@ from fuselog.replay.inference.smoothing.backward_pass import BackMemory, Nodes, 
 
 
 class Window(NamedTuple):
-    """Holds the steps within the lag of the first node that is not smoothed yet, as two stacks.
+    """Steps within the lag of the first node that is not yet smoothed, as two stacks.
 
-    Of the steps to the nodes up to `turned`, each node's row holds the composition of its own and all
-    behind it, up to there; those from there up to `through` are composed here. First axis = run; nodes
-    count from the first that is kept. A step is (G, b, A): deviations from the filter's means go back by
-    d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
+    For steps to the nodes up to `turned`, each node's row has the composition of its own step and all
+    later ones up to there; those from there up to `through` are composed here. The first axis is the
+    run; nodes count from the first stored one. A step is (G, b, A): deviations from the filter's means
+    are propagated back by d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
     """
 
     turned: Integers
@@ -34,18 +34,18 @@ class Window(NamedTuple):
 
 @lru_cache(maxsize=64)
 def sliding_over_runs(kinds: tuple[str, ...]) -> OverRuns:
-    """Compile the same over all runs; see `sliding`."""
+    """Make the loop of `sliding` over all runs, which is compiled when first called."""
     return compile_over_runs(sliding(kinds), title="a smoother with a fixed lag")
 
 
 def sliding(kinds: tuple[str, ...]) -> RunOnce:
-    """Make the loop over the nodes of one run in flat space, from first to last, a lag behind."""
+    """Make the loop over the nodes of one run in flat space, from first to last, at a fixed lag."""
     add, subtract = boxplus(kinds), boxminus(kinds)
 
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
     ) -> None:
-        """Add the step to a node behind those of the window: its row gets b, not the prediction."""
+        """Append the step to a node to those of the window; in its row, b replaces the prediction."""
         shift, change = nodes.predicted[row], work.change[0]
         subtract(nodes.mean[row], shift, work.change, 0)
         for i in range(len(shift)):
@@ -61,7 +61,7 @@ def sliding(kinds: tuple[str, ...]) -> RunOnce:
             extend(gain, window.shift[run], rest, nodes.gain[row], shift, nodes.rest[row], work)
 
     def go_back(gain: Floats, shift: Floats, rest: Floats, work: BackMemory) -> None:
-        """Take deviation and covariance of `work` by a step."""
+        """Propagate deviation and covariance of `work` back by a step."""
         step, deviation = work.step, work.mean
         for row in range(len(step)):
             step[row] = shift[row]
@@ -74,7 +74,7 @@ def sliding(kinds: tuple[str, ...]) -> RunOnce:
                 work.covariance[row, column] += rest[row, column]
 
     def slide(run: int, piece: Piece, window: Window, smoothed: Smoothed, work: BackMemory) -> None:
-        """Smooth the nodes of a piece, and move the window."""
+        """Smooth the nodes of a piece and move the window."""
         nodes, offsets = piece
         stop, start, lag_ns, estimates = smoothed
         begin, last = offsets[run], offsets[run + 1] - 1
@@ -115,7 +115,7 @@ def extend(
     next_rest: Floats,
     work: BackMemory,
 ) -> None:
-    """Make one step of a step and the next, in place of the first.
+    """Compose a step with the next one, in place of the first.
 
     Args:
         gain: (t, t) of the first step, changed in place.
@@ -124,7 +124,7 @@ def extend(
         next_gain: (t, t) of the next step.
         next_shift: (t,) of the next step.
         next_rest: (t, t) of the next step.
-        work: what is worked in.
+        work: working memory.
     """
     for row in range(len(shift)):
         for column in range(len(shift)):
