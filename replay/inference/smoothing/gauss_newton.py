@@ -1,13 +1,14 @@
-"""Minimises the cost of all states of a run by damped Gauss-Newton steps.
+"""Minimization of the cost of all states of a run by damped Gauss-Newton steps.
 
-What is minimised, over the state at the prior's time and at every stamp after it, is
+The cost is minimized over the state at the prior's time and at every later stamp:
 
     1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
 
-A pass is an affine filter about the latest trajectory (`fuselog.replay.inference.smoothing.affine`) and
-the way back over it (`fuselog.replay.inference.smoothing.backward_pass`). Where a step would raise the
-cost it is taken again, damped (Levenberg and Marquardt): every state is measured as it stands, with the
-start's variances over the damping.
+A pass consists of an affine filter about the latest trajectory
+(`fuselog.replay.inference.smoothing.affine`) and the backward pass over it
+(`fuselog.replay.inference.smoothing.backward_pass`). If a step would raise the cost, it is repeated with
+damping (Levenberg and Marquardt): every state is measured as it is, with the variances of the start
+divided by the damping.
 
 Bell, SIAM J. Optim. 4(3), 1994; Sarkka and Svensson, ICASSP 2020.
 """
@@ -43,16 +44,16 @@ from fuselog.replay.inference.smoothing.backward_pass import (
     backward_pass,
 )
 
-SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
+SETTLED = 1e-10  # largest component of the last step, in standard deviations
 ROUNDING = 1e-15
-COST_ROUNDING = 1e-6  # of one, or of the cost itself where larger: noise may depend on the state
+COST_ROUNDING = 1e-6  # of 1, or of the cost if larger: noise may depend on the state
 LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e12
 
 
 class Plan(NamedTuple):
-    """Holds what a search is given: the prior (first axis = run), what drives before the first control.
+    """Inputs of a search: the prior (first axis: run), its stamps, and the control before its messages.
 
-    And the first damping, and the most passes.
+    Also the first damping, and the maximum number of passes.
     """
 
     prior: Gaussian
@@ -63,12 +64,12 @@ class Plan(NamedTuple):
 
 
 class SearchState(NamedTuple):
-    """Holds what a search changes, of all runs.
+    """State of a search, for all runs.
 
     Attributes:
-        carried, piece, innovations: of the pass forward.
-        later, smoothed: of the way back.
-        kept: (nodes, n), the best trajectory.
+        carried, piece, innovations: of the forward pass.
+        later, smoothed: of the backward pass.
+        kept: (nodes, n) best trajectory.
     """
 
     carried: RecursionState
@@ -80,9 +81,9 @@ class SearchState(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Describes how the searches ended: passes, and whether converged (runs,).
+    """Results of the searches: number of passes, and whether they converged (runs,).
 
-    Of every pass the cost, the damping and the largest step in standard deviations (runs, passes, 3).
+    For every pass, the cost, the damping and the largest step in standard deviations (runs, passes, 3).
     """
 
     passes: Integers
@@ -92,7 +93,7 @@ class Ended(NamedTuple):
 
 @lru_cache(maxsize=64)
 def searching(stage: Stage) -> tuple[OverRuns, Steps]:
-    """Return the compiled search, and the steps that make its memory."""
+    """Make the search, which is compiled when first called, and the steps that allocate its memory."""
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "iterated smoother")
@@ -100,7 +101,7 @@ def searching(stage: Stage) -> tuple[OverRuns, Steps]:
 
 
 def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
-    """Make the search of one run's trajectory, for `compile_over_runs`."""
+    """Make the search for one run's trajectory, for `compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
     follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
     add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
@@ -109,7 +110,7 @@ def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
     def go_forward(
         run: int, inputs: RunInputs, plan: Plan, state: SearchState, memory: ForwardMemory
     ) -> bool:
-        """Filter about the trajectory, and sum its cost; whether all went well."""
+        """Filter about the trajectory, sum its cost, and return whether everything succeeded."""
         carried, (nodes, offsets) = state.carried, state.piece
         trajectory, belief, begin = memory.filter.samples[0], carried.belief, offsets[run]
         mean, covariance = belief.mean[run], belief.covariance[run]
@@ -138,10 +139,10 @@ def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
     def move(
         trajectory: Trajectory, kept: Floats, steps: Floats, begin: int, end: int
     ) -> tuple[float, float, bool]:
-        """Move the trajectory from what is kept.
+        """Move the trajectory from the best one.
 
-        Returns the largest step, the sum of their squares, both in standard deviations of the start, and
-        whether these are nothing any more.
+        Return the largest step and the sum of squared steps, both in standard deviations of the start,
+        and whether the steps are negligible.
         """
         largest, squares, settled = 0.0, 0.0, True
         for node in range(begin, end):
@@ -166,13 +167,13 @@ def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
         ended: Ended,
         scratch: tuple[ForwardMemory, BackMemory],
     ) -> None:
-        """Move what is kept to the best trajectory of a run; the covariances go with it."""
+        """Replace `kept` by the best trajectory of a run, and the covariances accordingly."""
         memory, back = scratch
         offsets, later, kept, smoothed = state.piece.offsets, state.later, state.kept, state.smoothed
         trajectory, begin, end = memory.filter.samples[0], offsets[run], offsets[run + 1]
         ended.passes[run] = ended.converged[run] = 0
         best, damping, again, last = np.inf, plan.damping, False, False
-        # the damping of the last step, and a gain that it must not miss by far
+        # the damping of the last step, and the predicted gain, which it should not miss by far
         taken, promised = 0.0, 0.0
         while begin < end:
             trajectory.damping[0] = damping
@@ -185,7 +186,7 @@ def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
                 if better:
                     best = trajectory.cost[0]
                     copy_rows(trajectory.mean, kept, begin, end)
-                elif passes == 0:  # no start
+                elif passes == 0:  # the start is invalid
                     return
             if poor:
                 damping, again = max(10.0 * taken, LEAST_DAMPING), True
@@ -208,17 +209,17 @@ def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
                 again, last = False, passes + 1 == plan.passes
             if again or last:
                 copy_rows(kept, trajectory.mean, begin, end)
-            if last:  # the covariances, which damping has no part in
+            if last:  # compute the covariances without damping
                 damping, again = 0.0, True
 
     return search_run
 
 
 def copy_rows(these: Floats, there: Floats, begin: int, end: int) -> None:
-    """Copy some rows of one array to the same of another.
+    """Copy some rows of one array to the same rows of another.
 
     Args:
-        these, there: (n, k), the first to the second.
+        these, there: (n, k) source and destination.
         begin, end: the rows.
     """
     there[begin:end] = these[begin:end]

@@ -1,7 +1,7 @@
-"""Finds the most probable states of a whole run, given all measurements: the iterated smoother.
+"""Iterated smoother: the most probable states of a whole run, given all measurements.
 
-It keeps the events of a run, smooths them once as the extended smoother does, and from there searches
-the trajectory of the least cost; see `fuselog.replay.inference.smoothing.gauss_newton`.
+It stores the events of a run, smooths them once with the extended smoother, and from there searches for
+the trajectory with the least cost; see `fuselog.replay.inference.smoothing.gauss_newton`.
 """
 
 from collections.abc import Sequence
@@ -47,16 +47,16 @@ from fuselog.replay.inference.smoothing.smoothers import Smoother, SmootherParam
 
 
 class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
-    """Defines options of smoother:iterated: where the search starts, its damping, the loss of outliers.
+    """Options of smoother:iterated: start of the search, damping, and loss for outliers.
 
     Attributes:
-        start: where the search starts: smoother (the extended filter, smoothed once), motion (the
-            prior's mean, moved along) or prior (that mean at all stamps).
-        damping: damping of the first step, in units of the information at the start; with 0,
-            Gauss-Newton is damped only where its cost would rise.
-        loss: how residuals count; with huber and cauchy, long ones count less.
-        loss_scale: length of a whitened residual from which on huber and cauchy count it less.
-        iterations: the search ends after so many at most.
+        start: start of the search: smoother (result of the extended smoother), motion (the prior's mean,
+            propagated by the motion) or prior (the prior's mean at all stamps).
+        damping: damping of the first step, in units of the information at the start; with 0, damping is
+            only used where the cost would rise.
+        loss: loss function of residuals; huber and cauchy down-weight long ones.
+        loss_scale: length of a whitened residual above which huber and cauchy down-weight it.
+        iterations: maximum number of iterations.
     """
 
     start: Literal["smoother", "motion", "prior"] = "smoother"
@@ -66,19 +66,19 @@ class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
     iterations: Annotated[PositiveInt, Field(le=1000)] = 50
 
 
-# As an estimator
+# Estimator
 
 
 class Way(NamedTuple):
-    """Holds runs from their priors to their ends, as the extended smoother has them.
+    """Runs from their priors to their ends, as processed by the extended smoother.
 
     Attributes:
-        events: the events up to the last node, without those that a gate kept out.
-        node: (events,) of every event the node of its stamp.
-        nodes, offsets: the stamps, as the filter went through them; run r owns those from offsets[r] on.
-        states: the smoothed states there.
-        wanted: (nodes,) at which of them estimates are wanted.
-        made: the other outputs of the filter.
+        events: events up to the last node, without measurements that a gate rejected.
+        node: (events,) node of each event's stamp.
+        nodes, offsets: nodes of the filter; run r owns those from offsets[r] on.
+        states: smoothed states at the nodes.
+        wanted: (nodes,) whether an estimate is requested at each node.
+        made: other outputs of the filter.
     """
 
     events: FilterEvents
@@ -91,19 +91,19 @@ class Way(NamedTuple):
 
 
 class IteratedSmoother(Smoother):
-    """Runs a smoother that keeps the events of a run, and at the end searches its trajectory."""
+    """A smoother that stores the events of a run and searches for its trajectory at the end."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """Return the whole run."""
+        """Infinite lag: the whole run."""
         return FOREVER_NS
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Keep the events."""
+        """Store the events."""
         return state._replace(kept=(*state.kept, events)), []
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Return the best trajectory, and how the search for it ended."""
+        """Find the best trajectory, and report how the search ended."""
         state, _ = self.ended(state)
         if not state.kept:
             return []
@@ -121,7 +121,7 @@ class IteratedSmoother(Smoother):
         return [states, *way.made, *self._solution_streams(ended, way)]
 
     def smoothed_once(self, state: FilterState) -> "Way":
-        """Return the extended smoother's states at all stamps, from the prior's on."""
+        """Compute the extended smoother's states at all stamps, from the prior's on."""
         events = reduce(join_events, (*self._first(state), *state.kept))
         run = run_of_rows(events.offsets)
         asked, start_ns = events.wants_estimate, state.carried.time_ns
@@ -130,8 +130,8 @@ class IteratedSmoother(Smoother):
         )
         _, (nodes, offsets), made = self.filtered(state, events)
         stamp = np.cumsum(events.wants_estimate) - events.wants_estimate
-        stamp -= np.append(stamp, 0)[events.offsets[run]]  # counted in each run
-        known = stamp < np.diff(offsets)[run]  # a run that failed has no more
+        stamp -= np.append(stamp, 0)[events.offsets[run]]  # counted within each run
+        known = stamp < np.diff(offsets)[run]  # nodes after a failure do not exist
         node = offsets[run] + stamp
         wanted = np.zeros(offsets[-1], bool)
         wanted[node[asked & known]] = True
@@ -140,7 +140,7 @@ class IteratedSmoother(Smoother):
         return Way(used, node[known], nodes, offsets, states, wanted, made)
 
     def _moved(self, state: FilterState, way: "Way") -> Floats:
-        """Return the prior's means, moved along all of every run as if nothing was measured."""
+        """Propagate the prior's means through all of every run as if nothing was measured."""
         unseen = np.where(way.events.source >= 0, NOTHING, way.events.source)
         _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
         if not np.array_equal(reached, way.offsets):
@@ -152,7 +152,7 @@ class IteratedSmoother(Smoother):
         return mean
 
     def _first(self, state: FilterState) -> list[FilterEvents]:
-        """Return the prior's time as an event; an interpolated control has made one already."""
+        """Return the prior's time as an event, unless an interpolated control already has one."""
         control = self.stage.model.control
         if control is not None and control.interpolated:
             return []
@@ -162,7 +162,7 @@ class IteratedSmoother(Smoother):
     def _accepted(
         self, events: FilterEvents, start_ns: Integers, made: Sequence[Ragged]
     ) -> FilterEvents:
-        """Return events without the measurements that the gate kept out on the way forward."""
+        """Remove the measurements that the gate rejected in the forward pass."""
         if self.parameters.gate_probability == 1.0:
             return events
         source = events.source.copy()
@@ -179,7 +179,7 @@ class IteratedSmoother(Smoother):
         return events._replace(source=source)
 
     def _search(self, state: FilterState, way: Way, scale: Floats) -> Ended:
-        """Search the trajectories of all runs from the way's states, which they replace."""
+        """Search for the trajectories of all runs from the states of `way`, which are replaced."""
         stage, asked = self.stage, self.parameters
         events, nodes, offsets, kept = way.events, way.nodes, way.offsets, way.states
         loop, steps = searching(stage)
@@ -231,7 +231,7 @@ class IteratedSmoother(Smoother):
         return ended
 
     def _solution_streams(self, ended: Ended, way: Way) -> list[Ragged]:
-        """Describe how the searches ended, and every pass of each, at the last node of its run."""
+        """Make the streams that report each search and its passes, at the last node of the run."""
         asked, some = self.parameters, np.diff(way.offsets) > 0
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
@@ -265,11 +265,11 @@ class IteratedSmoother(Smoother):
         ]
 
 
-# As a method
+# Method
 
 
 def _solved_at_the_end(stage: Stage) -> Steps:
-    """Return the way to the start: the extended filter's."""
+    """Make the steps that compute the start, those of the extended smoother."""
     return smoothing_steps(stage, FILTERS["ekf"].steps(stage))
 
 

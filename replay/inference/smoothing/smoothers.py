@@ -1,9 +1,8 @@
-"""Runs smoothers: filters that keep their nodes and pass back over them, at the end or at a lag.
+"""Smoothers: filters that store their nodes and pass back over them, at the end or at a lag.
 
-The steps that a filter leaves, and the way back over them, are in
-`fuselog.replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
-`fuselog.replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps,
-each estimate of a fixed lag comes back over the whole of it.
+The stored steps and the backward pass are in `fuselog.replay.inference.smoothing.backward_pass`; sliding
+a fixed lag over them is in `fuselog.replay.inference.smoothing.fixed_lag`. On manifolds, where means
+affect the steps, each estimate of a fixed lag needs a backward pass over the whole lag.
 """
 
 import re
@@ -48,23 +47,23 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 from fuselog.replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
-IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file
+IN_MEMORY_BYTES = 10**9  # size of the nodes of whole runs; more are stored in temporary files
 
 
 class SmootherParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """States what goes forward, and how far estimates look ahead.
+    """The forward filter, and how far estimates look ahead.
 
     Attributes:
-        forward: the filter (ekf, iekf, ukf, lrkf, analytic or sqrt), perhaps with a lag, as in
-            `ekf:lag=500ms`; without a lag every estimate uses the whole run, with one the messages up
-            to so much later. Or iterated.
+        forward: the filter (ekf, iekf, ukf, lrkf, analytic or sqrt), optionally with a lag, as in
+            `ekf:lag=500ms`. With a lag, an estimate uses messages up to that much later; without one, it
+            uses the whole run. Or iterated.
     """
 
     forward: str = "ekf"
 
 
 class Forward(NamedTuple):
-    """Holds a filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
+    """A filter's name, its variant, and the lag; FOREVER_NS for the whole run."""
 
     name: str
     variant: str
@@ -72,7 +71,7 @@ class Forward(NamedTuple):
 
 
 def parse_forward(text: str) -> Forward:
-    """Parse `SmootherParameters.forward`; raises BadInput where it has another form."""
+    """Parse `SmootherParameters.forward`; raise BadInput if it is invalid."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     rest_on = before.removesuffix(":")
     name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
@@ -87,11 +86,11 @@ def parse_forward(text: str) -> Forward:
     return Forward(name, variant, int(found[1]) * UNITS_NS[found[2]])
 
 
-# As an estimator
+# Estimator
 
 
 class Stored:
-    """Represents a piece on disk, in a temporary file that is gone when nobody refers to it any more."""
+    """A piece in a temporary file, which is deleted when the object is no longer referenced."""
 
     def __init__(self, piece: Piece) -> None:
         self.offsets = piece.offsets
@@ -101,40 +100,40 @@ class Stored:
             np.save(self._file, column)
 
     def read(self) -> Piece:
-        """Return the piece, in memory."""
+        """Read the piece into memory."""
         self._file.seek(0)
         return Piece(Nodes(*(np.load(self._file) for _ in Nodes._fields)), self.offsets)
 
 
 def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
-    """Return a piece, on disk where it is too much beside those in memory."""
+    """Return a piece, stored on disk if those in memory would become too large."""
     in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
     size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
     return new if size <= IN_MEMORY_BYTES else Stored(new)
 
 
 class Waiting(NamedTuple):
-    """Holds the nodes within the lag, and the steps between them."""
+    """The nodes within the lag, and the steps between them."""
 
     piece: Piece
     window: Window
 
 
 class Smoother(Filter):
-    """Runs a filter that keeps its nodes, and smooths them at the end, or a lag behind."""
+    """A filter that stores its nodes, and smooths them at the end or at a lag."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """Compute how much later a message may be that an estimate uses."""
+        """Time after an estimate from which it may use messages."""
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
     def why_in_sequence(self) -> str:
-        """Explain that a smoother uses later messages in any case."""
+        """Reason why a smoother cannot reprocess late messages: it uses later messages in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Return the state at every run's prior, see `Filter.start`."""
+        """Make the state at every run's prior; see `Filter.start`."""
         state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
@@ -145,7 +144,7 @@ class Smoother(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Nodes, InnovationRows]:
-        """Return nodes and innovations to be filled in."""
+        """Make arrays of nodes and innovations to fill."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
@@ -153,10 +152,10 @@ class Smoother(Filter):
         return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Filter events, and smooth what the lag lets go."""
+        """Filter events, and smooth the nodes that are older than the lag."""
         after, (nodes, offsets), made = self.filtered(state, events)
         new = Piece(nodes, offsets)
-        if self.lag_ns == FOREVER_NS:  # nothing yet
+        if self.lag_ns == FOREVER_NS:  # nothing is smoothed yet
             nothing = self.states(*self.gone_back([new], offsets[:-1]))
             return after._replace(kept=(*state.kept, stored(state.kept, new))), [nothing, *made]
         piece, window = new, self._no_window(len(offsets) - 1)
@@ -171,7 +170,7 @@ class Smoother(Filter):
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter what waited for later messages, and smooth all nodes that are left."""
+        """Filter the events that still wait, and smooth all remaining nodes."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
             return [*made, self.states(*self.gone_back(state.kept))]
@@ -181,9 +180,9 @@ class Smoother(Filter):
         return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
     def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[EstimateRows, Integers]:
-        """Return the estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
+        """Smooth the nodes before row stop[run] at the lag; run r owns offsets[r]:offsets[r + 1].
 
-        Changes the nodes, and the window, which then begins at row stop[run].
+        The nodes and the window are changed; the window then begins at row stop[run].
         """
         model = self.stage.model
         if not is_flat(model.kinds):
@@ -204,7 +203,7 @@ class Smoother(Filter):
     def gone_back(
         self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
     ) -> tuple[EstimateRows, Integers]:
-        """Return the estimates at the nodes of all pieces, or of one those before row stop[run].
+        """Smooth the nodes of all pieces, or those of one piece before row stop[run].
 
         Run r owns offsets[r]:offsets[r + 1].
         """
@@ -233,7 +232,7 @@ def _no_estimates(offsets: Integers, n: int, t: int) -> EstimateRows:
 
 
 def _joined(pieces: Sequence[Piece]) -> Piece:
-    """Return pieces as one, each run's nodes together."""
+    """Concatenate pieces, run by run."""
     if len(pieces) == 1:
         return pieces[0]
     order, offsets = by_runs([piece.offsets for piece in pieces])
@@ -250,12 +249,12 @@ def _rows_from(piece: Piece, begin: Integers) -> Piece:
     return Piece(Nodes(offsets[1:], *columns), offsets)
 
 
-# As a method
+# Method
 
 
 @lru_cache(maxsize=64)
 def _smoother_of(name: str, variant: str) -> Method:
-    """Make the method that smooths what a filter estimates."""
+    """Make the method that smooths the estimates of a filter."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:
