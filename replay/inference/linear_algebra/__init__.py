@@ -1,4 +1,4 @@
-"""Computes with small matrices in place, and with states on their manifold.
+"""Linear algebra with small matrices in place, and operations on states on their manifold.
 
 Begin with `gaussian`.
 """

@@ -1,9 +1,8 @@
-"""Says what a filter can carry for a covariance: the contract of beliefs between methods.
+"""Forms in which a filter can store covariances: the contract of beliefs between methods.
 
-A belief is a mean (n,) and a matrix (t, t) that stands for its covariance P: P itself (`COVARIANCES`),
-or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). A filter's own
-steps predict and update it; all others, such as an IMM or a smoother, know no more of it than its
-`Form`.
+A belief is a mean (n,) and a matrix (t, t) that represents its covariance P: P itself (`COVARIANCES`),
+or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). The steps of a
+filter predict and update it; other code, such as an IMM or a smoother, only uses its `Form`.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,25 +14,25 @@ from fuselog.replay.inference.linear_algebra.manifold import Turning
 
 
 class Propagate(Protocol):
-    """Makes of P (t, t) what stands for F P F'; the product (t, t) is to work in."""
+    """Function that replaces the matrix of P (t, t) by that of F P F', with working memory `product`."""
 
     def __call__(self, matrix: Floats, transition: Floats, product: Floats, /) -> None: ...
 
 
 class Times(Protocol):
-    """Fills a product (t,) with P v."""
+    """Function that fills a product (t,) with P v."""
 
     def __call__(self, matrix: Floats, vector: Sequence[float] | Floats, product: Floats, /) -> None: ...
 
 
 class Turn(Protocol):
-    """Turns a matrix (t, t) by `manifold.by_right_jacobian`, which is `turning`, along a vector (t,)."""
+    """Function that applies `turning`, from `manifold.by_right_jacobian`, to the matrix of P (t, t)."""
 
     def __call__(self, turning: Turning, vector: Floats, matrix: Floats, /) -> None: ...
 
 
 class Mix(Protocol):
-    """Fills what stands for a mixture's covariance, see `Form`."""
+    """Function that fills the matrix of a mixture's covariance; see `Form`."""
 
     def __call__(
         self, weights: Floats, away: Floats, shift: Floats, carried: Floats, matrix: Floats, /
@@ -41,7 +40,7 @@ class Mix(Protocol):
 
 
 class Predicted(Protocol):
-    """Holds what a prediction left in the workspace, see `kalman.steps.Workspace`."""
+    """Arrays that a prediction leaves in the workspace; see `kalman.steps.Workspace`."""
 
     @property
     def product(self) -> Floats: ...
@@ -50,7 +49,10 @@ class Predicted(Protocol):
 
 
 class Retrace(Protocol):
-    """Goes back over a prediction, see `Form`; returns whether P- is positive semidefinite."""
+    """Function that reverses a prediction; see `Form`.
+
+    It returns whether P- is positive semidefinite.
+    """
 
     def __call__(
         self, before: Floats, after: Floats, work: Predicted, turned: Floats, factor: Floats, /
@@ -58,19 +60,20 @@ class Retrace(Protocol):
 
 
 class Form(NamedTuple):
-    """Holds what can be done with a matrix (t, t) that stands for a covariance P; all in place.
+    """Operations on a matrix (t, t) that represents a covariance P; all work in place.
 
     Attributes:
-        start: (covariances (..., t, t)) -> the matrices that stand for them.
-        to_covariance: (matrix) makes P of it.
+        start: (covariances (..., t, t)) -> matrices that represent them.
+        to_covariance: (matrix) replaces it by P.
         times: (matrix, vector, product) fills the product (t,) with P v.
-        propagate: (matrix, transition, product): P becomes F P F'; the product (t, t) is to work in.
-        turn: (turning, vector, matrix): the same by `manifold.by_right_jacobian`, which is `turning`.
-        mix: (weights, away, shift, carried, matrix) fills it with the mixture's of matrices (M, t, t)
-            whose means are `away` (M, t), and the mixture's `shift` (t,).
-        retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. Of the
-            matrices before and after a prediction, and what it left in the workspace, it fills `turned`
-            with G', and `before` with P - G D', see `fuselog.replay.inference.smoothing.backward_pass`.
+        propagate: (matrix, transition, product) replaces P by F P F'; product (t, t) is working memory.
+        turn: (turning, vector, matrix) transforms P by `turning`, from `manifold.by_right_jacobian`,
+            along a vector.
+        mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of matrices (M, t, t)
+            with the means `away` (M, t) and the mean `shift` (t,) of the mixture.
+        retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. From the
+            matrices before and after a prediction and what it left in the workspace, it fills `turned`
+            with G', and `before` with P - G D'; see `fuselog.replay.inference.smoothing.backward_pass`.
     """
 
     start: Callable[[Floats], Floats]

@@ -1,4 +1,4 @@
-"""Carries lower factors S in place of covariances P = S S', by weighted Gram-Schmidt.
+"""Lower factors S of covariances P = S S', computed by weighted Gram-Schmidt orthogonalization.
 
 Thornton, JPL Technical Memorandum 33-798, 1976; Bierman, Factorization Methods for Discrete Sequential
 Estimation, 1977, VI.4.
@@ -14,19 +14,20 @@ from fuselog.replay.inference.linear_algebra.covariances import Form, Predicted
 from fuselog.replay.inference.linear_algebra.gaussian import multiply
 from fuselog.replay.inference.linear_algebra.manifold import Turning
 
-ROUNDING = 1e-15  # of a variance, for each component that others determine
-NOTHING_LEFT = 1e-28  # a row's square beside what it was: rounding, of a row that others determine
+ROUNDING = 1e-15  # relative to a variance, per component that determines it
+NOTHING_LEFT = 1e-28  # relative square of a row that depends on others, because of rounding
 
 
 def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
-    """Fill the lower factor L (r, r) of A diag(w) A' = L L', of rows A (r, c), which it uses up.
+    """Compute the lower factor L (r, r) of A diag(w) A' = L L' from the rows of A (r, c).
 
-    Modified Gram-Schmidt, so that no product of A with itself is made; a weight may be negative. The
-    diagonal is positive, and zero with all below where a row depends on those before it. False, and the
-    pivot NaN, where the product is not positive semidefinite.
+    This is modified Gram-Schmidt orthogonalization, which does not form products of A with itself;
+    weights may be negative. The diagonal of L is positive; if a row depends on earlier rows, its
+    diagonal entry and the entries below are zero. If the product is not positive semidefinite, the pivot
+    is NaN.
 
     Args:
-        rows: A (r, c), used up.
+        rows: A (r, c), overwritten.
         weights: w (c,).
         factor: L (r, r), filled.
 
@@ -60,14 +61,14 @@ def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
 
 
 def fill_root(rows: Floats, covariance: Floats) -> bool:
-    """Fill the first rows with a factor N (n, n) of N N', which it uses up; False where it is none.
+    """Fill the first columns of `rows` with a factor N (n, n) of a covariance N N'.
 
-    By Cholesky, with that pivot next which is the largest beside what it was: a covariance may be
-    singular.
+    This is a Cholesky factorization with pivoting by the relative size of the pivots, since the
+    covariance may be singular.
 
     Args:
         rows: (n, at least n), whose first n columns become N.
-        covariance: (n, n), used up.
+        covariance: (n, n), overwritten.
 
     Returns:
         Whether the covariance is positive semidefinite.
@@ -93,7 +94,7 @@ def fill_root(rows: Floats, covariance: Floats) -> bool:
 
 
 def retriangulate(rows: Floats, factor: Floats) -> None:
-    """Fill the lower factor of A A', of rows A (t, t), which may be the factor itself.
+    """Compute the lower factor of A A' from A (t, t), which may be the factor itself.
 
     Args:
         rows: A (t, t).
@@ -105,7 +106,7 @@ def retriangulate(rows: Floats, factor: Floats) -> None:
 
 
 def _start(covariances: Floats) -> Floats:
-    """Factor covariances; NaN where one is not positive definite: such a run does not start."""
+    """Factor covariances; NaN for those that are not positive definite, whose runs do not start."""
     factors, whole = np.full_like(covariances, np.nan), is_positive_definite(covariances)
     factors[whole] = np.linalg.cholesky(covariances[whole])
     return factors
@@ -153,7 +154,7 @@ def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, factor: 
 
 
 def _retrace(before: Floats, after: Floats, work: Predicted, turned: Floats, _: Floats) -> bool:
-    """Go back over a prediction by what it left: G S- in `work.product`, P - G D' in `work.rest`."""
+    """Reverse a prediction, given G S- in `work.product` and P - G D' in `work.rest`."""
     t = len(before)
     for row in range(t):
         for column in range(t - 1, -1, -1):

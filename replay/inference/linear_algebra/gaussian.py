@@ -1,7 +1,7 @@
-"""Computes with Gaussians in place: Cholesky factors, innovations, the Kalman gain, covariances.
+"""Operations on Gaussians in place: Cholesky factors, innovations, the Kalman gain, covariances.
 
-Means lie in the state's own space, covariances in its tangent space and are symmetric by construction.
-Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
+Means are in the space of the state, covariances in its tangent space; covariances are symmetric by
+construction. Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
 """
 
 from typing import NamedTuple
@@ -15,12 +15,12 @@ LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 
 class Innovation(NamedTuple):
-    """Holds how a measurement differs from its prediction.
+    """Difference of a measurement from its prediction.
 
     Attributes:
-        difference: v (m,), NaN where the measurement has no such component.
-        covariance: S (m, m), of v.
-        cross_covariance: C (t, m), of the state with v.
+        difference: v (m,), NaN for missing components.
+        covariance: covariance S (m, m) of v.
+        cross_covariance: covariance C (t, m) of the state with v.
     """
 
     difference: Floats
@@ -29,21 +29,22 @@ class Innovation(NamedTuple):
 
 
 def no_innovation(states: int, components: int) -> Innovation:
-    """Make memory for an innovation of m components of a state with t tangent components."""
+    """Allocate memory for an innovation of m components and a state with t tangent components."""
     return Innovation(
         np.empty(components), np.empty((components, components)), np.empty((states, components))
     )
 
 
 def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """Fill the lower Cholesky factor L of the leading block of a matrix, A = L L'.
+    """Compute the lower Cholesky factor L of the leading block of a matrix, A = L L'.
 
     Args:
-        factor: (n, n) filled; may be the matrix itself.
+        factor: (n, n), filled; may be the matrix itself.
         matrix: A (n, n), symmetric in its first `size` rows and columns.
-        size: of the leading block.
+        size: size of the leading block.
 
-    Returns False where the block is not positive definite (or NaN).
+    Returns:
+        Whether the block is positive definite (and not NaN).
     """
     for column in range(size):
         for row in range(column, size):
@@ -60,12 +61,13 @@ def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """Fill the lower factor of a positive semidefinite block: below a pivot of about zero it is zero.
+    """Compute the lower factor of a positive semidefinite block; columns with a zero pivot are zero.
 
     Args:
         factor, matrix, size: as for `cholesky`.
 
-    Returns False where the block is indefinite (or NaN).
+    Returns:
+        Whether the block is positive semidefinite (and not NaN).
     """
     for column in range(size):
         smallest = 1e-15 * size * matrix[column, column]
@@ -84,14 +86,15 @@ def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
-    """Fill the inverse of a symmetric matrix A by its Cholesky factor.
+    """Compute the inverse of a symmetric matrix A by its Cholesky factor.
 
     Args:
-        matrix: A (n, n), which stays as it is.
-        inverse: (n, n) filled.
-        factor: (n, n) filled with the lower factor L, A = L L'.
+        matrix: A (n, n), not changed.
+        inverse: (n, n), filled.
+        factor: (n, n), filled with the lower factor L, A = L L'.
 
-    Returns False where A is not positive definite.
+    Returns:
+        Whether A is positive definite.
     """
     size = len(matrix)
     if not cholesky(factor, matrix, size):
@@ -111,15 +114,18 @@ def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
 
 
 def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
-    """Solve A X = B in place, by Cholesky's factor of A, which goes into `factor`.
+    """Solve A X = B in place by the Cholesky factor of A.
 
-    A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
-    is in the range of A. False where A is not positive semidefinite.
+    A zero pivot, up to rounding, is a component that A knows exactly: its row of X is zero, which is a
+    solution if B is in the range of A.
 
     Args:
         matrix: A (n, n), symmetric.
-        right: B (n, m), which becomes X.
-        factor: (n, n) to work in.
+        right: B (n, m), replaced by X.
+        factor: (n, n) working memory.
+
+    Returns:
+        Whether A is positive semidefinite.
     """
     size, columns = len(matrix), right.shape[1]
     if not semidefinite_cholesky(factor, matrix, size):
@@ -142,14 +148,14 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
 
 
 def wrap(difference: float, is_angle: bool) -> float:
-    """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
+    """Wrap a difference of angles to [-pi, pi); return any other difference unchanged."""
     if is_angle and not abs(difference) < np.pi:
         difference = wrap_angle(difference)
     return difference
 
 
 def drop_missing(innovation: Innovation) -> int:
-    """Move the components that were measured to the front; returns how many there are."""
+    """Move the measured components to the front, and return their number."""
     difference, covariance, cross_covariance = innovation
     size = 0
     for component in range(len(difference)):
@@ -165,13 +171,13 @@ def drop_missing(innovation: Innovation) -> int:
 
 
 def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
-    """Turn v into L^-1 v and S into L, S = L L'; returns v' S^-1 v and log det S.
+    """Replace v by L^-1 v and S by L, S = L L', and return v' S^-1 v and log det S.
 
-    The first is NaN where S is not positive definite.
+    The first is NaN if S is not positive definite.
 
     Args:
         innovation: v (m,) and S (m, m), changed in place.
-        size: how many components stand in front, see `drop_missing`.
+        size: number of measured components, which come first; see `drop_missing`.
     """
     difference, factor, _ = innovation
     if not cholesky(factor, factor, size):
@@ -180,12 +186,12 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
 
 
 def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, float]:
-    """Turn v into L^-1 v; returns its square, and log det L L'.
+    """Replace v by L^-1 v, and return its square and log det L L'.
 
     Args:
-        factor: L, lower, of which the first `size` rows and columns count.
+        factor: L, lower, of which the first `size` rows and columns are used.
         difference: v (m,), changed in place.
-        size: how many components are measured.
+        size: number of measured components.
     """
     squared, determinant = 0.0, 1.0
     for i in range(size):
@@ -199,14 +205,14 @@ def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, flo
 
 
 def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
-    """Fill `step` (t,) with K v of a whitened innovation; its cross-covariance C becomes W = C L^-T.
+    """Fill `step` (t,) with K v for a whitened innovation, and replace C by W = C L^-T.
 
-    So K v = W L^-1 v, and K S K' = W W'.
+    K v is W L^-1 v, and K S K' is W W'.
 
     Args:
-        innovation: v whitened, the factor L of S, and C (t, m).
-        size: how many components are measured.
-        step: (t,) filled.
+        innovation: whitened v, the factor L of S, and C (t, m).
+        size: number of measured components.
+        step: (t,), filled.
     """
     difference, factor, cross = innovation
     for row in range(len(step)):
@@ -220,12 +226,12 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
 
 
 def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
-    """Downdate P to P - W W', in place.
+    """Replace P by P - W W', in place.
 
     Args:
         covariance: P (t, t).
-        weighted: W (t, m), as `kalman_step` leaves it.
-        size: how many columns of W count.
+        weighted: W (t, m), as computed by `kalman_step`.
+        size: number of columns of W to use.
     """
     for row in range(len(covariance)):
         for column in range(row + 1):
@@ -238,11 +244,11 @@ def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
 def scalar_update(
     mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
 ) -> None:
-    """Update by one number v, in place: x + C v / s and P - C C' / s.
+    """Update by a scalar innovation v, in place: x + C v / s and P - C C' / s.
 
     Args:
         mean, covariance: x (n,) in a flat space, P (n, n).
-        cross: C (n,), the covariance of the state with v.
+        cross: C (n,), covariance of the state with v.
         variance, difference: s and v.
     """
     share = difference / variance
@@ -255,17 +261,17 @@ def scalar_update(
 
 
 def fill_identity(matrix: Floats) -> None:
-    """Make a matrix the identity."""
+    """Fill a matrix with the identity."""
     matrix[:, :] = 0.0
     for row in range(len(matrix)):
         matrix[row, row] = 1.0
 
 
 def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill the product of two square matrices.
+    """Compute the product of two square matrices.
 
     Args:
-        left, right, product: (n, n); the last is none of the others.
+        left, right, product: (n, n); the product must be a different array.
     """
     for row in range(len(product)):
         for column in range(len(product)):
@@ -276,21 +282,21 @@ def multiply(left: Floats, right: Floats, product: Floats) -> None:
 
 
 def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
-    """Multiply A by F from the left, F A, in place.
+    """Replace A by F A, in place.
 
     Args:
-        left, matrix, product: F, A and what is worked in, (n, n).
+        left, matrix, product: F, A and working memory, (n, n).
     """
     multiply(left, matrix, product)
     matrix[:, :] = product
 
 
 def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
-    """Propagate P to F P F' in place.
+    """Replace P by F P F', in place.
 
     Args:
         covariance, transition: P and F, (t, t).
-        product: (t, t), which becomes F P.
+        product: (t, t), filled with F P.
     """
     size = len(covariance)
     multiply(transition, covariance, product)
@@ -303,13 +309,13 @@ def propagate_covariance(covariance: Floats, transition: Floats, product: Floats
 
 
 def measured_covariance(covariance: Floats, rows: Floats, cross: Floats, spread: Floats) -> None:
-    """Fill C = P H' and S = H C, with H in `rows`, of which there may be more than are measured.
+    """Fill C = P H' and S = H C, with H in the first m rows of `rows`.
 
     Args:
         covariance: P (t, t).
         rows: H (at least m, t).
-        cross: C (t, m) filled.
-        spread: S (m, m) filled.
+        cross: C (t, m), filled.
+        spread: S (m, m), filled.
     """
     for i in range(len(spread)):
         for row in range(len(covariance)):
@@ -333,15 +339,15 @@ def predict_constant_velocity(
 ) -> None:
     """Predict positions and velocities at constant velocity, in place.
 
-    Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
-    a variance of the position, a covariance of both, and a variance of the velocity.
+    The position of axis a is at a * layout[0], and its velocity layout[1] further. The noise adds a
+    variance of the position, a covariance of both, and a variance of the velocity to each axis.
 
     Args:
         mean: (n,).
         covariance: (n, n).
-        duration_s: how long.
+        duration_s: duration.
         layout: see above.
-        noise: the three moments of every axis.
+        noise: the three moments, the same for every axis.
     """
     stride, apart = layout
     places = range(0, stride * (len(mean) // 2), stride)
@@ -365,7 +371,7 @@ def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
     Args:
         covariance: P (t, t).
         gain: G (t, k).
-        variances: (k,), of its columns.
+        variances: (k,) variances of its columns.
     """
     for row in range(len(covariance)):
         for column in range(row + 1):
@@ -380,7 +386,7 @@ def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covarian
 
     Args:
         mean, covariance: (n,), (t, t).
-        to_mean, to_covariance: overwritten, as large.
+        to_mean, to_covariance: overwritten, of the same sizes.
     """
     to_mean[:] = mean
     to_covariance[:, :] = covariance

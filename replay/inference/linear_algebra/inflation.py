@@ -1,4 +1,4 @@
-"""Takes the covariance of a surprising innovation for larger, so that outliers count for less."""
+"""Inflation of the covariance of an unlikely innovation, so that outliers are down-weighted."""
 
 import numpy as np
 
@@ -7,22 +7,22 @@ from fuselog.replay.inference.linear_algebra.gaussian import Innovation
 
 
 def inflation(squared: float, size: int, parameters: Settings) -> float:
-    """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
+    """Compute the factor by which the covariance of an innovation is inflated, from its NIS.
 
-    To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
-    a Kalman update still. 1 where no option of
-    `fuselog.replay.inference.model.parameters.ModelParameters` is
-    given: those are NaN then. The largest of those given holds:
+    The added covariance counts as measurement noise, so that the update remains a Kalman update. The
+    factor is the largest of those of the given options, which are in
+    `fuselog.replay.inference.model.parameters.ModelParameters`. Options that are not given are NaN;
+    without any, the factor is 1:
 
     - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
-    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
-      Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
+    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
+      Gustafsson, ICASSP 2013. At least 1: a small innovation does not reduce the noise;
     - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
 
     Args:
         squared: the NIS.
-        size: how many components the innovation has.
-        parameters: with the three options.
+        size: number of components of the innovation.
+        parameters: parameters with the three options.
 
     >>> from types import SimpleNamespace
     >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)

@@ -1,7 +1,7 @@
-"""Takes derivatives of a model's functions between the tangent spaces of their arguments and results.
+"""Derivatives of a model's functions between the tangent spaces of their arguments and results.
 
-A function is traced (`fuselog.replay.tracing`), and the exact derivatives of its graph are what a kernel
-fills into the arrays of its workspace.
+A function is traced (`fuselog.replay.tracing`), and a kernel writes the exact derivatives of its graph
+to the arrays of its workspace.
 """
 
 import operator
@@ -16,7 +16,7 @@ from fuselog.replay.tracing.functions import Derivative, TracedFunction
 from fuselog.replay.tracing.graph import Node
 from fuselog.replay.tracing.traced import Trace
 
-# Hamilton's product of the units: e_i e_j = sign * e_k, as rows k of (i, j, sign).
+# Hamilton product of the units: e_i e_j = sign * e_k, with row k listing (i, j, sign).
 _PRODUCT = (
     ((0, 0, 1), (1, 1, -1), (2, 2, -1), (3, 3, -1)),
     ((0, 1, 1), (1, 0, 1), (2, 3, 1), (3, 2, -1)),
@@ -25,16 +25,16 @@ _PRODUCT = (
 )
 
 
-# The inputs, the other arguments and the workspace: how many there are is up to what is linearised.
+# The inputs, the other arguments and the workspace; their number depends on the linearized function.
 Linearise = Callable[..., None]  # type: ignore[explicit-any]
 Place = tuple[str, int, int]  # an array of the workspace, row and column
 
 
 class Input(NamedTuple):
-    """Describes an argument to differentiate by: its name, its kinds, and where its Jacobian goes.
+    """An argument to differentiate by: its name, its kinds, and the destination of its Jacobian.
 
-    `into` is the name of an array of the workspace, empty where the derivative is not wanted. An
-    argument that is `zero` is not handed in: it is noise, of mean zero.
+    `into` is the name of an array of the workspace, empty if the derivative is not requested. An
+    argument that is `zero` is not passed: it is noise with mean zero.
     """
 
     name: str
@@ -46,16 +46,18 @@ class Input(NamedTuple):
 def derivative(
     function: object, inputs: Sequence[Input], outputs: Sequence[str], values: str = ""
 ) -> Linearise:
-    """Make a function that takes values and exact Jacobians of a component-first function by its graph.
+    """Make a function that computes values and exact Jacobians of a component-first function.
 
     Args:
-        function: takes the inputs, tuples, and then others; returns a tuple. It is traced.
+        function: function of the inputs, which are tuples, and of other arguments; it returns a tuple
+            and is traced.
         inputs: its first arguments.
-        outputs: the kinds of what it returns.
-        values: the array of the workspace that gets the values (n,), if they are wanted.
+        outputs: kinds of its results.
+        values: array of the workspace for the values (n,), if requested.
 
-    Returns `linearise(inputs..., others..., work)`, without the inputs that are zero. It fills the
-    values and the wanted Jacobians (t of the outputs, t of the input), in the tangent spaces.
+    Returns:
+        `linearise(inputs..., others..., work)`, without inputs that are zero. It fills the values and
+        the requested Jacobians (t of the outputs, t of the input), in the tangent spaces.
     """
     assert isinstance(function, TracedFunction)
     wanted = [(index, each) for index, each in enumerate(inputs) if each.into]
@@ -114,9 +116,9 @@ def derivative(
 
 
 def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], float | None] | None:
-    """List the entries of a Jacobian that may differ from zero, by row and column, with known values.
+    """Return the entries of a Jacobian that may be nonzero, by row and column, with constant values.
 
-    None where nothing is known, as of one written by hand.
+    None if nothing is known, as for a Jacobian that is written by hand.
     """
     known = linearise.__dict__.get("known")
     if known is None:
@@ -127,7 +129,7 @@ def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], floa
 def _seeded(
     trace: Trace, argument: int, kinds: Sequence[str], first: int
 ) -> dict[Node, dict[int, Node]]:
-    """Seed an argument: how its components change with its tangent space; its variables begin at one."""
+    """Return the derivatives of an argument's components by its tangent space."""
     graph = trace.graph
     x = [graph.input((argument, index)) for index in range(len(kinds))]
     one, found = graph.constant(1.0), {}
@@ -155,7 +157,7 @@ def _in_tangent_space(
     slopes: Sequence[Mapping[int, Node]],
     variable: int,
 ) -> Iterator[tuple[int, Node]]:
-    """Express the slopes of what a function returns by one variable in the tangent space, by row."""
+    """Yield the derivatives of a function's results by one variable in the tangent space, by row."""
     zero = trace.graph.constant(0.0)
     y = [trace.number(node) for node in returned]
     for kind, c, t, _ in manifold_blocks(kinds):

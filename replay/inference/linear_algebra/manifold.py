@@ -1,9 +1,9 @@
-"""Moves and compares states on their manifold: boxplus, boxminus, and the right Jacobian.
+"""Operations on states on their manifold: boxplus, boxminus, and the right Jacobian.
 
-Kinds and tangent space as in `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z)
-plus a rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with
-exp(i angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called boxplus and
-the difference of two states boxminus; Sola, arXiv 1711.02508.
+Kinds and tangent space are those of `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton,
+w x y z) plus a rotation vector d is q exp(d/2), and an axis (a unit complex number) plus an angle is its
+product with exp(i angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called
+boxplus and the difference of two states boxminus; Sola, arXiv 1711.02508.
 """
 
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
 
 Quaternion = tuple[float, float, float, float]
-SETTLED = 1e-15  # rad: a mean of rotations that moves by less is found
+SETTLED = 1e-15  # rad: smallest change of a mean of rotations that needs another iteration
 
 
 class Boxplus(Protocol):
-    """Moves a state x (n,) by a tangent vector d (t,), in place."""
+    """Function that moves a state x (n,) by a tangent vector d (t,), in place."""
 
     def __call__(self, x: Floats, d: Sequence[float] | Floats, /) -> None: ...
 
 
 class Boxminus(Protocol):
-    """Fills row k of d (..., t) with a boxminus b, of states (n,)."""
+    """Function that fills row k of d (..., t) with a boxminus b, for states (n,)."""
 
     def __call__(
         self, a: Sequence[float] | Floats, b: Sequence[float] | Floats, d: Floats, k: int, /
@@ -35,24 +35,24 @@ class Boxminus(Protocol):
 
 
 class Turning(Protocol):
-    """Multiplies every rotation's rows (t, m) by its right Jacobian at d (t,), or by the inverse."""
+    """Function that multiplies a rotation's rows (t, m) by its (inverse) right Jacobian at d (t,)."""
 
     def __call__(self, d: Floats, rows: Floats, /) -> None: ...
 
 
 class Recentre(Protocol):
-    """Makes tangent vectors (L, t) from a centre those from its shift (t,), see `recentring`."""
+    """Function that changes the centre of tangent vectors (L, t) by a shift (t,); see `recentring`."""
 
     def __call__(self, values: Floats, shift: Floats, /) -> bool: ...
 
 
 def tangent_size(kinds: Sequence[str]) -> int:
-    """Count the components of the tangent space of these components."""
+    """Return the number of tangent components of these components."""
     return sum(width for _, _, _, width in manifold_blocks(kinds))
 
 
 def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
-    """List every number, angle, axis and quaternion: kind, first component and tangent one, size."""
+    """List all numbers, angles, axes and quaternions: kind, first component, first tangent one, size."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
         kind = kinds[component]
@@ -63,13 +63,13 @@ def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
 
 
 def is_flat(kinds: Sequence[str]) -> bool:
-    """Tell whether the tangent space is the space itself, but for the wrapping of angles."""
+    """Test whether the tangent space equals the space itself, except for the wrapping of angles."""
     return set(kinds) <= {"linear", "angle"}
 
 
 @lru_cache(maxsize=64)
 def boxplus(kinds: tuple[str, ...]) -> Boxplus:
-    """Make `add(x, d)`: it moves the state x (n,) by a tangent vector d (t,), in place: x boxplus d."""
+    """Make `add(x, d)`, which moves the state x (n,) in place to x boxplus d, with d (t,)."""
     parts = tuple(manifold_blocks(kinds))
 
     def add(x: Floats, d: Sequence[float] | Floats) -> None:
@@ -90,7 +90,7 @@ def boxplus(kinds: tuple[str, ...]) -> Boxplus:
 
 @lru_cache(maxsize=64)
 def boxminus(kinds: tuple[str, ...]) -> Boxminus:
-    """Make `subtract(a, b, d, k)`: row k of d (..., t) becomes a boxminus b, of states (n,)."""
+    """Make `subtract(a, b, d, k)`, which fills row k of d (..., t) with a boxminus b, of states (n,)."""
     parts = tuple(manifold_blocks(kinds))
 
     def subtract(a: Sequence[float] | Floats, b: Sequence[float] | Floats, d: Floats, k: int) -> None:
@@ -115,10 +115,10 @@ def boxminus(kinds: tuple[str, ...]) -> Boxminus:
 
 @lru_cache(maxsize=64)
 def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Turning:
-    """Make `reset(d, rows)`: it multiplies every rotation's rows (t, m) by its right Jacobian at d (t,).
+    """Make `reset(d, rows)`, which multiplies a rotation's rows (t, m) by its right Jacobian at d (t,).
 
-    Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
-    With `back` it multiplies by the inverse instead, which carries a covariance the other way.
+    Applied from both sides, it transforms a covariance from the old mean to the one moved by d: Jr P
+    Jr'. With `back`, it multiplies by the inverse, which transforms a covariance in the other direction.
     """
     factors_of = inverse_right_jacobian_factors if back else right_jacobian_factors
     turns = tuple(t for kind, _, t, _ in manifold_blocks(kinds) if kind == "quaternion")
@@ -152,7 +152,7 @@ def right_jacobian_factors(squared: float) -> tuple[float, float]:
 
 
 def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
-    """Compute the factors of its inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
+    """Compute the factors of the inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
     angle = np.sqrt(squared)
     if angle < 0.05:
         second = (1.0 + squared / 60.0 * (1.0 + squared / 42.0)) / 12.0
@@ -163,10 +163,10 @@ def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def recentring(kinds: tuple[str, ...]) -> Recentre:
-    """Make `recentre(values, shift)`: tangent vectors (L, t) from a centre become those from its shift.
+    """Make `recentre(values, shift)`, which changes the centre of tangent vectors (L, t) by a shift.
 
-    Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a
-    rotation is not yet settled.
+    It returns whether the weighted sum of the values may still differ from zero, because an angle was
+    wrapped or rotations have not converged.
     """
     parts = tuple(manifold_blocks(kinds))
 
@@ -192,7 +192,7 @@ def recentring(kinds: tuple[str, ...]) -> Recentre:
                     values[index, t] = change
             else:
                 x, y, z = shift[t], shift[t + 1], shift[t + 2]
-                if max(abs(x), abs(y), abs(z)) > SETTLED:  # else they are where they were
+                if max(abs(x), abs(y), abs(z)) > SETTLED:  # otherwise they do not change
                     again = True
                     turned_back = conjugate(from_vector(x, y, z))
                     for index in range(len(values)):
@@ -205,7 +205,7 @@ def recentring(kinds: tuple[str, ...]) -> Recentre:
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Multiply two quaternions: Hamilton's product."""
+    """Compute the Hamilton product of two quaternions."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -215,20 +215,20 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """Invert a unit quaternion."""
+    """Return the conjugate of a quaternion, which is the inverse of a unit quaternion."""
     return q[0], -q[1], -q[2], -q[3]
 
 
 def from_vector(x: float, y: float, z: float) -> Quaternion:
-    """Make the unit quaternion of a rotation vector."""
-    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)  # not zero, where sine / half is one
-    cosine, sine = np.cos(half), np.sin(half)  # of one number: libm gives both at once
+    """Return the unit quaternion of a rotation vector."""
+    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)  # not zero, so that sine / half is 1 there
+    cosine, sine = np.cos(half), np.sin(half)  # of the same number: libm computes both together
     scale = 0.5 * sine / half
     return cosine, scale * x, scale * y, scale * z
 
 
 def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Make the shortest rotation vector of a unit quaternion, which is that of its negative too."""
+    """Return the shortest rotation vector of a unit quaternion, which is also that of its negative."""
     sign = -1.0 if w < 0.0 else 1.0
     length = np.sqrt(x * x + y * y + z * z)
     angle = np.arctan2(length, sign * w)

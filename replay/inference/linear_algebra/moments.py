@@ -1,7 +1,7 @@
-"""Forms weighted samples from a covariance's factor, and their means and covariances.
+"""Weighted samples from a covariance's factor, and their means and covariances.
 
-All sums stay in registers: arrays might overlap, for all that a compiler knows. A kernel reads the whole
-of a tuple that changes wherever its name stands, so that such a tuple is gone through, not indexed.
+All sums are kept in registers, since a compiler must assume that arrays overlap. A kernel reads a whole
+changing tuple at every mention of its name; therefore such tuples are iterated over, not indexed.
 """
 
 from collections.abc import Callable
@@ -11,17 +11,17 @@ from typing import Protocol
 from fuselog.replay.engine.arrays import Floats, Numbers
 from fuselog.replay.inference.linear_algebra.tuples import total
 
-REGISTERS = 32  # of a processor: sums beyond these are kept in memory
+REGISTERS = 32  # of a processor: further sums are kept in memory
 
 
 class Offset(Protocol):
-    """Multiplies a triangle, as `lower_of` reads it, by a row of points (L, N)."""
+    """Function that multiplies a triangle, as `lower_of` reads it, by a row of points (L, N)."""
 
     def __call__(self, lower: Numbers, points: Floats, index: int, /) -> Numbers: ...
 
 
 class Moments(Protocol):
-    """Fills weighted covariances of values, see `moments_of`."""
+    """Function that fills weighted covariances of values; see `moments_of`."""
 
     def __call__(
         self,
@@ -36,14 +36,14 @@ class Moments(Protocol):
 
 
 class WeightedMean(Protocol):
-    """Fills the weighted sums (v,) of values (L, v)."""
+    """Function that fills the weighted sums (v,) of values (L, v)."""
 
     def __call__(self, weights: Floats, found: Floats, mean: Floats, /) -> None: ...
 
 
 @lru_cache(maxsize=64)
 def lower_of(size: int) -> Callable[[Floats], Numbers]:
-    """Make `read(factor)`: it reads the rows of a lower triangle as one tuple."""
+    """Make `read(factor)`, which returns the rows of a lower triangle as one tuple."""
     places = tuple((row, column) for row in range(size) for column in range(row + 1))
 
     def read(factor: Floats) -> Numbers:
@@ -68,9 +68,10 @@ def offset_of(size: int) -> Offset:
 
 @lru_cache(maxsize=64)
 def moments_of(states: int, values: int) -> Moments:
-    """Make `moments(weights, offsets, found, shift, spread, cross)`: weighted covariances.
+    """Make `moments(weights, offsets, found, shift, spread, cross)`, which fills weighted covariances.
 
-    Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t).
+    They are those of the values `found` (L, v) minus `shift` (v,) with each other, and with the offsets
+    (L, >= t).
     """
     parts = tuple(_moments_of_some(states, chosen) for chosen in _in_parts(states, values))
 
@@ -84,7 +85,7 @@ def moments_of(states: int, values: int) -> Moments:
 
 
 def _in_parts(states: int, values: int) -> list[range]:
-    """Split the values in parts: each has sums for as many registers as there are, or is one value."""
+    """Split the values into parts whose sums fit into the registers, or which are single values."""
     parts = [range(0)]
     for i in range(values):
         own = range(parts[-1].start, i + 1)
@@ -94,7 +95,7 @@ def _in_parts(states: int, values: int) -> list[range]:
 
 
 def _moments_of_some(states: int, chosen: range) -> Moments:
-    """Make `moments` of some values: with themselves and those before, in one loop."""
+    """Make `moments` for some values, with each other and with those before, in one loop."""
     pairs = tuple((i, j) for i in chosen for j in range(i + 1))
     mixed = tuple((row, i) for row in range(states) for i in chosen)
     size, first = chosen.stop, chosen.start
@@ -124,7 +125,7 @@ def _moments_of_some(states: int, chosen: range) -> Moments:
 
 @lru_cache(maxsize=64)
 def weighted_mean_of(values: int) -> WeightedMean:
-    """Make `fill(weights, found, mean)`: it fills the weighted sums (v,) of values (L, v)."""
+    """Make `fill(weights, found, mean)`, which fills the weighted sums (v,) of values (L, v)."""
 
     def fill(weights: Floats, found: Floats, mean: Floats) -> None:
         sums = (0.0,) * values

@@ -1,9 +1,8 @@
-"""Offers linear algebra of a few components to estimators of one's own: scalar loops, in place.
+"""Linear algebra with a few components for users' own estimators: scalar loops, in place.
 
-They are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`) and make
-no
-arrays: what they work in is made there once, before the loop over the messages. Covariances stay
-symmetric. A Kalman filter of x' = F x + w and z = H x + v is
+The functions are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`)
+and make no arrays: working memory is allocated there once, before the loop over the messages.
+Covariances stay symmetric. A Kalman filter for x' = F x + w and z = H x + v is
 
     memory, product = update_memory(states, components), np.empty((states, states))
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
@@ -33,26 +32,27 @@ __all__ = ["UpdateMemory", "cholesky", "predict", "solve", "update", "update_mem
 
 
 class UpdateMemory(NamedTuple):
-    """Holds what `update` works in; afterwards the innovation is used up."""
+    """Working memory of `update`, which overwrites the innovation."""
 
     innovation: Innovation
     step: Floats
 
 
 def update_memory(states: int, components: int) -> UpdateMemory:
-    """Make memory for updates of so many states by up to so many measured components."""
+    """Allocate memory for updates of `states` components by at most `components` measured ones."""
     return UpdateMemory(no_innovation(states, components), np.empty(states))
 
 
 def solve(matrix: Floats, right: Floats, size: int) -> bool:
-    """Solve A x = b in place, by Cholesky's factor of the leading block, which overwrites A.
+    """Solve A x = b in place, by the Cholesky factor of the leading block, which overwrites A.
 
     Args:
         matrix: A (n, n), symmetric positive definite in its first `size` rows and columns.
         right: b (n,).
-        size: how many equations there are.
+        size: number of equations.
 
-    Returns whether A was positive definite; `right` is as it was where not.
+    Returns:
+        Whether A was positive definite; otherwise `right` is not changed.
     """
     if not cholesky(matrix, matrix, size):
         return False
@@ -77,7 +77,7 @@ def predict(
         covariance: P (n, n).
         transition: F (n, n).
         noise: Q (n, n).
-        product: (n, n) to work in.
+        product: (n, n) working memory.
     """
     size = len(mean)
     for row in range(size):
@@ -106,13 +106,14 @@ def update(
     Args:
         mean: x (n,).
         covariance: P (n, n).
-        difference: v = z - h(x) (m,), NaN where a component is missing.
+        difference: v = z - h(x) (m,), NaN for missing components.
         rows: H (m, n), the derivative of the measurement by the state.
         noise: R (m, m).
-        memory: of `update_memory`.
-        gate: nothing changes where the NIS is beyond this.
+        memory: working memory from `update_memory`.
+        gate: largest NIS; nothing is updated if it is exceeded.
 
-    Returns the NIS v' S^-1 v; NaN where S is not positive definite, and nothing has changed.
+    Returns:
+        The NIS v' S^-1 v; NaN if S is not positive definite, in which case nothing is updated.
     """
     innovation, step = memory.innovation, memory.step
     measured = len(difference)

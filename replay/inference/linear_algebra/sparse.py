@@ -1,7 +1,7 @@
-"""Propagates covariances through matrices whose zeros and ones are known in advance.
+"""Propagation of covariances through matrices whose zeros and ones are known in advance.
 
-A `Pattern` has for each row of a matrix its entries that may differ from zero: the column, and the entry
-itself where it is known. What is left out are products with zero: sums keep their order.
+For each row of a matrix, a `Pattern` has the entries that may be nonzero: the column, and the entry
+itself if it is constant. Only products with zero are left out: sums keep their order.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ Pattern = tuple[Row, ...]
 
 
 class Propagate(Protocol):
-    """Makes F P F' of a covariance P (t, t), and F P of the product; the last array is to work in."""
+    """Function that replaces P (t, t) by F P F' and fills F P; the last array is working memory."""
 
     def __call__(
         self, covariance: Floats, transition: Floats, product: Floats, turned: Floats, /
@@ -27,19 +27,19 @@ class Propagate(Protocol):
 
 
 class MeasureCovariance(Protocol):
-    """Fills C = P H' (t, m) and S = H C (m, m), of a covariance P (t, t) and rows H (m, t)."""
+    """Function that fills C = P H' (t, m) and S = H C (m, m), from P (t, t) and rows H (m, t)."""
 
     def __call__(self, covariance: Floats, rows: Floats, cross: Floats, spread: Floats, /) -> None: ...
 
 
 class AddThrough(Protocol):
-    """Adds G diag(variances) G' to a covariance (t, t), with a gain G (t, k)."""
+    """Function that adds G diag(variances) G' to a covariance (t, t), with a gain G (t, k)."""
 
     def __call__(self, covariance: Floats, gain: Floats, variances: Floats, /) -> None: ...
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
-    """Make the pattern of a matrix of so many rows from its entries by place (None where one varies)."""
+    """Make the pattern of a matrix with `rows` rows from its entries by index (None if one varies)."""
     if known is None:
         return None
     return tuple(
@@ -51,8 +51,8 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
 def propagating_covariance(pattern: Pattern | None) -> Propagate:
     """Make `move(covariance, transition, product, turned)`: P (t, t) becomes F P F', the product F P.
 
-    `turned` is to work in: the inner loops all go along rows, so that the compiler takes several columns
-    at once. What F leaves as it is, such as a bias, takes no sums.
+    `turned` is working memory: all inner loops go along rows, so that the compiler can process several
+    columns together. Components that F does not change, such as a bias, need no sums.
     """
     if pattern is None:
 

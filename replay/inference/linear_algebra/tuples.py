@@ -1,7 +1,7 @@
-"""Converts between the tuples of a model's functions and the arrays that kernels work in.
+"""Conversion between the tuples of a model's functions and the arrays that kernels work in.
 
-A kernel has no index into a tuple that it does not know while it is compiled: what goes through one is a
-loop over something known, which is written out (`range_of`).
+A kernel can only index a tuple by numbers that are known when it is compiled: loops over tuples go over
+a known range and are unrolled (`range_of`).
 """
 
 from collections.abc import Sequence
@@ -12,31 +12,31 @@ from fuselog.replay.engine.arrays import Floats, Numbers
 
 
 class ReadTuple(Protocol):
-    """Reads entries of an array (n,), or of a tuple, as a tuple."""
+    """Function that reads entries of an array (n,), or of a tuple, as a tuple."""
 
     def __call__(self, array: Floats | Numbers, /) -> Numbers: ...
 
 
 class Fill(Protocol):
-    """Fills numbers into the first entries of an array (n,)."""
+    """Function that writes numbers to the first entries of an array (n,)."""
 
     def __call__(self, array: Floats, values: Sequence[float] | Floats, /) -> None: ...
 
 
 class AddNoise(Protocol):
-    """Adds variances, or rows of a lower triangle, to a covariance (t, t)."""
+    """Function that adds variances, or rows of a lower triangle, to a covariance (t, t)."""
 
     def __call__(self, covariance: Floats, noise: Sequence[float] | Floats, /) -> None: ...
 
 
 def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
-    """Return the numbers of `range` as a tuple, for a loop that is written out."""
+    """Return the numbers of `range` as a tuple, for a loop that is unrolled."""
     return tuple(range(start) if end is None else range(start, end))
 
 
 @lru_cache(maxsize=256)
 def tuple_of(size: int, start: int = 0) -> ReadTuple:
-    """Make `read(array)`: it reads `size` entries of an array from `start` on, as a tuple."""
+    """Make `read(array)`, which returns `size` entries of an array from `start` on, as a tuple."""
 
     def read(array: Floats | Numbers) -> Numbers:
         return tuple(array[start + index] for index in range(size))
@@ -46,7 +46,7 @@ def tuple_of(size: int, start: int = 0) -> ReadTuple:
 
 @lru_cache(maxsize=256)
 def filling(size: int) -> Fill:
-    """Make `fill(array, values)`: it fills the first entries of a tuple into an array."""
+    """Make `fill(array, values)`, which copies the first entries of a tuple to an array."""
 
     def fill(array: Floats, values: Sequence[float] | Floats) -> None:
         for index in range_of(size):
@@ -56,7 +56,7 @@ def filling(size: int) -> Fill:
 
 
 def total(numbers: Sequence[float]) -> float:
-    """Sum a tuple of numbers, from the first on; how `sum` rounds depends on Python's version."""
+    """Sum a tuple of numbers in order; the rounding of `sum` depends on the version of Python."""
     found = numbers[0]
     for number in numbers[1:]:
         found = found + number
@@ -65,10 +65,10 @@ def total(numbers: Sequence[float]) -> float:
 
 @lru_cache(maxsize=64)
 def adding_noise(size: int, block: int = 0) -> AddNoise:
-    """Make `add(covariance, noise)`: it adds variances, or rows of a lower triangle, given as a tuple.
+    """Make `add(covariance, noise)`, which adds variances, or a lower triangle, given as a tuple.
 
-    The triangle is that of the first `block` components, behind which are variances of the others; of
-    all components unless it is given.
+    The triangle is that of the first `block` components, by default of all, followed by variances of the
+    other components.
     """
     corner = block or size
     triangle = tuple((row, column) for row in range(corner) for column in range(row + 1))
