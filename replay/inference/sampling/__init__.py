@@ -1,4 +1,4 @@
-"""Makes and keeps sample sets of N(0, I) for linear regression Kalman filters.
+"""Sample sets of N(0, I) for linear regression Kalman filters, and their cache.
 
 Begin with `samplers`.
 """

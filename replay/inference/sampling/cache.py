@@ -1,8 +1,8 @@
-"""Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
+"""Cache of LCD sets on disk: each set is computed once, and damaged files are never used.
 
-A file (see `fuselog.recorders.compiling.cache`) holds a NumPy npz archive whose members are named
-after their sets. Common sets ship with the package (see `sampling.ship`); others are kept
-in the user's cache.
+A file (see `fuselog.recorders.compiling.cache`) contains a NumPy npz archive whose members are named
+after their sets. Common sets ship with the package (see `sampling.ship`); others are stored in the
+user's cache.
 """
 
 import io
@@ -30,7 +30,7 @@ SHIPPED = files("fuselog_data") / "lcd-samples.bin"
 
 @dataclass(frozen=True)
 class SetName:
-    """Identifies one moment-corrected LCD set."""
+    """Identification of one moment-corrected LCD set."""
 
     dimension: int
     count: int
@@ -38,17 +38,17 @@ class SetName:
     seed: int = 0
 
     def __str__(self) -> str:
-        """Return the name in an archive; raise its version whenever another set is to come out."""
+        """Return the name in an archive; its version must change whenever the computed sets change."""
         kind = "symmetric" if self.symmetric else "free"
         return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
 
 
 def cached_set(name: SetName, report: Report = silent) -> Array:
-    """Return one set (count, dimension), from the shipped file, the user's cache, or computed now.
+    """Return one set (count, dimension), from the shipped file, the user's cache, or a new computation.
 
     Args:
         name: the set.
-        report: told when the set is computed, how far that is, and where it could not be kept.
+        report: called with messages if the set is computed, on the progress, and if it cannot be stored.
 
     Raises:
         BadInput: no such set exists, see `check_count`.
@@ -82,7 +82,7 @@ def compute_set(name: SetName, report: Report = silent) -> Array:
 
 
 def read_set(source: Path | Traversable, name: SetName) -> Array | None:
-    """Return one set of a file, or None where the file is damaged or one of them is not there."""
+    """Return one set of a file, or None if the file is damaged or does not contain it."""
     archive = read_checked(source)
     if archive is None:
         return None
@@ -92,7 +92,7 @@ def read_set(source: Path | Traversable, name: SetName) -> Array | None:
 
 
 def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:
-    """Write sets to one file, which appears whole or not at all; raises BadInput."""
+    """Write sets to one file, which appears completely or not at all; raise BadInput if this fails."""
     archive = io.BytesIO()
     members = {str(name): points for name, points in sets.items()}
     np.savez(archive, **members)  # type: ignore[arg-type]

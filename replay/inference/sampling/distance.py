@@ -1,13 +1,15 @@
-"""Measures how far a sample set is from N(0, I), by localized cumulative distributions (LCD).
+"""Distance of a sample set from N(0, I), by localized cumulative distributions (LCD).
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 Definition V.2 and (26): the modified Cramér-von Mises distance D, here divided by pi^(N/2). The paper
-leaves b_max open; here it is B = 10.
+does not specify b_max; here it is B = 10.
 
 D is a small difference of large terms. With weights w_i and d = |s_i - s_j|^2, (26) integrates to
+
     D3 = B^2 / 2 sum_ij w_i w_j E2(d / 4B^2),
     D2 = sum_i w_i integral_0^B b (2b^2 / (1 + 2b^2))^(N/2) exp(-|s_i|^2 / (2 + 4b^2)) db.
-What does not depend on the samples is summed once, and E2 - 1 and exp - 1 are summed over the samples.
+
+Terms that do not depend on the samples are summed once; E2 - 1 and exp - 1 are summed over the samples.
 """
 
 from functools import lru_cache
@@ -27,30 +29,30 @@ PANELS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, B_MAX])
 NODES_PER_PANEL = 12  # exact to rounding for N up to 100
 
 # Exponential integrals for u <= 1: E1 = -log u + sum_k E1_SERIES[k] u^k and
-# E2 - 1 = u (log u + sum_k E2_SERIES[k] u^k). The first term left out is below 1e-18.
+# E2 - 1 = u (log u + sum_k E2_SERIES[k] u^k). The first omitted term is below 1e-18.
 TERMS = 19
 E1_SERIES = (-np.euler_gamma, *(-((-1.0) ** k) / (k * factorial(k)) for k in range(1, TERMS)))
 E2_SERIES = (np.euler_gamma - 1, *((-1.0) ** k / (k * factorial(k + 1)) for k in range(1, TERMS)))
 
 
 class _Quadrature(NamedTuple):
-    """Approximates integrals over b by sums: D2(s) = sum_q factors[q] exp(-rates[q] |s|^2)."""
+    """Quadrature of integrals over b: D2(s) = sum_q factors[q] exp(-rates[q] |s|^2)."""
 
     rates: Array
     factors: Array
     constant: float
-    """D of a set whose samples all lie at the origin."""
+    """D of a set whose samples are all at the origin."""
 
 
 def lcd_distance(points: Array, weights: Array | None = None) -> float:
-    """Return D / pi^(N/2) between a sample set and N(0, I).
+    """Compute D / pi^(N/2) between a sample set and N(0, I).
 
     Args:
         points: (L, N).
-        weights: (L,), summing to 1, negative ones allowed; all equal when left out.
+        weights: (L,), summing to 1, possibly negative; equal by default.
 
     Raises:
-        BadInput: the shapes do not fit, a value is not finite, or the weights do not sum to 1.
+        BadInput: the shapes do not match, a value is not finite, or the weights do not sum to 1.
     """
     if points.ndim != 2 or 0 in points.shape or not np.isfinite(points).all():
         raise BadInput(
@@ -64,7 +66,7 @@ def lcd_distance(points: Array, weights: Array | None = None) -> float:
 
 
 def lcd_distance_and_gradient(points: Array, weights: Array) -> tuple[float, Array]:
-    """Return D / pi^(N/2) and its gradient (L, N) by the points (L, N); unchecked, for optimisers."""
+    """Compute D / pi^(N/2) and its gradient (L, N) by the points (L, N), without checks."""
     rates, factors, constant = _quadrature(points.shape[1])
     decays = np.expm1(-np.multiply.outer(np.sum(points**2, axis=1), rates))
     pulls = 4 * np.vecdot(decays + 1, factors * rates)
@@ -91,14 +93,14 @@ def _quadrature(dimension: int) -> _Quadrature:
     )
 
 
-# The costly loops below sum nothing over their innermost index, so a compiler can turn them into vector
-# instructions without reordering. With fastmath the bytes depended on whether numba's cache was warm.
+# The costly loops below do not sum over their innermost index, so a compiler can vectorize them without
+# reordering. With fastmath, the results depended on whether numba's cache was warm.
 
 
 def _sum_pairs(coordinates: Array, weights: Array, gradient: Array, work: Array) -> float:
-    """Sum B^2/2 w_i w_j (E2 - 1) over all i, j; adds its gradient (N, L), for coordinates (N, L).
+    """Sum B^2/2 w_i w_j (E2 - 1) over all i, j, and add its gradient (N, L), for coordinates (N, L).
 
-    `work` (3 + L, L) is 0.
+    `work` (3 + L, L) must be zero.
     """
     dimension, count = coordinates.shape
     u, e1, e2, pulls = work[0], work[1], work[2], work[3:]
@@ -125,7 +127,7 @@ _pair_sum = compiled(_sum_pairs)
 
 
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
-    """Fill e1 with E1(u) and e2 with E2(u) - 1: the series for all, then what lies beyond it."""
+    """Fill e1 with E1(u) and e2 with E2(u) - 1: by the series, and by another method for u > 1."""
     for j in range(len(u)):
         e2[j] = log(u[j])
     for j in range(len(u)):
@@ -142,7 +144,7 @@ def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
 
 
 def _exponential_integrals_beyond_one(u: float) -> tuple[float, float]:
-    """Compute E1(u) and E2(u) - 1 for u > 1, by the continued fraction of E1 from its tail."""
+    """Compute E1(u) and E2(u) - 1 for u > 1, by evaluating the continued fraction of E1 from its end."""
     tail = 0.0
     for k in range(20 + int(80 / u), 0, -1):
         tail = k / (1 + k / (u + tail))

@@ -1,8 +1,9 @@
-"""Computes equally weighted samples of N(0, I) that are as close to it as can be: LCD sampling.
+"""LCD sampling: equally weighted samples of N(0, I) that are as close to it as possible.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section V.A. The paper does not say that the optimum's covariance is too small (eigenvalues of .82 for 5
-samples in two dimensions, .99 for 150), which ruins a filter: apply `moment_corrected` before use.
+section V.A. The paper does not mention that the optimum's covariance is too small (eigenvalues of 0.82
+for 5 samples in two dimensions, 0.99 for 150), which degrades a filter: apply `moment_corrected` before
+use.
 """
 
 from collections.abc import Callable
@@ -18,12 +19,12 @@ Report = Callable[[str], object]
 
 STARTS = 8
 OBJECTIVE_SCALE = 1000.0
-# D is flat around its optimum: stop where rounding stops the line search, not before.
+# D is flat around its optimum: stop only when rounding stops the line search.
 OPTIMISER = {"ftol": 1e-15, "gtol": 1e-9, "maxcor": 20, "maxiter": 10**6, "maxfun": 10**6}
 
 
 def silent(_: str) -> None:
-    """Report progress to nobody."""
+    """Ignore a progress report."""
 
 
 def lcd_samples(
@@ -35,20 +36,23 @@ def lcd_samples(
     starts: int = STARTS,
     report: Report = silent,
 ) -> Array:
-    """Return the sample set (count, dimension) of smallest D among local optima, not moment-corrected.
+    """Compute the sample set (count, dimension) with the smallest D of several local optima.
+
+    The set is not moment-corrected.
 
     Args:
         dimension: N.
         count: L.
-        generator: draws the starts from N(0, I); the optimum found depends on it, and its rotation.
-        symmetric: with every sample its mirror image at the origin; an odd one out lies at the origin.
-        starts: how many local optima to find.
-        report: told before each start.
+        generator: draws the starts from N(0, I); the optimum and its rotation depend on it.
+        symmetric: whether the set contains the mirror image of every sample at the origin; with an odd
+            count, one sample is at the origin.
+        starts: number of local optima to find.
+        report: called with a message before each start.
 
     Raises:
         BadInput: the set could not have a regular covariance, see `check_count`.
     """
-    from scipy.optimize import minimize  # which takes long to import
+    from scipy.optimize import minimize  # slow to import
 
     check_count(dimension, count, symmetric)
     free = count // 2 if symmetric else count
@@ -70,14 +74,14 @@ def lcd_samples(
     for start in range(starts):
         report(f"{count} samples in {dimension} dimensions: start {start + 1} of {starts}")
         begin = generator.standard_normal(free * dimension)
-        with threadpool_limits(1):  # products this small only keep a second core spinning
+        with threadpool_limits(1):  # for products this small, a second core would only spin
             optima.append(minimize(objective, begin, jac=True, method="L-BFGS-B", options=OPTIMISER))
     found: Array = min(optima, key=lambda optimum: optimum.fun).x
     return whole(found)
 
 
 def check_count(dimension: int, count: int, symmetric: bool) -> None:
-    """Raise BadInput where `count` samples in `dimension` dimensions cannot have covariance I."""
+    """Raise BadInput if `count` samples in `dimension` dimensions cannot have covariance I."""
     least = 2 * dimension if symmetric else dimension + 1
     if dimension < 1:
         raise BadInput(f"a sample set needs a dimension of 1 or more, found {dimension}")
@@ -90,7 +94,7 @@ def check_count(dimension: int, count: int, symmetric: bool) -> None:
 
 
 def moment_corrected(points: Array) -> Array:
-    """Return the set (L, N) with mean 0 and covariance I: shifted, and multiplied by C^(-1/2).
+    """Shift the set (L, N) to mean 0, and multiply it by C^(-1/2) to get covariance I.
 
     Raises:
         BadInput: the set's covariance is singular.

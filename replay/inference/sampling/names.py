@@ -1,10 +1,10 @@
-"""Names samplings as a command line writes them, and says what each name stands for.
+"""Names of samplings, as on a command line, and their meaning.
 
 ukf  ukf:kappa=0              unscented
 gf-25                         25 Gaussian-filter points on each axis
 rukf-12                       randomised unscented, 12 iterations
 s2kf-50  s2kf-50:symmetric    50 LCD samples
-s2kf-50:seed=3:rotation=7     of another optimisation, and turned at random
+s2kf-50:seed=3:rotation=7     from another optimization, and rotated at random
 """
 
 import re
@@ -41,18 +41,18 @@ PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-
 
 
 class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
-    """Names a way to sample N(0, I) in any dimension; `str` gives its name back."""
+    """A way to sample N(0, I) in any dimension; `str` returns its name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     family: ClassVar[str]
     number: ClassVar[str | None] = None
-    """The field that the number after the family's name sets."""
+    """Field that is set by the number after the family's name."""
 
     def at(self, dimension: int, report: Report = silent) -> Sampler:
-        """Return the sampler for one dimension; `report` is told when samples must be computed first.
+        """Make the sampler for one dimension; `report` is called if samples must be computed first.
 
         Raises:
-            BadInput: the dimension is below 1, or this sampling cannot serve it.
+            BadInput: the dimension is below 1, or this sampling does not support it.
         """
         if dimension < 1:
             raise BadInput(f"{self}: a sampling needs a dimension of 1 or more, found {dimension}")
@@ -62,7 +62,7 @@ class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
     def _at(self, dimension: int, report: Report, /) -> Sampler: ...
 
     def __str__(self) -> str:
-        """Return the name, without what is left at its default."""
+        """Return the name, without options that have their default."""
         number = "" if self.number is None else f"-{getattr(self, self.number)}"
         options = [
             f":{key}" if value is True else f":{key}={value}"
@@ -73,7 +73,7 @@ class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
 
 
 class Unscented(Sampling):  # type: ignore[explicit-any]
-    """Names the points of the unscented transform; equal weights by default."""
+    """Points of the unscented transform; with equal weights by default."""
 
     family = "ukf"
     kappa: FiniteFloat = 0.5
@@ -83,7 +83,7 @@ class Unscented(Sampling):  # type: ignore[explicit-any]
 
 
 class GaussianFilter(Sampling):  # type: ignore[explicit-any]
-    """Names points on the axes only, as many on each as wanted."""
+    """Points on the axes only, `per_axis` on each."""
 
     family = "gf"
     number = "per_axis"
@@ -94,7 +94,7 @@ class GaussianFilter(Sampling):  # type: ignore[explicit-any]
 
 
 class RandomisedUnscented(Sampling):  # type: ignore[explicit-any]
-    """Names unscented sets, turned and stretched at random, new ones for every run and step."""
+    """Unscented sets with random rotations and radii, drawn for every run and step."""
 
     family = "rukf"
     number = "iterations"
@@ -105,7 +105,7 @@ class RandomisedUnscented(Sampling):  # type: ignore[explicit-any]
 
 
 class SmartSampling(Sampling):  # type: ignore[explicit-any]
-    """Names the S2KF's LCD samples; rotation 0 leaves the set as it was found."""
+    """LCD samples of the S2KF; rotation 0 leaves the set as it was found."""
 
     family = "s2kf"
     number = "count"
@@ -129,7 +129,7 @@ FAMILIES = {
 
 @lru_cache(maxsize=64)
 def parse_sampling(name: str) -> Sampling:
-    """Return the sampling that a name stands for; see the module's head for the names.
+    """Return the sampling of a name; see the module's docstring for the names.
 
     Raises:
         BadInput: the family is unknown, or a number or option is missing, unknown or out of bounds.

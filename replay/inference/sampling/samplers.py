@@ -1,4 +1,4 @@
-"""Makes sample sets of N(0, I), through the one interface that a filter takes.
+"""Samplers of N(0, I), with the interface that filters use.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section I.B; the randomised set is that of Dunik, Straka and Simandl, "The Development of a Randomised
@@ -20,7 +20,7 @@ Shape = tuple[int, ...]
 
 
 class Samples(NamedTuple):
-    """Holds points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
+    """Points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
 
     points: Array
     weights: Array
@@ -28,11 +28,12 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class Sampler:
-    """Draws by a sampling at one dimension.
+    """A sampler for one dimension.
 
-    `draw(generator, batch)` gives points (*batch, count, dimension) and weights (*batch, count). Unless
-    `redrawn`, they are read-only views of one set and the generator is not used. Batches drawn one after
-    the other have the same numbers as one batch of them all, so a log may be cut into blocks anywhere.
+    `draw(generator, batch)` returns points (*batch, count, dimension) and weights (*batch, count).
+    Unless `redrawn`, they are read-only views of one set and the generator is not used. Consecutive
+    batches have the same numbers as one batch of their total size, so that a log can be divided into
+    blocks anywhere.
     """
 
     dimension: int
@@ -42,13 +43,13 @@ class Sampler:
 
 
 def fixed(samples: Samples) -> Sampler:
-    """Return the sampler that always gives this set (L, N)."""
+    """Make the sampler that always returns this set (L, N)."""
     count, dimension = samples.points.shape
     return Sampler(dimension, count, False, partial(_repeat, samples))
 
 
 def randomised(dimension: int, iterations: int) -> Sampler:
-    """Return the sampler of `randomised_unscented`."""
+    """Make the sampler of `randomised_unscented`."""
     count = 2 * dimension * iterations + 1
     return Sampler(dimension, count, True, partial(randomised_unscented, dimension, iterations))
 
@@ -77,11 +78,11 @@ def unscented(dimension: int, kappa: float = 0.5) -> Samples:
 def axis_points(dimension: int, per_axis: int) -> Samples:
     """Return the Gaussian filter's set: `per_axis` points on each axis, with equal weights.
 
-    On an axis they halve D slices of equal probability, Phi(x_i) = (2i-1) / (2D), and are then scaled so
-    that the whole set has covariance I. An odd D's centre is shared: L = N (D - 1) + 1, otherwise N D.
-    With D = 2 this is the cubature rule, with D = 3 the equally weighted unscented set.
+    On an axis they are the medians of D slices of equal probability, Phi(x_i) = (2i-1) / (2D), scaled so
+    that the whole set has covariance I. With an odd D the axes share their centre: L = N (D - 1) + 1,
+    otherwise N D. With D = 2 this is the cubature rule, with D = 3 the equally weighted unscented set.
     """
-    from scipy.special import ndtri  # which takes long to import
+    from scipy.special import ndtri  # slow to import
 
     quantiles = ndtri((np.arange(per_axis) + 0.5) / per_axis)
     half = quantiles[(per_axis + 1) // 2 :]
@@ -95,10 +96,10 @@ def axis_points(dimension: int, per_axis: int) -> Samples:
 def randomised_unscented(
     dimension: int, iterations: int, generator: Generator, batch: Shape = ()
 ) -> Samples:
-    """Draw 2 N iterations + 1 points: an unscented set per iteration, randomly turned and stretched.
+    """Draw 2 N iterations + 1 points: one unscented set per iteration, with random rotation and radius.
 
     With Q uniform over rotations and rho^2 ~ chi2(N + 2), an iteration's points are +- rho Q e_i with
-    weight 1 / (2 rho^2 iterations) each; the centre has the rest of the weight, which may be negative.
+    weight 1 / (2 rho^2 iterations) each; the centre has the remaining weight, which may be negative.
     Every draw integrates cubics exactly, and any other function without bias.
     """
     rotation_size = dimension**2
@@ -118,16 +119,16 @@ def randomised_unscented(
 
 
 def rotated(samples: Samples, generator: Generator) -> Samples:
-    """Return the set turned by a rotation (or reflection) drawn uniformly."""
+    """Rotate (or reflect) the set by a matrix that is drawn uniformly."""
     dimension = samples.points.shape[-1]
     rotation = _orthonormal(generator.standard_normal((dimension, dimension)))
     return samples._replace(points=samples.points @ rotation)
 
 
 def _orthonormal(normals: Array) -> Array:
-    """Turn matrices (..., N, N) of standard normals into orthogonal ones, uniform over the group.
+    """Convert matrices (..., N, N) of standard normals to orthogonal ones, uniform over the group.
 
-    The QR decomposition is uniform only where its R has a positive diagonal (Mezzadri 2007).
+    The QR decomposition is uniform only if its R has a positive diagonal (Mezzadri 2007).
     """
     q, r = np.linalg.qr(normals)
     turned: Array = q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]

@@ -1,6 +1,6 @@
-"""Gives sample sets to compiled filters: one that serves every step, or a new one for each.
+"""Sample sets for compiled filters: one set for all steps, or a new one for each.
 
-A randomised sampling draws from a generator of each run's own, which the run's own data seed: so a run
+A randomised sampling uses a separate generator for each run, seeded by the run's data, so that a run
 gives the same estimates alone and in an ensemble.
 """
 
@@ -22,7 +22,7 @@ _UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
-    """Holds points (sets, L, N), weights (sets, L); use number u takes the set (u - first) * stride."""
+    """Points (sets, L, N) and weights (sets, L); use number u takes the set (u - first) * stride."""
 
     points: Array
     weights: Array
@@ -33,11 +33,11 @@ class SampleSets(NamedTuple):
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
 ) -> Iterator[tuple[RowSlice, SampleSets]]:
-    """Yield the sets of all runs, as many runs at once as memory should hold.
+    """Yield the sets of all runs, for as many runs together as memory should hold.
 
     Args:
-        sampler: which draws them.
-        generators: of the runs; a randomised sampling needs all of them, and moves them on.
+        sampler: sampler that draws the sets.
+        generators: generators of the runs; a randomised sampling needs and advances all of them.
         offsets: (runs + 1,); run r has the uses offsets[r]:offsets[r + 1].
     """
     runs = len(offsets) - 1
@@ -64,14 +64,14 @@ def sets_by_runs(
 def seeded_by_data(
     generators: Generators, data: Array, offsets: NDArray[np.int64], seed: int, function: int = 0
 ) -> Generators:
-    """Copy the runs' generators; one that is missing comes from `seed` and the run's first data.
+    """Copy the runs' generators; missing ones are seeded by `seed` and the run's first data.
 
     Args:
-        generators: of the runs.
-        data: (n, ...), of all runs, of which the first row of each counts.
-        offsets: (runs + 1,), where the data of each run begin.
-        seed: of the estimator.
-        function: of several that are sampled its number, from zero; each has generators of its own.
+        generators: generators of the runs.
+        data: (n, ...) of all runs; only the first row of each run is used.
+        offsets: (runs + 1,) first row of each run.
+        seed: seed of the estimator.
+        function: index of the sampled function, if there are several; each has separate generators.
     """
     words = np.ascontiguousarray(data).view(np.uint32).reshape(len(data), -1)
     return tuple(

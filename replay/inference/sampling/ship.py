@@ -1,7 +1,7 @@
-"""Computes the sample sets that ship with fuselog, in data/.
+"""Computation of the sample sets that ship with fuselog, in data/.
 
-Run it by `python -m fuselog.replay.inference.sampling.ship`. Another CPU may end in another
-optimum of (nearly) the same D, so sets that are there stay as they are.
+Run it by `python -m fuselog.replay.inference.sampling.ship`. Another CPU may find another optimum of
+(nearly) the same D, so existing sets are not computed again.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ COMMON = (
 
 
 def main() -> None:
-    """Compute the sets that the shipped file lacks, and replace it."""
+    """Compute the sets that the shipped file lacks, and replace the file."""
     found = {name: read_set(SHIPPED, name) for name in COMMON}
     sets = {
         name: compute_set(name, lambda message: print(message, flush=True)) if points is None else points
