@@ -1,5 +1,5 @@
-"""Holds the estimators and models of the core: robots, inertial units, batch least squares.
+"""Estimators and models of the core: robots, inertial units, batch least squares.
 
-Begin with `landmarks`. The methods that estimate models, such as `ekf`, are in
-`fuselog.replay.inference`; families have their own estimators in `fuselog.replay.families`.
+Begin with `landmarks`. Methods that estimate models, such as `ekf`, are in `fuselog.replay.inference`;
+families have their own estimators in `fuselog.replay.families`.
 """

@@ -1,8 +1,8 @@
-"""Localizes robots in the plane from odometry and whatever else there is.
+"""Localization of robots in the plane from odometry and other sensors.
 
-Sightings of mapped landmarks, position fixes, poses, headings; a gyro may say how fast the robot turns
-in place of its wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the
-next one. Thrun, Burgard and Fox, Probabilistic Robotics, chapters 3 and 7.
+These are sightings of mapped landmarks, position fixes, poses and headings; a gyro can replace the turn
+rate of the wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the next
+message. Thrun, Burgard and Fox, Probabilistic Robotics, chapters 3 and 7.
 """
 
 from collections.abc import Mapping
@@ -28,19 +28,19 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """States what odometry errs by; None takes what the log's channels state.
+    """Errors of odometry; values of None are read from the log's channels.
 
-    A noise density is the standard deviation of the readings times the root of the step between them:
-    0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
+    A noise density is the standard deviation of the readings times the square root of the step between
+    them: 0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
 
     Attributes:
         forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times
-            the root of the step.
+            the square root of the step.
         turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
-            root of the step.
-        forward_scale: the robot drives so many times what the odometry says.
-        turn_scale: the robot turns so many times what the odometry says, before the bias is added.
-        turn_bias_radps: the robot turns faster by so much than the odometry says.
+            square root of the step.
+        forward_scale: true forward speed divided by that of the odometry.
+        turn_scale: true turn rate divided by that of the odometry, before the bias is added.
+        turn_bias_radps: bias that is added to the turn rate of the odometry, after scaling.
     """
 
     forward_noise_density: NonNegativeFloat | None = None
@@ -51,18 +51,20 @@ class DeadReckoningParameters(ModelParameters):
 
 
 class LocalizationParameters(DeadReckoningParameters):
-    """States noise and bias of the sensors.
+    """Noise and biases of the sensors.
 
     Attributes:
-        sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state it.
+        sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state its
+            own.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
-        bias_range_m: ranges are too long by so much.
-        bias_bearing_rad: bearings are too large by so much.
-        bias_heading_rad: headings are too large by so much, as of a compass that is mounted turned.
-        fix_delay_s: a position was measured so long before its stamp.
-        lever_x_m, lever_y_m: where the antenna whose position fixes say is on the robot, ahead of and to
-            the left of the point that it turns about.
+        bias_range_m: measured range minus true range.
+        bias_bearing_rad: measured bearing minus true bearing.
+        bias_heading_rad: measured heading minus true heading, such as of a compass that is mounted
+            rotated.
+        fix_delay_s: time by which a position fix is stamped after its measurement.
+        lever_x_m, lever_y_m: position of the antenna on the robot, ahead of and to the left of the point
+        that it turns about.
     """
 
     sigma_heading_rad: PositiveFloat | None = None
@@ -78,7 +80,7 @@ class LocalizationParameters(DeadReckoningParameters):
 
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the pose at the end of an arc."""
+    """Move the pose along an arc."""
     forward, turn = velocity
     true = (
         parameters.forward_scale * forward,
@@ -96,26 +98,26 @@ def velocity_noise(duration_s: Any, parameters: Any) -> Components:
 
 
 def sight(pose: Components, place: Components) -> Components:
-    """Return range and bearing of a place; NaN on the very spot, where neither has a derivative."""
+    """Return range and bearing of a position; NaN if the pose is there, without a derivative."""
     distance, bearing = range_bearing(pose, place)
-    # 0, or NaN where the distance is 0: numba has no np.where for numbers
+    # 0, or NaN if the distance is 0: numba has no np.where for numbers
     defined = np.minimum(np.inf * (distance > 0.0), 0.0)
     return distance + defined, bearing + defined
 
 
 def range_and_bearing(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """Return range and bearing of a landmark, with the sensor's bias."""
+    """Return range and bearing of a landmark, with the sensor's biases."""
     distance, bearing = sight(pose, landmark)
     return distance + parameters.bias_range_m, bearing + parameters.bias_bearing_rad
 
 
 def range_alone(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """Return the range alone."""
+    """Return only the range of a landmark, with the sensor's bias."""
     return (range_and_bearing(pose, landmark, parameters)[0],)
 
 
 def bearing_alone(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """Return the bearing alone."""
+    """Return only the bearing of a landmark, with the sensor's bias."""
     return (range_and_bearing(pose, landmark, parameters)[1],)
 
 
@@ -135,44 +137,44 @@ def bearing_noise(parameters: Any) -> Components:
 
 
 def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
-    """Return where the antenna is."""
+    """Return the position of the antenna."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     forward, left = parameters.lever_x_m, parameters.lever_y_m
     return pose[0] + cosine * forward - sine * left, pose[1] + sine * forward + cosine * left
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix that does not state them."""
+    """Return the variances of a fix that does not state its own."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components:
-    """Return the pose itself."""
+    """Return the components of the pose."""
     return pose[0], pose[1], pose[2]
 
 
 def pose_noise(parameters: Any) -> Components:
-    """Return the variances of a pose that does not state them."""
+    """Return the variances of a pose that does not state its own."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
 def heading_alone(pose: Components, reference: Any, parameters: Any) -> Components:
-    """Return the heading alone, with the sensor's bias."""
+    """Return the heading, with the sensor's bias."""
     return (pose[2] + parameters.bias_heading_rad,)
 
 
 def heading_noise(parameters: Any) -> Components:
-    """Return the variance of a heading that does not state it."""
+    """Return the variance of a heading that does not state its own."""
     return (parameters.sigma_heading_rad**2,)
 
 
 def read_pose(stream: Stream) -> Floats:
-    """Return poses in the plane (n, 3) of those in space."""
+    """Project poses in space to poses in the plane (n, 3)."""
     return np.column_stack([stream["position_m"][:, :2], heading(stream["quaternion"])])
 
 
 def read_pose_covariance(stream: Stream) -> Floats:
-    """Return the covariances (n, 3, 3) of poses: x, y and a turn about z, of the frame's axes."""
+    """Return the covariances (n, 3, 3) of x, y and the rotation about z, in the axes of the frame."""
     return stream["covariance"].reshape(-1, 6, 6)[:, PLANAR][:, :, PLANAR]
 
 
@@ -182,27 +184,28 @@ def read_heading(stream: Stream) -> Floats:
 
 
 def read_heading_covariance(stream: Stream) -> Floats:
-    """Return their variances (n, 1, 1), which the channel states for all, about x, y and z."""
+    """Return the variances (n, 1, 1) of headings, as stated by the channel."""
     return np.full((len(stream), 1, 1), heading_variance(stream.metadata))
 
 
 def align(
     path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
 ) -> tuple[Floats, Floats] | None:
-    """Find the pose at the last of some fixes: the antenna's path turned and shifted to them.
+    """Find the pose at the last of several fixes by aligning the antenna's path with them.
 
-    By least squares. To its covariance is added what the odometry errs by: the mean of a random walk
-    over a span, seen from its end, has a third of the variance that it has grown to.
+    The path is rotated and shifted by least squares. The error of the odometry is added to the
+    covariance: the mean of a random walk over a span, seen from its end, has a third of the variance
+    that the walk has reached.
 
     Args:
-        path: poses (k, 3) where the odometry alone leads from zero, at the fixes.
-        places, covariances: of the fixes, (k, 2) in m, (k, 2, 2).
-        span_s: the time from the first to the last of them.
-        parameters: with the antenna's place and the odometry's noise densities.
+        path: poses (k, 3) at the fixes, where the odometry alone leads from zero.
+        places, covariances: positions (k, 2) in m of the fixes, and covariances (k, 2, 2).
+        span_s: time from the first to the last fix.
+        parameters: parameters with the antenna's position and the odometry's noise densities.
 
     Returns:
-        The pose (3,) and its covariance (3, 3), or None while the heading is less sure than
-        `COURSE_SIGMA_RAD`. See `start.Start`.
+        The pose (3,) and its covariance (3, 3), or None while the standard deviation of the heading
+        exceeds `COURSE_SIGMA_RAD`. See `start.Start`.
     """
     weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
     seen = np.stack(antenna(path.T, None, parameters), axis=1)
@@ -230,19 +233,19 @@ def align(
 
 
 def read_turn_rate(stream: Stream) -> Floats:
-    """Turn rates about the vertical (n, 1) of a gyro that is mounted upright."""
+    """Return the turn rates about the vertical (n, 1) of a gyro that is mounted upright."""
     return stream["turn_rate_radps"][:, 2:]
 
 
-COURSE_SIGMA_RAD = 0.1  # of a heading that is good enough to linearise at
-PLANAR = [0, 1, 5]  # x, y and the turn about z among the six of a pose
+COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearize at
+PLANAR = [0, 1, 5]  # x, y and the rotation about z, among the six components of a pose
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
 DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps": "linear"}
 SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
 COMPASS_ERRORS: Mapping[str, Kind] = {"bias_heading_rad": "angle"}
 LEVER: Mapping[str, Kind] = {"lever_x_m": "linear", "lever_y_m": "linear"}
-# How well each needs to be known before it is said to be: 1 %, 1 % of a radian per second, 20 cm, 50 ms.
+# Standard deviation up to which each counts as determined: 1 %, 0.01 rad/s.
 DRIVE_CALIBRATION: Mapping[str, float] = {
     "forward_scale": 0.01,
     "turn_scale": 0.01,
@@ -263,7 +266,7 @@ ODOMETRY = Control(
     estimates=True,
     fallbacks=(TURN_RATE,),
 )
-# Of logs that were not made for this model: wheels that slip as an indoor robot's may.
+# For logs that were not recorded for this model: slipping wheels of an indoor robot.
 START = Start(
     {"x_m": 1000.0, "y_m": 1000.0, "heading_rad": np.pi / np.sqrt(3.0)},
     {"forward_noise_density": 0.05, "turn_noise_density": 0.05},

@@ -1,1 +1,1 @@
-"""Finds positions from angles and arrival times, by batch least squares; begin with `least_squares`."""
+"""Positions from angles and arrival times, by batch least squares; begin with `least_squares`."""

@@ -1,10 +1,10 @@
-"""Solves iterated least squares over many runs at once, with the bound that belongs to it.
+"""Iterated least squares over many runs together, and the corresponding bound.
 
-A model says, for parameters (runs, n), how far each measurement is from its prediction, how predictions
-change with the parameters, and how noisy the measurements are. From that one answer come the step of
-the search, the Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the directions that
-no measurement sees. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with
-scaled columns and a halving line search; the weights follow the latest estimate.
+For parameters (runs, n), a model returns the residuals of the measurements, the derivatives of the
+predictions, and the covariance of the measurements. From these, the module computes the step of the
+search, the Fisher information, the Cramer-Rao lower bound (CRLB), the rank, and the unobservable
+directions. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with scaled
+columns and a step-halving line search; the weights follow the latest estimate.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,29 +19,28 @@ from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 Rows = NDArray[np.intp]
 
-# Keeps the scaled normal equations (unit diagonal) solvable where a direction is not observed at all.
+# Keeps the scaled normal equations (unit diagonal) solvable if a direction is unobservable.
 LEAST_DAMPING = 1e-12
-# Relative singular values of the scaled information root below this count as zero: exact deficiencies
-# come out near 1e-16.
+# Relative singular values of the scaled information root below this count as zero: exact rank
+# deficiencies result in about 1e-16.
 RANK_TOLERANCE = 1e-10
-# Components of a unit null vector below this are rounding.
+# Smaller components of a unit null vector are rounding errors.
 PARTICIPATION = 1e-8
 TOLERANCE = 1e-6  # of a step, in standard deviations
 SMALLEST_STEP = 2.0**-12
-# Costs are in squared standard deviations: less than this is rounding.
+# Costs are in squared standard deviations; smaller differences are rounding errors.
 COST_ROUNDING = 1e-12
-# Runs worked on together: their Jacobians stay in the processor's cache.
+# Number of runs that are processed together, so that their Jacobians stay in the processor's cache.
 BLOCK_RUNS = 256
 
 
 class Linearization(NamedTuple):
-    """Holds what a model says at given parameters.
+    """Result of a model at given parameters.
 
-    residual: (runs, m) measured minus predicted, angles wrapped.
-    jacobian: (runs, m, n) derivative of the prediction.
-    covariance: (runs, m) variances of independent errors, or (runs, blocks, k, k) where errors are
-    correlated within blocks of k measurements that follow each other, m = blocks k.
-    covariance_jacobian: derivative of `covariance`, one axis n more; None where it is constant.
+    residual: (runs, m) measured minus predicted, angles wrapped. jacobian: (runs, m, n) derivative of
+    the prediction. covariance: (runs, m) variances of independent errors; or (runs, blocks, k, k) if
+    errors are correlated within blocks of k consecutive measurements, m = blocks k. covariance_jacobian:
+    derivative of `covariance`, with another axis n; None if it is constant.
     """
 
     residual: Floats
@@ -54,7 +53,7 @@ Model = Callable[[Floats, Rows], Linearization]
 
 
 class Status(IntEnum):
-    """Describes how the search of one run ended."""
+    """How the search of one run ended."""
 
     CONVERGED = 0
     NO_START = 1
@@ -75,9 +74,9 @@ SENTENCES = {
 
 
 class Bound(NamedTuple):
-    """Holds the CRLB of each run: covariance (runs, n, n) and rank (runs,).
+    """The CRLB of each run: covariance (runs, n, n) and rank (runs,).
 
-    A parameter that takes part in an unobservable direction has infinite variance and no covariances.
+    A parameter that is part of an unobservable direction has infinite variance and no covariances.
     """
 
     covariance: Floats
@@ -85,7 +84,7 @@ class Bound(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Holds estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half chi-square."""
+    """Estimates (runs, n), their CRLB, and how each run ended; `cost` is half of chi-square."""
 
     parameters: Floats
     covariance: Floats
@@ -96,12 +95,12 @@ class Solution(NamedTuple):
 
     @property
     def converged(self) -> Booleans:
-        """Return which runs have an estimate, (runs,)."""
+        """Whether each run has an estimate, (runs,)."""
         return self.status == Status.CONVERGED
 
 
 class _Whitened(NamedTuple):
-    """Holds a linearization in standard deviations, and the whitener that made it so."""
+    """A linearization in units of standard deviations, and the whitener that was applied."""
 
     residual: Floats
     jacobian: Floats
@@ -120,17 +119,17 @@ class _Whitened(NamedTuple):
 
 
 def solve(model: Model, start: Floats, *, max_iterations: int = 50) -> Solution:
-    """Search the weighted least-squares estimate of every run from `start` (runs, n).
+    """Compute the weighted least-squares estimate of every run, starting from `start`.
 
-    `model(parameters, rows)` linearizes the runs `rows`, which may be none. A run has converged when its
-    next full step is shorter than `TOLERANCE` standard deviations in the metric of its own information;
-    that step is still taken. A row of `start` that is not finite is a run without a starting point.
-    Raises BadInput for a wrong shape only.
+    A run has converged when its next full step is shorter than `TOLERANCE` standard deviations in the
+    metric of its own information; that step is still taken.
 
     Args:
-        model: (parameters (k, n), rows (k,)) -> the linearisation of these runs.
-        start: (runs, n), not finite for a run without a starting point.
-        max_iterations: how many steps there are at most.
+        model: (parameters (k, n), rows (k,)) -> linearization of these runs; k may be zero.
+        start: (runs, n); not finite for a run without a starting point.
+        max_iterations: maximum number of steps.
+
+    Raises BadInput if `start` has a wrong shape.
     """
     if start.ndim != 2 or 0 in start.shape:
         raise BadInput(f"least squares: start has shape {start.shape}; give (runs, parameters)")
@@ -184,7 +183,7 @@ def _gauss_newton(here: _Whitened) -> tuple[Floats, Floats]:
 def _line_search(
     model: Model, parameters: Floats, rows: Rows, step: Floats, here: _Whitened
 ) -> tuple[Floats, _Whitened, Booleans]:
-    """Halve the steps of those runs whose cost would rise while the weights stay as they are here."""
+    """Halve the steps of runs whose cost would rise if the weights stayed constant."""
     limit = here.cost + COST_ROUNDING * (1.0 + here.cost)
 
     def attempt(some: Rows, factor: float) -> tuple[Floats, _Whitened, Booleans]:
@@ -207,7 +206,7 @@ def _line_search(
 
 
 def _judge(model: Model, parameters: Floats, iterations: Integers, status: Integers) -> Solution:
-    """Compute bound, rank and cost where each run ended."""
+    """Compute bound, rank and cost at the final parameters of each run."""
     runs, n = parameters.shape
     covariance, cost = np.full((runs, n, n), np.nan), np.full(runs, np.nan)
     rank = np.zeros(runs, np.int64)
@@ -220,11 +219,11 @@ def _judge(model: Model, parameters: Floats, iterations: Integers, status: Integ
 
 
 def information_root(at: Linearization) -> Floats:
-    """Return rows (runs, k, n) whose outer products sum to the Fisher information.
+    """Compute rows (runs, k, n) whose outer products sum to the Fisher information.
 
-    First the whitened Jacobian; then, where the covariance depends on the parameters, one row for each
-    of its entries: the trace term is half the scalar product of the whitened derivatives (Osborne et
-    al. 2014, eq (48)).
+    The first rows are the whitened Jacobian. If the covariance depends on the parameters, one row
+    follows for each of its entries: the trace term is half the scalar product of the whitened
+    derivatives (Osborne et al. 2014, eq. (48)).
     """
     whitener = _whitener(at.covariance)
     root = _apply(whitener, at.jacobian)
@@ -240,10 +239,10 @@ def information_root(at: Linearization) -> Floats:
 
 
 def cramer_rao_bound(at: Linearization) -> Bound:
-    """Invert the Fisher information, from its root, so that no digits are lost to squares.
+    """Invert the Fisher information from its root, so that squaring does not lose digits.
 
-    Where the triangular factor proves full rank it is inverted, which is fast; singular values decide
-    the rest. A run whose model is not finite has rank 0.
+    If the triangular factor proves full rank, it is inverted, which is fast; otherwise singular values
+    determine the rank. A run whose model is not finite has rank 0.
     """
     root, scale = _scaled_root(at)
     inverse, safe = _inverse_factor(root)
@@ -264,7 +263,7 @@ def cramer_rao_bound(at: Linearization) -> Bound:
 
 
 def unobservable_directions(at: Linearization) -> list[Floats]:
-    """Find each run's directions that no measurement sees, unit columns (n, n - rank), own units."""
+    """Find each run's unobservable directions, as unit columns (n, n - rank) in parameter units."""
     root, scale = _scaled_root(at)
     values, right = _singular_values(root)
     directions = scale[:, :, None] * right
@@ -274,7 +273,7 @@ def unobservable_directions(at: Linearization) -> list[Floats]:
 
 
 def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
-    """Return the information root with columns of unit length, and the scale that made them so."""
+    """Compute the information root with columns of unit length, and the scale that was applied."""
     root = information_root(at)
     root = np.where(np.isfinite(root).all(axis=(1, 2), keepdims=True), root, 0.0)
     scale = _column_scale(root)
@@ -282,9 +281,9 @@ def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
 
 
 def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
-    """Return matrices whose squares are the inverse information, and where the rank is full for sure.
+    """Compute roots of the inverse information, and whether the rank is certainly full.
 
-    With F the inverse of the triangular factor, no singular value is below 1 / |F| nor above sqrt(n).
+    With F the inverse of the triangular factor, no singular value is below 1 / |F| or above sqrt(n).
     """
     runs, rows, n = root.shape
     if rows < n:
@@ -298,7 +297,7 @@ def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
 
 
 def _singular_values(root: Floats) -> tuple[Floats, Floats]:
-    """Return all n singular values, largest first, and their right vectors as columns."""
+    """Compute all n singular values, largest first, and their right vectors as columns."""
     runs, rows, n = root.shape
     _, singular, right = np.linalg.svd(root, full_matrices=rows < n)
     values = np.zeros((runs, n))
@@ -307,10 +306,10 @@ def _singular_values(root: Floats) -> tuple[Floats, Floats]:
 
 
 def describe_direction(names: Sequence[str], direction: Floats) -> str:
-    """Name a direction by the shares of its parameters against the largest, in their order.
+    """Describe a direction by the shares of its parameters relative to the largest, in their order.
 
     Args:
-        names: of the n parameters.
+        names: names of the n parameters.
         direction: (n,); shares up to `PARTICIPATION` are left out.
     """
     share = direction / direction[np.argmax(np.abs(direction))]
@@ -319,11 +318,11 @@ def describe_direction(names: Sequence[str], direction: Floats) -> str:
 
 
 def mask_missing(at: Linearization, present: Booleans) -> Linearization:
-    """Take out the measurements that are not `present` (runs, m): they then carry no information.
+    """Remove the information of measurements that are not `present`.
 
     Args:
-        at: the linearisation of runs.
-        present: (runs, m).
+        at: linearization of the runs.
+        present: (runs, m) whether each measurement is present.
     """
     if present.all():
         return at
@@ -347,7 +346,7 @@ def _whiten(at: Linearization) -> _Whitened:
 
 
 def _whitener(covariance: Floats) -> Floats:
-    """Return an inverse square root of the covariance, in its shape; NaN where it is not positive."""
+    """Compute an inverse square root of the covariance, of the same shape; NaN if it is not positive."""
     if covariance.ndim == 2:
         positive = covariance > 0.0
         return np.where(positive, 1.0 / np.sqrt(np.where(positive, covariance, 1.0)), np.nan)
@@ -360,7 +359,7 @@ def _whitener(covariance: Floats) -> Floats:
 
 
 def _apply(whitener: Floats, columns: Floats) -> Floats:
-    """Whiten columns (runs, m, any)."""
+    """Multiply columns (runs, m, any) by the whitener."""
     if whitener.ndim == 2:
         return whitener[:, :, None] * columns
     blocks = columns.reshape(*whitener.shape[:3], columns.shape[2])
@@ -372,6 +371,6 @@ def _half_square(residual: Floats) -> Floats:
 
 
 def _column_scale(matrix: Floats) -> Floats:
-    """Return what gives each column (runs, m, n) unit length, (runs, n); 1 for a column of zeros."""
+    """Return factors (runs, n) that scale columns (runs, m, n) to unit length; 1 for zero columns."""
     norm = np.sqrt((matrix * matrix).sum(axis=1))
     return 1.0 / np.where(norm > 0.0, norm, 1.0)

@@ -1,4 +1,4 @@
-"""Intersects rays: the starting point of localization from angles."""
+"""Intersection of rays: the starting point of localization from angles."""
 
 import numpy as np
 
@@ -9,17 +9,16 @@ PARALLEL = 1e-12
 
 
 def intersect_rays(origin_m: Floats, direction: Floats) -> Floats:
-    """Find the point nearest to rays: (sum(I - u u'))^-1 sum((I - u u') origin), by least squares.
+    """Find the least-squares intersection of rays: (sum(I - u u'))^-1 sum((I - u u') origin).
 
-    Unit vectors `direction` u are (..., rays, d), origins (rays, d) or alike; a ray of NaNs is left out.
-    NaN where the rays do not meet: fewer than two are left, all are parallel, or all point away from it.
+    The result is NaN if fewer than two rays remain, if all are parallel, or if all point away from it.
 
     Args:
         origin_m: (rays, d), or with the batch axes of `direction`.
-        direction: u (..., rays, d), of unit length; NaN leaves a ray out.
+        direction: unit vectors u (..., rays, d); NaN leaves a ray out.
 
     Returns:
-        (..., d), in m.
+        Points (..., d), in m.
     """
     missing = np.isnan(direction)
     unit = np.where(missing, 0.0, direction)

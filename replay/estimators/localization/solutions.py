@@ -1,4 +1,4 @@
-"""Writes what batch estimators give: the estimates that were found, how each ended, failures by name."""
+"""Output streams of batch estimators: estimates, how each solution ended, and failures."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,19 +18,19 @@ from fuselog.replay.estimators.localization.least_squares import SENTENCES, Solu
 
 
 class Batches(NamedTuple):
-    """States what is solved together: the run of each batch, in order, and its last stamp."""
+    """Batches that are solved together: the run of each batch, in order, and its last stamp."""
 
     runs: int
     run: Integers
     time_ns: Integers
 
     def ragged(self, stream: Stream, rows: Booleans) -> Ragged:
-        """Return an output stream with a message for each of these batches."""
+        """Assign the messages of an output stream, one for each selected batch, to their runs."""
         return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
 
 
 def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
-    """Put the messages of all sensors in a table: run, sensor (its place there), time_ns, fields."""
+    """Combine the messages of all sensors in a table with run, sensor (index), time_ns, and fields."""
     return pd.concat(
         [
             pd.DataFrame(
@@ -48,9 +48,9 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
 
 
 def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integers]:
-    """Return a table's batches, one for each value of `key` in each run, and which one each row is of.
+    """Return a table's batches, one for each value of `key` in each run, and the batch of each row.
 
-    A run's batches are in the order of their last stamps, whatever their keys.
+    A run's batches are in the order of their last stamps.
     """
     groups = table.groupby(["run", key])
     last = groups["time_ns"].max()
@@ -63,7 +63,7 @@ def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integ
 def solution_streams(
     topic: str, truth: str, components: Sequence[str], batches: Batches, solution: Solution
 ) -> list[Ragged]:
-    """Return the streams TOPIC/state, TOPIC/solution and TOPIC/failure of one solution for each batch.
+    """Make the streams TOPIC/state, TOPIC/solution and TOPIC/failure, with one solution per batch.
 
     A batch that failed has no state; its failure is one of `SENTENCES`.
     """
@@ -97,7 +97,7 @@ def solution_streams(
 
 
 def positive(topic: Topic, name: str) -> float:
-    """Return a positive number that the channel's metadata states; raises BadInput where it does not."""
+    """Return a positive number from the channel's metadata; raise BadInput for any other value."""
     value = stated([topic], name)
     if not 0.0 < value < np.inf:
         raise BadInput(f"topic {topic.name} states {name} = {value:g}, which must be positive")

@@ -1,1 +1,1 @@
-"""Navigates by inertial units: model, sensors, alignment; begin with `navigation`."""
+"""Navigation by inertial units: model, sensors, alignment; begin with `navigation`."""

@@ -1,9 +1,9 @@
-"""Finds where inertial navigation starts from: levelled at rest, its heading from the course.
+"""Alignment of inertial navigation: tilt from samples at rest, heading from the course.
 
 Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
-section 5.6: roll and pitch from the specific force, of which gravity is all while nothing accelerates;
-the gyro's bias from what it says at rest; the heading from the first course that is worth one. How well
-each is known the same samples say, unless it is given.
+section 5.6: roll and pitch come from the specific force, which equals gravity while nothing accelerates;
+the gyro's bias from its mean at rest; the heading from the first course at sufficient speed. Unless they
+are given, the standard deviations are estimated from the same samples.
 """
 
 from collections.abc import Mapping
@@ -35,42 +35,47 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Started
 from fuselog.replay.inference.run.first_messages import WIDER
 
-LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
-SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
-LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
-USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
-SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
+LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; tolerance of its detection
+SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force, when the body starts to move
+LARGEST_BIAS_RADPS = 0.1  # three times the bias of the cheapest units
+USUAL_BIAS_RADPS = 0.0035  # standard deviation for a small unit that was never at rest
+SIDEWAYS_RAD, ALIKE = (
+    np.radians(60.0),
+    0.8,
+)  # reported angle of accelerations; correlation
 
 
 class AlignmentParameters(ModelParameters):
-    """States how the unit is mounted and delayed, and how the state at the start is found.
+    """Mounting and delay of the unit, and how the state at the start is found.
 
-    Tilt comes from the first samples. The body is assumed to rest until a margin before it first moves.
-    The heading is the course at the first speed that is high enough, less the turn of the gyro until
-    then; without such a speed it is unknown. Standard deviations of the start that are not given come
-    from the data: position and velocity start so uncertain that their first messages decide; the tilt
-    is as uncertain as the accelerometer's bias and the motion make it; the gyro's bias as its mean over
-    the rest; the heading as much as the course differs from the turn of the gyro.
+    Tilt comes from the first samples. The body is assumed to be at rest until a margin before it first
+    moves. The heading is the course when the speed is first high enough, minus the turn of the gyro
+    until then; without such a speed it is unknown. Standard deviations of the start that are not given
+    are estimated from the data: position and velocity start so uncertain that their first messages
+    determine them; the tilt is as uncertain as the accelerometer's bias and the motion imply; the gyro's
+    bias as uncertain as its mean at rest; the heading as much as the course differs from the turn of the
+    gyro.
 
-    The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
+    The mounting rotates the unit's axes to forward, left, up: by yaw about up, then pitch about left,
     then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: share of the force that is measured too much.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: share of the turn rate that is measured too much.
-        fix_delay_s: a position was measured so long before its stamp.
-        velocity_delay_s: a velocity was measured so long before its stamp.
-        inertial_delay_s: an inertial sample was measured so long before its stamp.
-        level_s: tilt comes from samples of so long.
-        still_mps: the body first moves where its speed is above this.
-        rest_margin_s: it is assumed to rest until so long before it first moves.
-        course_mps: the heading is the course at the first speed above this.
-        course_s: the heading's standard deviation is how much courses of so long differ from the turn of
-            the gyro.
+        force_scale_x, force_scale_y, force_scale_z: relative scale error of the specific force on this
+        axis.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative scale error of the turn rate about this axis.
+        fix_delay_s: time by which a position fix is stamped after its measurement.
+        velocity_delay_s: time by which a velocity is stamped after its measurement.
+        inertial_delay_s: time by which an inertial sample is stamped after its measurement.
+        level_s: duration of the first samples, from which the tilt is computed.
+        still_mps: speed above which the body is moving.
+        rest_margin_s: time before the body first moves until which it is assumed to be at rest.
+        course_mps: speed above which the course determines the heading.
+        course_s: duration over which courses are compared with the turn of the gyro to estimate the
+            heading's standard deviation.
         start_sigma_m: standard deviation of the position at the start, per axis.
-        start_sigma_mps: standard deviation of a velocity at the start that is measured, per axis.
-        unmeasured_sigma_mps: standard deviation of a velocity at the start that is not measured, per
+        start_sigma_mps: standard deviation of a measured velocity at the start, per axis.
+        unmeasured_sigma_mps: standard deviation of the velocity at the start if it is not measured, per
             axis.
         tilt_sigma_rad: standard deviation of roll and pitch at the start.
         heading_sigma_rad: standard deviation of the heading at the start.
@@ -105,28 +110,29 @@ class AlignmentParameters(ModelParameters):
 
 
 def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
-    """Return the specific force of the body by samples of the unit, force and rate, of this bias."""
+    """Return the specific force of the body from a sample of the unit (force, rate) and this bias."""
     x, y, z = mounted(samples[:3], parameters)
     sx, sy, sz = parameters.force_scale_x, parameters.force_scale_y, parameters.force_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
 
 
 def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
-    """Return the turn rate of the body, see `specific_force`."""
+    """Return the turn rate of the body from a sample of the unit and this bias; see `specific_force`."""
     x, y, z = mounted(samples[3:], parameters)
     sx, sy, sz = parameters.gyro_scale_x, parameters.gyro_scale_y, parameters.gyro_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find where to start: at the first fix within the unit's samples, with the velocity nearest to it.
+    """Find the start: the first fix within the unit's samples, with the velocity nearest to it in time.
 
     Args:
-        streams: `inertial` samples, `fix`, positions in the plane (east, north, up), and perhaps
-            `velocity`, velocities there.
+        streams: `inertial` samples, `fix`, positions in the local tangent plane (east, north, up), and
+            optionally `velocity`, velocities in that plane.
         parameters: `AlignmentParameters`.
 
-    Raises BadInput where there is no such fix, no gravity to level by, or numbers of another unit.
+    Raises BadInput if there is no such fix, if no gravity is measured, or if numbers seem to have
+    another unit.
     """
     samples, topic = read_samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
@@ -162,9 +168,9 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
-    """Find what looks wrong in the first samples of a body whose start is known.
+    """Describe what looks wrong in the first samples of a body whose start is known.
 
-    It is what `align` refuses, and only said here: the body may begin in motion.
+    The checks are those of `align`, but they are only reported, since the body may start in motion.
 
     Args:
         streams: see `align`.
@@ -189,16 +195,16 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """Return the covariance (3, 3) of a start at a message of this one, which is used once more."""
+    """Return the covariance (3, 3) of a start at a message of this covariance, which is used again."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
 
 def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
-    """Return that of the tilt and the accelerometer's bias (6, 6), in the body's axes, `up` being up.
+    """Return the covariance (6, 6) of tilt and accelerometer bias in the body's axes, with `up` up.
 
-    Where the tilt's is not given they go together: a bias is levelled away, and the body leans by as
-    much as the bias is of gravity.
+    If the tilt's standard deviation is not given, both are correlated: levelling compensates for a bias,
+    so the body tilts by the ratio of the bias to gravity.
     """
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
@@ -216,9 +222,9 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
 def _first_place(
     fix: Stream, samples: ImuSamples, topic: str, parameters: Any
 ) -> tuple[int, Floats, Floats]:
-    """Find when the first fix within the samples was measured, its place (3,) and covariance (3, 3).
+    """Return time, position (3,) and covariance (3, 3) of the first fix within the samples.
 
-    One in the plane has the height of the origin. Raises BadInput where there is none.
+    A fix in the plane has the height of the origin. Raises BadInput if there is no such fix.
     """
     sigma = stated_or(parameters.sigma_fix_m, USUAL_SIGMA_M)
     places = read_fixes(fix, "position_m", "covariance_m2", SPACE, sigma)
@@ -236,9 +242,9 @@ def _first_place(
 
 
 def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, float]:
-    """Find roll and pitch, rad, under which the mean of the first specific forces points up.
+    """Compute roll and pitch, rad, at which the mean of the first specific forces points up.
 
-    Raises BadInput where that is not gravity in m/s2, or points down.
+    Raises BadInput if it is not gravity in m/s2, or points down.
     """
     until_ns = samples.time_ns[0] + round(parameters.level_s / NS)
     x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
@@ -260,11 +266,12 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
 def _bias(
     samples: ImuSamples, topic: str, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[Floats, float]:
-    """Return the mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
+    """Return the mean turn rate (3,) at rest, zeros without rest, and its standard deviation.
 
-    The means of single stretches of `level_s` differ by noise and unrest; the earth turns too.
+    The standard deviation comes from the means of single stretches of `level_s`, which differ by noise
+    and motion, and from the rotation of the earth.
 
-    Raises BadInput where it is more than a gyro errs.
+    Raises BadInput if the rate exceeds the error of any gyro.
     """
     moved = motion.first_above(row, parameters.still_mps)
     end_ns = samples.time_ns[-1] if moved is None else motion.time_ns[moved]
@@ -289,7 +296,7 @@ def _bias(
 
 
 def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) -> str:
-    """Say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
+    """Report that the unit and the fixes start to move as far apart as the leap seconds of GPS time."""
     moved = motion.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
@@ -313,7 +320,7 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
 def _turned(
     samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
-    """Return seconds since the start (n,), of the samples from there on, and the turn about up."""
+    """Return the later samples' times since the start (n,) in s, and the turn about the vertical."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
@@ -322,8 +329,8 @@ def _turned(
 
 
 def _integral(values: NDArray, times_s: Floats) -> NDArray:
-    """Integrate values (n,) from the first time on, by the trapezoid rule."""
-    from scipy.integrate import cumulative_trapezoid  # which takes long to import
+    """Integrate values (n,) from the first time on, by the trapezoidal rule."""
+    from scipy.integrate import cumulative_trapezoid  # slow to import
 
     return np.asarray(cumulative_trapezoid(values, times_s, initial=0.0))
 
@@ -331,10 +338,11 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 def _heading(
     turning: tuple[Floats, Floats], start_ns: int, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[float, float] | None:
-    """Find the heading at the start, rad, and its standard deviation; None where nothing moves.
+    """Find the heading at the start, rad, and its standard deviation; None if nothing moves.
 
-    It is the first course, less what the body turned about up until then. A body that looks where it
-    goes has the same of all later courses; how much they differ is how far it may be off.
+    It is the first course, minus the turn of the body about the vertical until then. A body that faces
+    its direction of motion yields the same heading from all later courses; their differences determine
+    the standard deviation.
     """
     fast = motion.first_above(row, parameters.course_mps)
     if fast is None:
@@ -358,9 +366,9 @@ def _mounting(
     heading: float,
     parameters: Any,
 ) -> str:
-    """Say where the body accelerates in another direction than its velocity changes.
+    """Report that the body accelerates in another direction than its velocity changes.
 
-    Both are compared over the intervals of the velocities, in the plane and as complex numbers.
+    Both are compared over the intervals between the velocities, in the plane and as complex numbers.
     """
     since_s, turned = turning
     fast = motion.first_above(0, parameters.course_mps)

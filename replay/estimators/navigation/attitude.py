@@ -1,9 +1,9 @@
-"""Estimates the orientation of a body that is carried about, from gyro, accelerometer, magnetometer.
+"""Orientation of a body that is carried around, from gyro, accelerometer and magnetometer.
 
-The state is the rotation, the gyro's bias, the velocity, and the magnetic field of the place. The
-accelerometer drives the velocity, which stays small: what is carried about does not get away. So gravity
-is told from motion by how long each lasts, as by the average over seconds of Laidig and Seel, "VQF",
-Information Fusion 91, 2023, and its uncertainty is known. The gate keeps out a field that is disturbed.
+The state is the rotation, the gyro's bias, the velocity, and the local magnetic field. The accelerometer
+drives the velocity, which stays small because the body is carried around. Gravity is therefore separated
+from motion by their durations, similar to the averaging over seconds of Laidig and Seel, "VQF",
+Information Fusion 91, 2023, but with a known uncertainty. The gate rejects a disturbed field.
 """
 
 from collections.abc import Mapping
@@ -35,24 +35,24 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 
 
 class AttitudeParameters(ModelParameters):
-    """States noise of the unit and of the body's motion, and the uncertainty at the start.
+    """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
-    That the velocity is about zero and the field about constant is used once a second, since their
-    errors last about as long.
+    The assumptions that the velocity is about zero and the field about constant are applied once a
+    second, because their errors last about as long.
 
     Attributes:
-        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it covers errors of scale
+        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it includes scale errors
             while the body moves.
-        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz); it covers errors of
-            scale while the body moves.
+        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz); it includes scale
+            errors while the body moves.
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         field_density_ut: random walk of the magnetic field, in uT/sqrt(s).
         gravity_mps2: acceleration of gravity.
         sigma_velocity_mps: standard deviation of the velocity about zero.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
-        inertial_gap_s: a longer silence of the unit is a gap, in which the body may turn.
+        inertial_gap_s: time without samples above which the unit has a gap, in which the body may turn.
         gap_turn_radps: standard deviation of the turn rate in a gap.
-        rest_s: the body rests for so long first.
+        rest_s: duration for which the body is at rest at the start.
         start_sigma_rad: standard deviation of the orientation at the start, per axis.
         gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
@@ -75,7 +75,7 @@ class AttitudeParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the state after a step with the mean of both ends' samples."""
+    """Return the state after a step, given the mean of the samples at both ends."""
     qw, qx, qy, qz, bx, by, bz, vx, vy, vz, north, up = state
     fx, fy, fz, wx, wy, wz = control
     half_s = 0.5 * duration_s
@@ -110,25 +110,25 @@ def velocity(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """Return the variances of how fast it is carried about."""
+    """Return the variances of the velocity at which the body is carried."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 
 
 def feel_north(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return the magnetic field in the body's axes: that of the place has no part to the east."""
+    """Return the magnetic field in the body's axes; the local field has no east component."""
     qw, qx, qy, qz, _, _, _, _, _, _, north, up = state
     return into_body((qw, qx, qy, qz), (0.0, north, up))
 
 
 def field_noise(parameters: Any) -> Components:
-    """Return the variances of a field that is not disturbed."""
+    """Return the variances of an undisturbed field."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
 
 def first_of_periods(stream: Stream) -> Booleans:
-    """Return which samples (n,) are the first of a second of the clock, whatever block they come in."""
+    """Return which samples (n,) are the first in a second of the clock, independent of blocks."""
     rate_hz = stream.metadata.get("rate_hz")
     steps_ns = np.diff(stream.publish_time_ns)
     step_ns = 1e9 / float(rate_hz) if rate_hz else np.median(steps_ns[steps_ns > 0])
@@ -136,14 +136,14 @@ def first_of_periods(stream: Stream) -> Booleans:
 
 
 def read_velocity(stream: Stream) -> Floats:
-    """Return no velocity (n, 3), once a period."""
+    """Return zero velocities (n, 3) once a period, otherwise NaN."""
     return np.where(first_of_periods(stream)[:, None], np.zeros(3), np.nan)
 
 
 def read_field(stream: Stream) -> Floats:
-    """Return the field (n, 3), once a period: its first sample there, of a slower magnetometer too."""
+    """Return the field (n, 3) once a period: the first sample, also of a slower magnetometer."""
     field = stream["magnetic_field_ut"]
-    if field.shape[1:] != (3,):  # the magnetometer has a topic of its own
+    if field.shape[1:] != (3,):  # the magnetometer has a separate topic
         return np.full((len(stream), 3), np.nan)
     known = np.flatnonzero(np.isfinite(field).all(axis=1))
     if len(known) in (0, len(field)):
@@ -157,14 +157,14 @@ def read_field(stream: Stream) -> Floats:
 
 
 def read_own_field(stream: Stream) -> Floats:
-    """Return the field (n, 3) of a magnetometer with a topic of its own, once a period."""
+    """Return the field (n, 3) of a magnetometer with a separate topic, once a period."""
     return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
 
 
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find orientation and field by the means of the rest: force is up there, and the field north.
+    """Find orientation and field from means at rest, where the force points up and the field north.
 
-    Raises BadInput where there is no magnetometer, or both point the same way.
+    Raises BadInput if there is no magnetometer, or if both point in the same direction.
     """
     stream = streams["inertial"]
     begin_ns = int(stream.publish_time_ns[0])
@@ -204,7 +204,7 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(begin_ns, mean, np.diag(sigma**2), "at rest, levelled, north by its magnetometer")
 
 
-UNIT = replace(CARRIED, delay="", estimates=True)  # its own clock is the only one
+UNIT = replace(CARRIED, delay="", estimates=True)  # its clock is the only one
 ATTITUDE = Model(
     "orientation of a body with a gyro, an accelerometer and a magnetometer",
     {**components_of(ORIENTATION), **BIAS, **VELOCITY, **PLACE},

@@ -1,9 +1,9 @@
-"""Navigates by an inertial unit, corrected by what a log has of position and velocity.
+"""Navigation by an inertial unit, corrected by the position and velocity measurements of a log.
 
-The state of 15 components, with an inertial unit for its control: position and velocity in a local
-plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro
-and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems,
-2nd edition, 2013, chapter 14; the error of the orientation is one in the body's axes.
+The state has 15 components, and an inertial unit is its control: position and velocity in a local
+tangent plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases
+of gyro and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation
+Systems, 2nd edition, 2013, chapter 14; the error of the orientation is in the body's axes.
 """
 
 from collections.abc import Mapping
@@ -42,10 +42,10 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 
 
 class NavigationParameters(AlignmentParameters):
-    """States noise of the inertial unit and other sensors, where they are mounted, and gaps.
+    """Noise of the inertial unit and other sensors, their mounting, and gaps.
 
-    The biases are those of the body's axes. Gravity and the rotation of the earth are those of the
-    plane's origin. If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes
+    The biases are in the body's axes. Gravity and the rotation of the earth are those of the plane's
+    origin. After more than `inertial_gap_s` without samples, everything except the biases becomes
     unknown: the body may have accelerated, turned and tilted by the standard deviations of a gap.
 
     Attributes:
@@ -55,26 +55,26 @@ class NavigationParameters(AlignmentParameters):
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         origin_latitude_deg: latitude of the plane's origin.
         origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
-        inertial_gap_s: a longer silence of the unit is a gap.
+        inertial_gap_s: time without samples above which the unit has a gap.
         gap_acceleration_mps2: standard deviation of the acceleration in a gap.
         gap_turn_radps: standard deviation of the turn rate in a gap.
         gap_tilt_rad: standard deviation of the tilt after a gap.
-        lever_x_m, lever_y_m, lever_z_m: position of the antenna from the unit along this axis of the
-            body (forward, left, up).
-        axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle from the unit along this axis of the
-            body (forward, left, up).
-        wheel_scale: share by which wheels measure too much.
-        field_east_ut, field_north_ut, field_up_ut: magnetic field of the place in this direction.
-        range_delay_s: a range was measured so long before its stamp.
-        standing_delay_s: that the body stands was told so long before its stamp.
+        lever_x_m, lever_y_m, lever_z_m: position of the antenna relative to the unit along this axis of
+        the body (forward, left, up).
+        axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit along this axis
+        of the body (forward, left, up).
+        wheel_scale: relative scale error of the wheels' speed.
+        field_east_ut, field_north_ut, field_up_ut: local magnetic field in this direction.
+        range_delay_s: time by which a range is stamped after its measurement.
+        standing_delay_s: time by which a message that the body stands still is stamped late.
         sigma_velocity_mps: standard deviation of each component of a velocity that does not state its
             covariance.
         sigma_heading_rad: standard deviation of a heading.
         sigma_height_m: standard deviation of a height.
         sigma_wheel_mps: standard deviation of the wheels' forward speed.
-        sigma_slip_mps: standard deviation of the wheels' velocity to the side and up, which is about
+        sigma_slip_mps: standard deviation of the wheels' sideways and upward velocity, which is about
             zero.
-        sigma_standing_mps: standard deviation of the velocity of a body that stands, per axis.
+        sigma_standing_mps: standard deviation of the velocity of a body that stands still, per axis.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
         sigma_range_m: standard deviation of a range.
     """
@@ -119,7 +119,7 @@ def read_inertial(stream: Stream) -> Floats:
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the state after a step with the mean of both ends' samples."""
+    """Return the state after a step, given the mean of the samples at both ends."""
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
     moved = strapdown(
         (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
@@ -133,7 +133,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the variances that white noise of the samples, and the walks of their biases, add."""
+    """Return the variances added by white noise of the samples and random walks of their biases."""
     force = parameters.force_noise_density**2 * duration_s
     rate = parameters.gyro_noise_density**2 * duration_s
     gyro_bias = parameters.gyro_bias_density**2 * duration_s
@@ -144,7 +144,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the variances that a gap of the unit adds: where it may have gone and turned meanwhile."""
+    """Return the variances added by a gap of the unit, in which the body may have moved and turned."""
     speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
     gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
     moved = (speed_squared + 0.25 * gained) * duration_s**2
@@ -154,7 +154,7 @@ def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components
 
 
 def position(state: Components, reference: Any, parameters: Any) -> Components:
-    """Compute where the end of the lever arm is."""
+    """Return the position of the end of the lever arm."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     x, y, z = into_plane((qw, qx, qy, qz), lever)
@@ -162,7 +162,7 @@ def position(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def velocity(state: Components, samples: Components, parameters: Any) -> Components:
-    """Compute how fast the end of the lever arm moves, which turns with the body."""
+    """Return the velocity of the end of the lever arm, which turns with the body."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     rate = turn_rate(samples, (gx, gy, gz), parameters)
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
@@ -171,17 +171,17 @@ def velocity(state: Components, samples: Components, parameters: Any) -> Compone
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix that does not state them."""
+    """Return the variances of a fix that does not state its own."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """Return the variances of a velocity that does not state them."""
+    """Return the variances of a velocity that does not state its own."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 
 
-# Of a log that was not made for this model: a small unit that is carried about, somewhere on earth.
+# For a log that was not recorded for this model: a small unit that is carried around, anywhere on earth.
 HANDHELD = {
     "force_noise_density": 0.05,
     "gyro_noise_density": 0.001,

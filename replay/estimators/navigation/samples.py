@@ -1,4 +1,4 @@
-"""Reads the inertial samples and velocities that an alignment begins with."""
+"""The inertial samples and velocities that an alignment uses."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -14,13 +14,13 @@ from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.measurements import read_fixes
 from fuselog.replay.engine.vectors.components import components_of
 
-USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
+USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # for receivers that do not state their accuracy
 VELOCITY = components_of(NAVIGATION[3:6])
 NS = 1e-9
 
 
 class ImuSamples(NamedTuple):
-    """Holds a unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
+    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
 
     time_ns: Integers
     force: Floats
@@ -28,7 +28,7 @@ class ImuSamples(NamedTuple):
 
 
 class GnssMotion(NamedTuple):
-    """Holds a receiver's velocities (n, 3), covariances (n, 3, 3), and when they were of (n,)."""
+    """A receiver's velocities (n, 3), their covariances (n, 3, 3), and times of measurement (n,)."""
 
     topic: str
     time_ns: Integers
@@ -36,19 +36,19 @@ class GnssMotion(NamedTuple):
     covariance: Floats
 
     def first_above(self, row: int, limit_mps: float) -> int | None:
-        """Return the first row from this one on with a greater horizontal speed."""
+        """Return the first row from `row` on with a greater horizontal speed."""
         faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
         return row + int(faster[0]) if len(faster) else None
 
 
 def mounted(sample: Any, parameters: Any) -> Any:
-    """Turn what the unit measures into the body's axes; three components, or columns of them."""
+    """Rotate a measurement of the unit, or columns of them, to the body's axes."""
     roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
 def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
-    """Return the finite samples at the times at which they were measured."""
+    """Return the finite samples with their times of measurement."""
     columns = [
         np.stack(mounted(inertial[name].T, parameters), axis=1)
         for name in ("specific_force_mps2", "turn_rate_radps")
@@ -65,12 +65,12 @@ def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
 
 
 def stated_or(sigma: float | None, otherwise: Any) -> Any:
-    """Return a parameter, or else what holds where it is None, or NaN among a filter's numbers."""
+    """Return a parameter, or `otherwise` if it is None or NaN."""
     return otherwise if sigma is None or np.isnan(sigma) else sigma
 
 
 def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | None:
-    """Return the velocities that are finite; None where there are none."""
+    """Return the finite velocities; None if there are none."""
     stream = streams.get("velocity")
     if stream is None:
         return None
@@ -83,13 +83,13 @@ def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | 
     return GnssMotion(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
 
 
-PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
+PLUMB_SIGMA_RAD = 1e-4  # deflection of the plumb line from the ellipsoid's normal
 
 
 def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
-    """Compute how far the first samples' mean specific force may be from gravity's, m/s2, by motion.
+    """Compute the standard deviation, m/s2, of the first samples' mean specific force about gravity.
 
-    It is as much as they differ among themselves, and as the velocity changes meanwhile.
+    It includes the differences between the samples and the change of the velocity during them.
     """
     begin_ns = samples.time_ns[0]
     until_ns = begin_ns + round(parameters.level_s / NS)

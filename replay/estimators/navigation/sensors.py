@@ -1,6 +1,6 @@
-"""Models what a body may carry beside an inertial unit and GNSS: compass, barometer, wheels, radio tags.
+"""Models of further sensors of a body with an inertial unit: compass, barometer, wheels, radio tags.
 
-Sensors of the state of `navigation`, each on a topic of its own that a log may lack. Groves, Principles
+They are sensors of the state of `navigation`; each has a topic that a log may lack. Groves, Principles
 of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters 6 and 15.
 """
 
@@ -33,13 +33,13 @@ def be_headed(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def be_high(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return the height over the plane's origin."""
+    """Return the height above the plane's origin."""
     _, _, pz, _, _, _, _, _, _, _, _, _, _, _, _, _ = state
     return (pz,)
 
 
 def roll_along(state: Components, samples: Components, parameters: Any) -> Components:
-    """Return the velocity of the wheels, forward, left, up: they neither slip aside nor lift off."""
+    """Return the wheels' velocity (forward, left, up); they neither slip sideways nor lift off."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     wx, wy, wz = turn_rate(samples, (gx, gy, gz), parameters)
     axle = parameters.axle_x_m, parameters.axle_y_m, parameters.axle_z_m
@@ -49,13 +49,13 @@ def roll_along(state: Components, samples: Components, parameters: Any) -> Compo
 
 
 def stand(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return the velocity, which is zero where the body stands."""
+    """Return the velocity, which is zero if the body stands still."""
     _, _, _, vx, vy, vz, _, _, _, _, _, _, _, _, _, _ = state
     return vx, vy, vz
 
 
 def stay_on_wheels(state: Components, samples: Components, parameters: Any) -> Components:
-    """Return the velocity of the axle to the left and up, see `roll_along`."""
+    """Return the velocity of the axle to the left and up; see `roll_along`."""
     _, left, up = roll_along(state, samples, parameters)
     return left, up
 
@@ -68,7 +68,7 @@ def feel_north(state: Components, reference: Any, parameters: Any) -> Components
 
 
 def see_anchor(state: Components, reference: Components, parameters: Any) -> Components:
-    """Return the range of an anchor from a tag on the body, which `reference` has behind the anchor."""
+    """Return the range of an anchor from a tag on the body; `reference` has both, the anchor first."""
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     ax, ay, az, tx, ty, tz = reference
     x, y, z = into_plane((qw, qx, qy, qz), (tx, ty, tz))
@@ -86,25 +86,25 @@ def height_noise(parameters: Any) -> Components:
 
 
 def wheel_noise(parameters: Any) -> Components:
-    """Return the variances of a wheel's speed, and of its slip to the side and up."""
+    """Return the variances of the wheels' speed and of their slip sideways and up."""
     slip = parameters.sigma_slip_mps**2
     return parameters.sigma_wheel_mps**2, slip, slip
 
 
 def standing_noise(parameters: Any) -> Components:
-    """Return the variances of a velocity that is zero."""
+    """Return the variances of a zero-velocity measurement."""
     variance = parameters.sigma_standing_mps**2
     return variance, variance, variance
 
 
 def slip_noise(parameters: Any) -> Components:
-    """Return the variances of the slip of wheels, to the side and up."""
+    """Return the variances of the wheels' slip sideways and up."""
     variance = parameters.sigma_slip_mps**2
     return variance, variance
 
 
 def field_noise(parameters: Any) -> Components:
-    """Return the variances of a field that does not state them."""
+    """Return the variances of a field that does not state its own."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
@@ -120,7 +120,7 @@ def read_heading(stream: Stream) -> Floats:
 
 
 def heading_sigma(metadata: Mapping[str, str]) -> float:
-    """Return the standard deviation of headings by the variance that their channel states."""
+    """Return the standard deviation of headings from the variance that their channel states."""
     return float(np.sqrt(heading_variance(metadata)))
 
 
@@ -130,24 +130,24 @@ def read_height(stream: Stream) -> Floats:
 
 
 def read_wheels(stream: Stream) -> Floats:
-    """Return the velocities of the wheels (n, 3): forward as measured, no other."""
+    """Return the velocities of the wheels (n, 3): forward as measured, zero otherwise."""
     forward = stream["forward_mps"]
     return np.stack([forward, np.zeros(len(forward)), np.zeros(len(forward))], axis=1)
 
 
 def read_standing(stream: Stream) -> Floats:
-    """Return no velocity (n, 3) where the value is not zero, nothing where it is: the body may move."""
+    """Return zero velocities (n, 3) if the value is not zero, otherwise NaN, since the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
 
 
 def read_rolling(stream: Stream) -> Floats:
-    """Return no velocity to the side and up (n, 2) where the value is not zero, nothing where it is."""
+    """Return zero velocities to the side and up (n, 2) if the value is not zero, otherwise NaN."""
     return read_standing(stream)[:, :2]
 
 
 def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
-    """Return the sensors of a body that this inertial unit drives."""
+    """Return the further sensors of a body with this inertial unit."""
     return (
         Sensor(
             "heading",

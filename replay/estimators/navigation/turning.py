@@ -1,17 +1,19 @@
-"""Corrects a body's state together with its heading, which may be hardly known.
+"""Correction of a body's state together with its heading, which may be very uncertain.
 
-What an inertial unit measures acts in the plane turned by the heading, what fixes measure acts as it is.
-Given the heading both act linearly. So the mean of any other part of the state, as a function of the
-heading, is a sum of two terms, of which one turns with it: it moves on a circle. Of position and
-velocity, in the plane, the term of the inertial samples turns. Of tilt and biases, in the body's axes,
-that of the fixes turns, the other way. The covariance states the tangent of the circle, from which the
-radius follows. A filter that moves along the tangent mistakes the difference for information about the
-heading: the body seems to learn at rest where it is headed, which it cannot.
+Measurements of an inertial unit act in the plane rotated by the heading; measurements of fixes act in
+the plane itself. For a given heading, both act linearly. Therefore the mean of any other part of the
+state, as a function of the heading, is a sum of two terms, one of which rotates with the heading: it
+moves on a circle. For position and velocity, in the plane, the term of the inertial samples rotates. For
+tilt and biases, in the body's axes, the term of the fixes rotates, in the opposite direction. The
+covariance contains the tangent of the circle, which determines its radius. A filter that moves along the
+tangent mistakes the difference for information about the heading: a body at rest then seems to learn its
+heading, which is impossible.
 
-An innovation is a vector of the plane, so that what it adds to tilt and biases turns in the body's axes.
-On a smoother's way back steps are vectors of the body, whose biases do not change where it turns.
+An innovation is a vector in the plane, so its contribution to tilt and biases rotates in the body's
+axes. In a smoother's backward pass, steps are vectors in the body, whose biases do not depend on its
+heading.
 
-Where all terms turn this is the invariant filter: Barrau and Bonnabel, The Invariant Extended Kalman
+If all terms rotate, this is the invariant filter: Barrau and Bonnabel, The Invariant Extended Kalman
 Filter as a Stable Observer, IEEE Transactions on Automatic Control 62(4), 2017.
 """
 
@@ -25,23 +27,23 @@ UP = 0.0, 0.0, 1.0
 
 
 def heading(state: Components) -> Components:
-    """Return the error (15,) of a heading that is off by a radian: the body is turned about up."""
+    """Return the error (15,) of a heading that is off by one radian: a rotation of the body about up."""
     x, y, z = into_body(state[6:10], UP)
     return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
 def move(state: Components, step: Components, slope: Components) -> Components:
-    """Return the state after an update, see `fuselog.replay.inference.model.model.Correction`."""
+    """Return the state after an update; see `fuselog.replay.inference.model.model.Correction`."""
     return _moved(state, step, slope, 0.0)
 
 
 def move_back(state: Components, step: Components, slope: Components) -> Components:
-    """Return the state after a step of the way back."""
+    """Return the state after a step of a smoother's backward pass."""
     return _moved(state, step, slope, 1.0)
 
 
 def step_to(state: Components, target: Components, slope: Components) -> Components:
-    """Return the step (15,) of the way back that moves the state to the target."""
+    """Return the step (15,) of a backward pass that moves the state to the target."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
@@ -63,7 +65,7 @@ WITH_HEADING = Correction(heading, move, step_to, move_back)
 
 
 def _moved(state: Components, step: Components, slope: Components, of_body: float) -> Components:
-    """Return the state after a step whose rest is of the body's axes, 1, or of the plane's, 0."""
+    """Return the state after a step whose residual is in the body's axes (1) or in the plane's (0)."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
@@ -84,7 +86,7 @@ def _moved(state: Components, step: Components, slope: Components, of_body: floa
 def _forth(
     step: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """Return how a vector changes by its step: along its circle, and by the rest of the step, swung."""
+    """Return the change of a vector by its step: along its circle, plus the rotated rest of the step."""
     rest = _less(step, _times(turn, slope))
     return _plus(_arc(slope, axis, turn), _rotated(rest, axis, swing))
 
@@ -92,27 +94,27 @@ def _forth(
 def _back(
     change: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """Return the step by which a vector changes so, see `_forth`."""
+    """Return the step that results in a change of a vector, the inverse of `_forth`."""
     rest = _rotated(_less(change, _arc(slope, axis, turn)), axis, -swing)
     return _plus(_times(turn, slope), rest)
 
 
 def _arc(slope: Components, axis: Components, turn: Component) -> Vector:
-    """Go from a point to that a turn further on, on a circle about the axis with this tangent there."""
+    """Return the chord of a turn on the circle about an axis that has the given tangent at its start."""
     once = cross(axis, slope)
     bent = _plus(_times(1.0 - np.cos(turn), once), _times(turn - np.sin(turn), cross(axis, once)))
     return _plus(_times(turn, slope), bent)
 
 
 def _rotated(vector: Components, axis: Components, angle: Component) -> Vector:
-    """Rotate a vector about the unit vector of an axis: Rodrigues' formula."""
+    """Rotate a vector about the unit vector of an axis by Rodrigues' formula."""
     once = cross(axis, vector)
     turned = _plus(_times(np.sin(angle), once), _times(1.0 - np.cos(angle), cross(axis, once)))
     return _plus(vector, turned)
 
 
 def _across(axis: Components, vector: Components) -> Vector:
-    """Return what of a vector is at right angles to the unit vector of an axis."""
+    """Return the component of a vector that is perpendicular to the unit vector of an axis."""
     return _less(vector, _times(_dot(axis, vector), axis))
 
 
