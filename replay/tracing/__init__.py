@@ -1,6 +1,5 @@
-"""Traces models as expression graphs: calls each function once with traced numbers.
+"""Traces of models as expression graphs: each function is called once with traced numbers.
 
-From the graph of a function come its exact derivatives (`derivatives`), its machine code (`emission`),
-the formulas that a person reads (`formulas`). Begin reading in `functions`, which is what models are
-wrapped in.
+The graph of a function provides its exact derivatives (`derivatives`), its machine code (`emission`) and
+readable formulas (`formulas`). Begin with `functions`, whose classes wrap a model's functions.
 """

@@ -1,7 +1,7 @@
-"""Writes a graph as C99 that a person can read: a line for what is used more than once.
+"""Graphs written as readable C99, with a line for each expression that is used more than once.
 
-Sums and products stand in the order in which kernels compute them, so that a compiler that contracts and
-reorders nothing (`-ffp-contract=off`, no `-ffast-math`) gives the same bits.
+Sums and products are in the order in which kernels compute them, so that a compiler that neither
+contracts nor reorders operations (`-ffp-contract=off`, no `-ffast-math`) gives the same bits.
 """
 
 import math
@@ -17,7 +17,7 @@ import numpy as np
 from fuselog.replay.tracing.formulas import Text
 from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
-SHORTEST, LONGEST = 16, 90  # characters: what is shorter is repeated, what is longer gets a line
+SHORTEST, LONGEST = 16, 90  # characters: shorter expressions are repeated, longer ones get a line
 
 _CHOICE, _OR, _AND, _EQUAL, _COMPARISON, _SUM, _PRODUCT, _SIGN, _WHOLE = range(9)
 _OPERATORS: dict[Any, tuple[str, int]] = {
@@ -53,7 +53,7 @@ static int is_equal(REAL x, REAL y)
     return x <= y && x >= y;
 }
 """
-# What C lacks; REAL is the type of numbers, and S ends libm's functions of it.
+# Functions that C lacks; REAL is the type of numbers, and _S the suffix of libm's functions for it.
 HELPERS: Mapping[Any, tuple[str, str]] = {
     operator.mod: (
         "modulo",
@@ -108,16 +108,16 @@ static REAL sign_of(REAL x)
 
 
 class Precision(NamedTuple):
-    """Holds how numbers are written: their type, and how constants and libm's functions of it end."""
+    """How numbers are written: their type, and the suffix of constants and of libm's functions."""
 
     real: str = "double"
     ending: str = ""
 
     def number(self, value: float) -> str:
-        """Write a number, so that it is read as the same one.
+        """Write a number so that it is read back unchanged.
 
-        What `float` would round to zero is its least normal number, so that nothing is divided by zero
-        that is not zero in double precision; what is beyond its range is infinite.
+        In single precision, numbers that would be rounded to zero become the smallest normal number, so
+        that a nonzero divisor stays nonzero; numbers beyond the range become infinite.
         """
         if self.ending and np.isfinite(value) and value != 0.0:
             limits = np.finfo(np.float32)
@@ -131,7 +131,7 @@ class Precision(NamedTuple):
         return f"{text}{'' if '.' in text or 'e' in text else '.0'}{self.ending}"
 
     def text(self, template: str) -> str:
-        """Fill in REAL, and what ends constants and functions (_S)."""
+        """Replace REAL by the type and _S by the suffix."""
         return re.sub(r"(?<=[0-9a-z])_S\b", self.ending, re.sub(r"\bREAL\b", self.real, template))
 
 
@@ -145,14 +145,14 @@ def c_lines(
     of: str = "v",
     known: Mapping[Node, str] = MappingProxyType({}),
 ) -> Iterator[str]:
-    """Write every named node as `const double name = ...;`, each behind the lines that it needs.
+    """Yield lines that assign the named nodes, as `const double name = ...;`, after the lines they need.
 
     Args:
-        named: the nodes; a name that is no identifier is assigned to, as `P[0][0]`.
-        inputs: names of what the graph is given, by place.
-        precision: of the numbers.
-        of: the letter that names of lines begin with.
-        known: names of nodes that stand in lines before these.
+        named: the nodes by name; a name that is not an identifier, such as `P[0][0]`, is assigned to.
+        inputs: names of the graph's inputs, by place.
+        precision: precision of the numbers.
+        of: first letter of the names of additional lines.
+        known: names of nodes that earlier lines define.
     """
     everything = needed(named.values(), known)
     uses = Counter(argument for node in everything for argument in node.arguments)
@@ -184,7 +184,7 @@ def c_lines(
 
 
 def truth_text(node: Node, inputs: Mapping[Any, str], precision: Precision) -> str:
-    """Write a condition in one expression."""
+    """Write a condition as one expression."""
     found: dict[Node, Text] = {}
     for each in needed([node]):
         found[each] = _text_of(each, [found[one] for one in each.arguments], inputs, precision)
@@ -192,7 +192,7 @@ def truth_text(node: Node, inputs: Mapping[Any, str], precision: Precision) -> s
 
 
 def _real(node: Node, text: Text, precision: Precision) -> Text:
-    """Write a truth as a number."""
+    """Write a truth value as a number."""
     return Text(f"({precision.real}){text.within(_WHOLE)}", _SIGN) if node.is_truth else text
 
 
@@ -244,7 +244,7 @@ def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision
 
 
 def _equality(node: Node, numbers: list[Text], precision: Precision) -> Text:
-    """Write whether numbers are equal or not, without the == that compilers warn of."""
+    """Write a comparison of numbers for equality without `==`, which compilers warn about."""
     first, last = (each.text for each in numbers)
     is_unequal = node.operation is operator.ne
     if node.arguments[1].operation is CONSTANT and not node.arguments[1].value:
@@ -254,7 +254,7 @@ def _equality(node: Node, numbers: list[Text], precision: Precision) -> Text:
 
 
 def _power(base: str, exponent: int, precision: Precision) -> Text:
-    """Write a power by squaring, as kernels do."""
+    """Write a power by repeated squaring, as kernels do."""
     found, square, rest = "", base, abs(exponent)
     while rest:
         if rest & 1:
@@ -272,8 +272,8 @@ def _power(base: str, exponent: int, precision: Precision) -> Text:
 
 
 def helpers_of(nodes: Collection[Node], precision: Precision) -> list[str]:
-    """Write the functions that these nodes need and C lacks."""
+    """Return the functions that these nodes need and C lacks."""
     used = {node.operation for node in nodes}
-    compared = [_IS_EQUAL] if used & {operator.eq, operator.ne} else []  # left out if nothing calls it
+    compared = [_IS_EQUAL] if used & {operator.eq, operator.ne} else []  # left out if it is not called
     texts = [text for operation, (_, text) in HELPERS.items() if operation in used]
     return [precision.text(text) for text in [*compared, *texts]]

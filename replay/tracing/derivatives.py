@@ -1,16 +1,17 @@
-"""Differentiates graphs exactly, forward: how every number changes with chosen inputs.
+"""Exact forward differentiation of graphs: how each number changes with chosen inputs.
 
-Griewank and Walther, Evaluating Derivatives, chapter 3. Only what can differ from zero is followed, so
-that the pattern of a Jacobian is known with it. Where a derivative does not exist or is infinite at one
-point, the slopes there are chosen:
+Griewank and Walther, Evaluating Derivatives, chapter 3. Only derivatives that can differ from zero are
+computed, so the sparsity pattern of a Jacobian is also known. If a derivative does not exist or is
+infinite at one point, its value there is defined:
 
 - `sqrt`, `cbrt`, `hypot`, `arctan2` and `abs` have slope 0 where their arguments are 0: the mean of both
-  sides of `abs`, and no NaN from the length of a vector that vanishes;
-- the lesser and the greater of two equal numbers have the slopes of the first;
-- steps (`floor`, `round`, `sign`, `//`) have slope 0 everywhere, `a % b` that of `a - b floor(a / b)`;
+  sides of `abs`, and no NaN from the length of a zero vector;
+- the minimum and the maximum of two equal numbers have the slopes of the first;
+- step functions (`floor`, `round`, `sign`, `//`) have slope 0 everywhere, `a % b` that of
+  `a - b floor(a / b)`;
 - a branch has the slopes of the side that is taken.
 
-A derivative that is infinite elsewhere (`log` at 0, `1 / x`) makes slopes infinite or NaN.
+Other infinite derivatives (`log` at 0, `1 / x`) result in slopes that are infinite or NaN.
 """
 
 import operator
@@ -41,7 +42,7 @@ def _power_slopes(value: Any, base: Any, exponent: Any) -> tuple[Any, Any]:
     return by_base, where(base == 0.0, 0.0, value * np.log(base))
 
 
-# How a function's value changes with each argument, from its value and its arguments.
+# Derivatives of a function's value by each argument, from its value and its arguments.
 SLOPES: dict[Any, Callable[..., tuple[Any, ...]]] = {
     operator.neg: lambda v, x: (-1.0,),
     operator.add: lambda v, x, y: (1.0, 1.0),
@@ -78,19 +79,19 @@ SLOPES: dict[Any, Callable[..., tuple[Any, ...]]] = {
     np.arccosh: lambda v, x: (1.0 / np.sqrt(x * x - 1.0),),
     np.arctanh: lambda v, x: (1.0 / (1.0 - x * x),),
 }
-# What never changes but by steps.
+# Functions that are constant except for steps.
 _STEPS = (np.floor, np.ceil, np.trunc, np.rint, np.sign, operator.floordiv)
 
 Slopes = dict[int, Node]
 
 
 def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes]) -> list[Slopes]:
-    """Compute how outputs change with the variables by which inputs change; what is missing is zero.
+    """Compute the derivatives of outputs by the variables of the seeds; missing ones are zero.
 
     Args:
-        trace: whose graph it is, and grows by what is found.
-        outputs: the nodes.
-        seeds: of inputs, how they change with every variable.
+        trace: trace whose graph contains the nodes and is extended by the derivatives.
+        outputs: nodes to differentiate.
+        seeds: derivatives of the inputs by each variable.
     """
     found: dict[Node, Slopes] = {}
     for node in needed(outputs):
@@ -99,7 +100,7 @@ def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes
 
 
 def _chained(trace: Trace, node: Node, found: Mapping[Node, Slopes]) -> Slopes:
-    """Apply the chain rule."""
+    """Apply the chain rule to one node."""
     graph, zero = trace.graph, trace.graph.constant(0.0)
     if node.operation is CONSTANT or node.is_truth or node.operation in _STEPS:
         return {}

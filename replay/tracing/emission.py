@@ -1,4 +1,4 @@
-"""Emits a graph as instructions of a kernel, and as Python."""
+"""Translation of a graph to instructions of a kernel, and to Python."""
 
 import operator
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _LOGICAL = (operator.and_, operator.or_, operator.xor)
 
 
 def emit(emitter: Emitter, outputs: Sequence[Node], inputs: dict[Any, Number]) -> list[Number]:
-    """Write the instructions of a graph; `inputs` are the numbers at the places of its inputs."""
+    """Write the instructions of a graph; `inputs` are the numbers of its inputs, by place."""
     found: dict[Node, Number] = {}
     for node in needed(outputs):
         given = [found[each] for each in node.arguments]
@@ -74,7 +74,7 @@ _SIGNS = {
 
 
 def python_of(outputs: Sequence[Node], inputs: dict[Any, str]) -> list[str]:
-    """Return the lines of Python that compute a graph's outputs, and return them as a list."""
+    """Return Python lines that compute a graph's outputs and return them as a list."""
     lines: list[str] = []
     names: dict[Node, str] = {}
     for node in needed(outputs):
@@ -91,7 +91,7 @@ def python_of(outputs: Sequence[Node], inputs: dict[Any, str]) -> list[str]:
 
 
 def expression(node: Node, given: Sequence[str]) -> str:
-    """Return a node as an expression of its arguments."""
+    """Write a node as an expression of its arguments."""
     operation = node.operation
     if operation is SELECT:
         return f"{given[1]} if {given[0]} else {given[2]}"

@@ -1,7 +1,7 @@
-"""Writes a graph as formulas that a person can read, which are Python: it computes the same.
+"""Graphs written as readable formulas in Python, which compute the same values.
 
-What is used more than once, unless that is short, and what would not fit in a line get lines of their
-own.
+Expressions that are used more than once, unless they are short, and expressions that would not fit in a
+line get their own lines.
 """
 
 import operator
@@ -16,9 +16,9 @@ from fuselog.replay.tracing.functions import TracedFunction
 from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 from fuselog.replay.tracing.traced import Trace
 
-SHORTEST, LONGEST = 20, 100  # characters: what is shorter is repeated, what is longer gets a line
+SHORTEST, LONGEST = 20, 100  # characters: shorter expressions are repeated, longer ones get a line
 
-# How tightly operators bind: as in Python, but that a remainder is set apart from products about it.
+# Precedence of operators: as in Python, except that a remainder is separated from products around it.
 _CHOICE, _OR, _AND, _NOT, _COMPARISON, _SUM, _REMAINDER, _PRODUCT, _SIGN, _POWER, _WHOLE = range(11)
 _OPERATORS: dict[Any, tuple[str, int]] = {
     operator.or_: ("or", _OR),
@@ -47,13 +47,13 @@ _KNOWN: dict[float, tuple[str, int]] = {
 
 
 class Text(NamedTuple):
-    """Holds a formula or an expression of C, and how tightly its last operation binds."""
+    """A formula or a C expression, and the precedence of its last operation."""
 
     text: str
     binds: int
 
     def within(self, binds: int) -> str:
-        """Return it as a part of what binds so tightly, in parentheses where they are needed."""
+        """Return the text as an operand at this precedence, in parentheses if necessary."""
         return self.text if self.binds >= binds else f"({self.text})"
 
 
@@ -63,13 +63,13 @@ def formulas_of(
     outputs: Mapping[str, Node],
     by: Mapping[Any, str],
 ) -> list[str]:
-    """Return lines `name = formula` of a function's outputs, and of their derivatives that are not zero.
+    """Return lines `name = formula` of a function's outputs and their nonzero derivatives.
 
     Args:
         function: the function.
-        inputs: the names of what it is given, by place.
+        inputs: names of its inputs, by place.
         outputs: its nodes, by name.
-        by: those of the inputs by which it is differentiated.
+        by: names of the inputs by which it is differentiated, by place.
     """
     trace, names = Trace(function.graph, {}), list(by.values())
     seeds = {
@@ -86,7 +86,7 @@ def formulas_of(
 
 
 def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str]:
-    """Yield every named node, each behind the lines that it needs."""
+    """Yield a line for each named node, after the lines that it needs."""
     everything = needed(named.values())
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
@@ -110,7 +110,7 @@ def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str
 
 
 def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str]) -> Text:
-    """Write a node as a formula of those of its arguments."""
+    """Write a node as a formula of its arguments' formulas."""
     operation = node.operation
     if operation is INPUT:
         return Text(inputs[node.value], _WHOLE)

@@ -1,8 +1,8 @@
-"""Traces functions of models: called as they are where kernels are plain Python, graphs elsewhere.
+"""Tracing of models' functions: called directly if kernels are plain Python, as graphs otherwise.
 
 A model's function takes tuples of numbers, numbers, parameters (a NamedTuple of numbers), and sometimes
-arrays that it changes; it returns a tuple of numbers, or one number. What it is given is described by
-`Argument`s. It is called once for every way through its conditions, which selections join.
+arrays that it changes; it returns a tuple of numbers, or one number. `Argument`s describe what it takes.
+It is called once for every path through its conditions; selections join the results.
 """
 
 import re
@@ -33,24 +33,24 @@ from fuselog.replay.tracing.traced import (
     too_many_ways,
 )
 
-# Files in whose lines nobody looks for a model's mistake.
+# Files that are not the source of a mistake in a model.
 _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
-    """Describes an array of these sizes, which the function reads and changes."""
+    """An array of these sizes, which the function reads and changes."""
 
     sizes: tuple[int, ...]
 
 
-# a tuple of so many numbers; a number (None); the names of parameters; an array
+# a tuple of this many numbers; the names of parameters; an array; a number (None)
 Argument = int | tuple[str, ...] | Shape | None
 
 
 class Result(NamedTuple):
-    """Holds what a function gives: the nodes it returns, and whether they are one number and no tuple.
+    """Result of a function: the nodes that it returns, and whether they are one number or a tuple.
 
-    `written` are the entries of arrays that it changes: argument, place, and the node.
+    `written` are the array entries that it changes: argument, index, and node.
     """
 
     returned: tuple[Node, ...]
@@ -59,7 +59,7 @@ class Result(NamedTuple):
 
 
 class TracedFunction:
-    """Represents a function of a model, with its graph."""
+    """A function of a model, with its graph."""
 
     def __init__(self, function: Callable[..., Any], arguments: Sequence[Argument]) -> None:
         self.function = function
@@ -67,7 +67,7 @@ class TracedFunction:
         self.__name__ = getattr(function, "__name__", "function")
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the function itself; of traced numbers its graph becomes a part of theirs."""
+        """Call the function; for traced numbers, inline its graph in theirs."""
         found = trace_of(arguments)
         if found is None or self.result.written:
             return self.function(*arguments)
@@ -76,21 +76,21 @@ class TracedFunction:
 
     @cached_property
     def graph(self) -> Graph:
-        """Return the graph, with that of derivatives as they are asked for."""
+        """The graph, including that of requested derivatives."""
         return Graph()
 
     @cached_property
     def result(self) -> Result:
-        """Trace the function; raises BadInput with its line, and the mend, where that cannot be."""
+        """The traced result; raises BadInput, with line and advice, if tracing is impossible."""
         return trace(self.graph, self.function, self.arguments)
 
     @property
     def outputs(self) -> list[Node]:
-        """Return all that it returns and writes."""
+        """All nodes that the function returns and writes."""
         return [*self.result.returned, *(node for _, _, node in self.result.written)]
 
     def kernel_identity(self) -> str:
-        """Return what is part of a kernel's key: the graph."""
+        """Return the part of a kernel's key that depends on the graph."""
         return self._identity
 
     @cached_property
@@ -101,7 +101,7 @@ class TracedFunction:
         )
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
-        """Write a call of it; see `fuselog.recorders.compiling.kernels.expressions`."""
+        """Write a call of the function; see `fuselog.recorders.compiling.kernels.expressions`."""
         numbers = _called(program, emitter, self, self.outputs, arguments)
         count = len(self.result.returned)
         for (argument, place, _), number in zip(self.result.written, numbers[count:], strict=True):
@@ -112,13 +112,13 @@ class TracedFunction:
 
 
 class Derivative:
-    """Represents a function that gives the values of a traced function and chosen derivatives.
+    """A function that returns the values of a traced function and selected derivatives.
 
     Args:
         function: the function.
-        seeds: (trace, inputs of all arguments) -> of every input how it changes with the variables.
-        combine: (trace, returned nodes, their slopes) -> the derivatives that are wanted, by place; what
-            is not in there is zero.
+        seeds: (trace) -> derivatives of every input by the variables.
+        combine: (trace, returned nodes, their slopes) -> requested derivatives by place; missing ones
+            are zero.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Derivative:
 
     @cached_property
     def entries(self) -> dict[Any, Node]:
-        """Return the derivatives by place; zero where there is none."""
+        """The derivatives by place, without those that are zero."""
         trace = Trace(self.function.graph, {})
         returned = self.function.result.returned
         slopes = slopes_of(trace, returned, self._seeds(trace))
@@ -143,26 +143,26 @@ class Derivative:
 
     @property
     def places(self) -> tuple[Any, ...]:
-        """Return where the numbers behind the values belong."""
+        """Places of the numbers that follow the values."""
         return tuple(self.entries)
 
     @property
     def outputs(self) -> list[Node]:
-        """Return the values and then the derivatives."""
+        """The values, followed by the derivatives."""
         return [*self.function.result.returned, *self.entries.values()]
 
     def kernel_identity(self) -> str:
-        """Return what is part of a kernel's key."""
+        """Return the part of a kernel's key that depends on the graph."""
         return _digest([repr(self.function.arguments), repr(self.places), *described(self.outputs)])
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
-        """Write a call of it."""
+        """Write a call of the function."""
         return tuple(_called(program, emitter, self.function, self.outputs, arguments))
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
-        """Return the values as the function itself gives them, and the derivatives by the graph.
+        """Return the values from the function itself, and the derivatives from the graph.
 
-        Of traced numbers both by the graph, as a part of theirs.
+        For traced numbers, both come from the graph, which is inlined in theirs.
         """
         found = trace_of(arguments)
         if found is not None:
@@ -172,7 +172,7 @@ class Derivative:
 
     @cached_property
     def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
-        """Return the places of inputs that the derivatives need, and the latter's function in Python."""
+        """Places of inputs that the derivatives need, and a function that computes the derivatives."""
         nodes = list(self.entries.values())
         places = [node.value for node in needed(nodes) if node.operation == INPUT]
         names = {place: f"x{index}" for index, place in enumerate(places)}
@@ -184,7 +184,7 @@ class Derivative:
 
 
 def arguments_like(values: Sequence[Any]) -> tuple[Argument, ...]:
-    """Return how arguments such as these are described."""
+    """Describe arguments such as these values."""
     return tuple(
         (getattr(each, "_fields", None) or len(each)) if isinstance(each, tuple) else None
         for each in values
@@ -201,7 +201,7 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """Return the numbers of a graph's outputs: a function of its own, of the inputs that they need."""
+    """Return the numbers of a graph's outputs by calling a separate function of the inputs they need."""
     places = [node.value for node in needed(outputs) if node.operation == INPUT]
     key = "graph", *places, *described(outputs)
     if key not in program.instances:
@@ -257,9 +257,9 @@ def _given(trace: Trace, argument: int, kind: Argument) -> Any:
 
 
 def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argument]) -> Result:
-    """Call a function with traced numbers, every way through its conditions.
+    """Call a function with traced numbers, on every path through its conditions.
 
-    Raises BadInput where it does what no graph holds: with the line, and what to write instead.
+    Raises BadInput, with the line and advice, if it does something that a graph cannot represent.
     """
     ways = 0
 
@@ -285,7 +285,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
 
 
 def _reason(error: Exception) -> str:
-    """Say what stopped a function; what NumPy says of traced numbers in our words."""
+    """Explain why a function could not be traced, replacing NumPy's messages about traced numbers."""
     if isinstance(error, CannotTrace | BadInput):
         return str(error)
     no_method = re.search(r"which has no callable (\w+) method", str(error))
@@ -331,7 +331,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """Return a function's name, with its file and line, or with those at which its own code stopped."""
+    """Return a function's name, with its file and line or those at which its own code failed."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())
@@ -349,7 +349,7 @@ def place_of(function: Callable[..., Any], error: Exception | None = None) -> st
 
 
 def _digest(words: Sequence[str]) -> str:
-    """Return the digest of a graph and of how its instructions are written."""
+    """Return the digest of a graph and of the code that writes its instructions."""
     return sha256("\n".join([digest_of("fuselog.replay.tracing"), *words]).encode()).hexdigest()
 
 
@@ -357,12 +357,12 @@ _KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
-    """Return a function as a traced one; the same again while it does the same.
+    """Return a function as a traced one, as the same object while the function does not change.
 
-    It is called anew where what it reads has changed, or may have changed unseen; see `reads`.
-    None for None, and what is traced already is as it was.
+    It is traced again if what it reads has changed or may have changed; see `reads`. None and functions
+    that are already traced are returned unchanged.
 
-    Raises BadInput where it cannot be traced, or gives something else when it is traced again.
+    Raises BadInput if it cannot be traced, or gives another result when it is traced again.
     """
     if function is None or isinstance(function, TracedFunction):
         return function
@@ -379,5 +379,5 @@ def traced(function: Any, *arguments: Argument) -> Any:
             f"{place_of(function)}: it gives something else when it is called again; a clock, random "
             "numbers and what changes meanwhile are no part of a model, so take them as parameters"
         )
-    _KNOWN[key] = made, reads  # which holds the function, whose id is no other's then
+    _KNOWN[key] = made, reads  # keeps a reference to the function, so that its id is not reused
     return made

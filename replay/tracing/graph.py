@@ -1,8 +1,8 @@
-"""Defines expression graphs: numbers that are made of others, each once, constants folded.
+"""Expression graphs: numbers computed from others, without duplicates, and with constants folded.
 
-A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. What is simplified has
-the same bits, but for one thing: zero times anything is zero here, so that what does not depend on
-something costs nothing.
+A node is an operation of Python or NumPy on other nodes; equal nodes are the same object.
+Simplifications preserve all bits with one exception: zero times anything is zero, so that independence
+of an input costs nothing.
 """
 
 import math
@@ -30,7 +30,7 @@ _TRUTHS = (
     operator.not_,
 )
 
-# what costs about as much as it takes to fetch a number
+# operations that cost about as much as loading a number
 _CHEAP = (
     *(INPUT, CONSTANT, POWER, SELECT, np.absolute, np.sign),
     *(operator.add, operator.sub, operator.mul, operator.truediv, operator.neg),
@@ -41,7 +41,7 @@ _COMMUTATIVE = (operator.add, operator.mul)
 
 
 class Node:
-    """Represents a number or a truth: an operation, what it is applied to, and its constant."""
+    """A number or a truth value: an operation, its arguments, and its constant."""
 
     __slots__ = ("arguments", "is_truth", "number", "operation", "value")
 
@@ -56,16 +56,16 @@ class Node:
 
     @property
     def is_constant(self) -> bool:
-        """Tell whether its value is known."""
+        """Whether its value is known."""
         return self.operation is CONSTANT
 
     def is_number(self, value: float) -> bool:
-        """Tell whether it is known to be this number."""
+        """Test whether it is known to be this number."""
         return self.operation is CONSTANT and not self.is_truth and self.value == value
 
 
 class Graph:
-    """Holds the nodes of one function, in the order in which they can be computed."""
+    """The nodes of one function, in an order in which they can be computed."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -83,17 +83,17 @@ class Graph:
         return found
 
     def input(self, place: Any) -> Node:
-        """Return what is handed in."""
+        """Return the node of an input."""
         return self._node(INPUT, (), place, (INPUT, place))
 
     def constant(self, value: Any) -> Node:
-        """Return a number, or a truth."""
+        """Return the node of a number or a truth value."""
         value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
         sign = math.copysign(1.0, value)
         return self._node(CONSTANT, (), value, (CONSTANT, type(value), sign, repr(value)))
 
     def power(self, base: Node, exponent: int) -> Node:
-        """Return a number to the power of an integer: by multiplication."""
+        """Return an integer power of a number, by multiplication."""
         if exponent == 1:
             return base
         if exponent == 0:
@@ -103,7 +103,7 @@ class Graph:
         return self._node(POWER, (base,), exponent, (POWER, base.number, exponent))
 
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
-        """Select one of two; the other is no part of the result, whatever it is."""
+        """Select one of two nodes; the other does not affect the result, even if it is NaN."""
         if condition.is_constant:
             return yes if condition.value else no
         if yes is no:
@@ -113,7 +113,7 @@ class Graph:
         )
 
     def apply(self, operation: Any, *arguments: Node) -> Node:
-        """Return an operation on nodes, or what is known to be the same."""
+        """Return an operation on nodes, or a simpler node that is equal."""
         if all(each.is_constant for each in arguments):
             return self.constant(evaluated(operation, *(each.value for each in arguments)))
         simpler = self._simpler(operation, arguments)
@@ -160,7 +160,7 @@ class Graph:
 
 
 def evaluated(operation: Any, *values: Any) -> Any:
-    """Compute what an operation gives for numbers; infinity and NaN without a word, as compiled code."""
+    """Compute the result of an operation on numbers, without warnings about infinity and NaN."""
     with np.errstate(all="ignore"):
         if operation in (operator.not_, operator.and_, operator.or_, operator.xor):
             return operation(*values)
@@ -168,7 +168,7 @@ def evaluated(operation: Any, *values: Any) -> Any:
 
 
 def _power(base: float, exponent: int) -> float:
-    """Multiply as compiled code does: by squaring."""
+    """Compute a power by repeated squaring, as compiled code does."""
     found, square, rest = None, base, abs(exponent)
     while rest:
         if rest & 1:
@@ -181,9 +181,9 @@ def _power(base: float, exponent: int) -> float:
 
 
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
-    """Return all nodes that some are made of, and these, in the order in which they can be computed.
+    """Return all nodes that the outputs depend on, including these, in an order of computation.
 
-    What is known already stands among them, and nothing that only this is made of.
+    Known nodes are included, but not the nodes that only they depend on.
     """
     found: set[Node] = set()
     waiting = list(outputs)
@@ -196,11 +196,11 @@ def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
 
 
 def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:
-    """Find what is worth computing before a loop: parts with a function's call that stay the same in it.
+    """Find nodes that should be computed before a loop: constant in it, and containing a function call.
 
     Args:
-        outputs: of the loop.
-        varies: (place) -> whether this input changes from round to round.
+        outputs: outputs of the loop.
+        varies: (place) -> whether this input changes between iterations.
     """
     varying, costly, wanted = set[Node](), set[Node](), set(outputs)
     nodes = needed(outputs)
@@ -215,7 +215,7 @@ def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Nod
 
 
 def described(outputs: Iterable[Node]) -> Iterator[str]:
-    """Yield words that are the same for the same graph, whatever else was traced before or with it."""
+    """Yield a digest of each output that only depends on its graph, not on anything else traced."""
     outputs = list(outputs)
     words: dict[Node, str] = {}
     for node in needed(outputs):

@@ -1,4 +1,4 @@
-"""Inlines graphs in others: a traced function that is called with traced numbers."""
+"""Inlining of graphs in others, when a traced function is called with traced numbers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from fuselog.replay.tracing.traced import Trace, Traced
 
 
 class Parameters:
-    """Holds the parameters of a function that is traced."""
+    """The parameters of a function during tracing."""
 
     def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
         self.trace, self._argument, self._names = trace, argument, names
@@ -23,13 +23,13 @@ class Parameters:
         return (getattr(self, name) for name in self._names)
 
 
-# traces for which a function is being called, by any thread: without one all numbers are known
+# traces in progress, in any thread; without any, all numbers are known
 _AT_WORK: list[Trace] = []
 
 
 @contextmanager
 def tracing(trace: Trace) -> Iterator[None]:
-    """Let functions that are called meanwhile be given numbers of this trace."""
+    """Register a trace while functions may be called with its numbers."""
     _AT_WORK.append(trace)
     try:
         yield
@@ -38,7 +38,7 @@ def tracing(trace: Trace) -> Iterator[None]:
 
 
 def trace_of(arguments: Sequence[Any]) -> Trace | None:
-    """Return the trace that numbers among these are of; None where all are known."""
+    """Return the trace of the traced numbers among these arguments; None if there are none."""
     return _found(arguments) if _AT_WORK else None
 
 
@@ -58,7 +58,7 @@ def _found(arguments: Sequence[Any]) -> Trace | None:
 def inlined(
     trace: Trace, outputs: Sequence[Node], number_at: Callable[[Any], Any]
 ) -> tuple[Traced, ...]:
-    """Copy nodes of one graph into another one, of the numbers there in the places of its inputs."""
+    """Copy nodes of one graph to another, with numbers of the latter in place of the inputs."""
     graph, found = trace.graph, dict[Node, Node]()
     for node in needed(outputs):
         given = [found[each] for each in node.arguments]

@@ -1,9 +1,9 @@
-"""Finds what a function reads beside its arguments, to know whether it would do the same again.
+"""Detection of what a function reads besides its arguments, to know whether it would do the same again.
 
-That is known where all of it is seen and nothing of it can change unseen: its code, its defaults, its
-closure, and the globals and attributes of modules that its bytecode names; each of them a number, a
-word, a tuple of these, a function that keeps nothing, or a Python function of which the same is true. A
-list, an array, an attribute of an object, a file and a clock may change unseen.
+This is only possible if everything is visible and cannot change unnoticed: the code, defaults and
+closure of the function, and the globals and attributes of modules that its bytecode names. Each of them
+must be a number, a string, a tuple of these, a function without state, or a Python function for which
+the same holds. A list, an array, an attribute of an object, a file and a clock may change unnoticed.
 """
 
 import builtins
@@ -29,7 +29,8 @@ _OF_NUMPY = (
     "identity inner interp ones outer prod reshape round around searchsorted sinc stack sum trace "
     "transpose vstack where zeros float64"
 )
-# Functions whose results follow from their arguments: held here, so that their ids stay theirs.
+# Functions whose results only depend on their arguments; referenced here, so that their ids are not
+# reused.
 _PURE = {
     id(each): each
     for each in (
@@ -46,17 +47,17 @@ Made = TypeVar("Made")
 
 
 def pure(kind: type[Made]) -> type[Made]:
-    """Declare that what a class makes follows from its arguments alone."""
+    """Declare that the results of a class depend only on its arguments."""
     _PURE[id(kind)] = kind
     return kind
 
 
 class Reads(NamedTuple):
-    """Holds what a function reads: each place, and what was there.
+    """What a function reads: each place, and its value.
 
     Attributes:
-        functions: it and those that it calls, with their code and defaults.
-        cells: of closures.
+        functions: the function and those that it calls, with their code and defaults.
+        cells: cells of closures.
         names: globals and attributes of modules.
     """
 
@@ -65,7 +66,7 @@ class Reads(NamedTuple):
     names: list[tuple[Mapping[str, Any], str, Any]]
 
     def are_unchanged(self) -> bool:
-        """Tell whether there is the same at every place."""
+        """Test whether every place still has the same value."""
         for function, code, defaults in self.functions:
             if function.__code__ is not code or function.__defaults__ is not defaults:
                 return False
@@ -74,19 +75,19 @@ class Reads(NamedTuple):
         try:
             if not all(cell.cell_contents is value for cell, value in self.cells):
                 return False
-        except ValueError:  # nothing is in the cell any more
+        except ValueError:  # the cell is empty now
             return False
         return all(scope.get(name, _ABSENT) is value for scope, name, value in self.names)
 
 
 def reads_of(function: Any) -> Reads | None:
-    """Find what a function reads; None where something of that may change unseen."""
+    """Find what a function reads; None if any of it may change unnoticed."""
     reads = Reads([], [], [])
     return reads if _sees(reads, function) else None
 
 
 def _sees(reads: Reads, value: Any) -> bool:
-    """Note what a value reads; returns whether nothing of that, nor of the value, can change unseen."""
+    """Record what a value reads, and return whether nothing of it can change unnoticed."""
     if type(value) in _IMMUTABLE or id(value) in _PURE:
         return True
     if type(value) is tuple:
@@ -111,7 +112,7 @@ def _sees(reads: Reads, value: Any) -> bool:
 
 
 def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
-    """Return what a chain of names such as `np.linalg.norm` leads to, in modules; each step is noted."""
+    """Return the value of a chain of names such as `np.linalg.norm` in modules; record each step."""
     name, *attributes = chain
     scope: Any = function.__globals__
     if name not in scope:
@@ -130,13 +131,13 @@ def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
 
 @lru_cache(maxsize=1024)
 def _chains(code: CodeType) -> tuple[tuple[str, ...], ...] | None:
-    """Return globals that code names, with attributes behind them; None if it does more with names.
+    """Return the globals that code names, with attributes after them; None if it uses names otherwise.
 
-    So do imports, classes, what sets a global or an attribute, and `__attributes__`.
+    Imports, classes, assignments to globals or attributes, and `__attributes__` do so.
     """
     instructions = [each for each in dis.get_instructions(code) if each.opname != "EXTENDED_ARG"]
     chains: list[list[str]] = []
-    is_open = False  # whether an attribute that follows is one of the last chain
+    is_open = False  # whether a following attribute belongs to the last chain
     for each in instructions:
         if each.opname == "LOAD_GLOBAL":
             chains.append([each.argval])

@@ -1,8 +1,8 @@
-"""Defines traced numbers: a model's function is called with them, and its graph is known after.
+"""Traced numbers: a model's function is called with them, which results in its graph.
 
-They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects. A
-condition that depends on them is tried both ways (see `functions`). What would freeze a value that is
-not known, such as float() or an index, is refused with the mend.
+They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects.
+Conditions that depend on them are followed on both paths (see `functions`). Uses that would fix an
+unknown value, such as float() or an index, raise an error with advice.
 """
 
 import linecache
@@ -18,7 +18,7 @@ from fuselog.replay.tracing.graph import Graph, Node
 
 
 class CannotTrace(TypeError):
-    """Says what a function does that no graph holds, and what to write instead."""
+    """Error that explains what a graph cannot represent, and what to write instead."""
 
 
 MOST_WAYS = 256
@@ -34,13 +34,13 @@ _INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 
 
 def refused(what: str) -> CannotTrace:
-    """Return the sentence for something that is refused."""
+    """Make the error for a use of a traced number that is not supported."""
     mend = _MENDS.get(what, "write it with operators, np.where and functions such as np.exp")
     return CannotTrace(f"it uses {what} of a number that is not known before; {mend}")
 
 
 def too_many_ways() -> CannotTrace:
-    """Return the sentence for conditions that are too many, also of a loop that does not end."""
+    """Make the error for too many conditions, which may also come from an endless loop."""
     return CannotTrace(
         f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that are not "
         "known before; write np.clip or np.where, and a fixed number of rounds"
@@ -48,7 +48,7 @@ def too_many_ways() -> CannotTrace:
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
-    """Represents a number of a graph that grows as it is used."""
+    """A number of a graph, which grows as the number is used."""
 
     __slots__ = ("node", "trace")
 
@@ -60,7 +60,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         return f"traced number {self.node.number}"
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        options.pop("out", None)  # of `x += y`, for which a new number does as well
+        options.pop("out", None)  # of `x += y`, which can also make a new number
         if method != "__call__":
             raise CannotTrace(f"it uses np.{ufunc.__name__}.{method}; write it with operators")
         if options:
@@ -100,15 +100,15 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 class Trace:
-    """Records one call of a function with traced numbers: the graph, the way through its conditions."""
+    """One call of a function with traced numbers: the graph, and the path through its conditions."""
 
     def __init__(self, graph: Graph, decisions: dict[Node, bool]) -> None:
         self.graph = graph
-        self.decisions = decisions  # of conditions, in the order in which they were met
-        self.more: list[Node] = []  # conditions met that were not decided before
+        self.decisions = decisions  # of conditions, in the order in which they were reached
+        self.more: list[Node] = []  # newly reached conditions
 
     def decided(self, number: Traced) -> bool:
-        """Decide which way is taken at a condition: a new one holds, and is tried otherwise later."""
+        """Return the path at a condition: a new one is true at first, and tried the other way later."""
         node = (
             number.node
             if number.node.is_truth
@@ -117,7 +117,7 @@ class Trace:
         if node.is_constant:
             return bool(node.value)
         if node not in self.decisions:
-            if len(self.more) == MOST_WAYS:  # each of which is tried the other way
+            if len(self.more) == MOST_WAYS:  # each is tried the other way later
                 raise too_many_ways()
             self.decisions[node] = True
             self.more.append(node)
@@ -128,14 +128,14 @@ class Trace:
         return Traced(self, node)
 
     def node_of(self, value: Any) -> Node:
-        """Return the node of a traced number or a known one."""
+        """Return the node of a traced or a known number."""
         if isinstance(value, Traced):
             return value.node
         return self.graph.constant(value)
 
 
 def where(condition: Any, yes: Any, no: Any) -> Any:
-    """Select one of two numbers, of which the other may be anything."""
+    """Select one of two numbers; the other may have any value."""
     numbers = [each for each in (condition, yes, no) if isinstance(each, Traced)]
     if not numbers:
         return yes if condition else no
@@ -147,7 +147,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
-    """Trace `np.interp` over a known table: the straight line of the last knot before x."""
+    """Trace `np.interp` over a known table, with the line segment of the last knot before x."""
     known_x, known_y = (_known("np.interp", each) for each in (xp, fp))
     found = where(np.isnan(x), x, known_y[0] if left is None else left)
     for k in range(len(known_x) - 1):
@@ -158,7 +158,7 @@ def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None)
 
 
 def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
-    """Trace `np.searchsorted` in a table that is known: how many of its numbers are less."""
+    """Trace `np.searchsorted` in a known table, by counting the smaller numbers."""
     count: Any = 0.0
     for each in _known("np.searchsorted", a):
         count = count + where(v > each if side == "left" else v >= each, 1.0, 0.0)
@@ -166,7 +166,7 @@ def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
 
 
 def _chosen(a: Any, choices: Any) -> Any:
-    """Trace `np.choose`; `np.take` does not tell NumPy's functions of its index."""
+    """Trace `np.choose`; `np.take` does not dispatch on its index."""
     found, *others = choices
     for place, each in enumerate(others, 1):
         found = where(a >= float(place), each, found)
@@ -174,7 +174,7 @@ def _chosen(a: Any, choices: Any) -> Any:
 
 
 def _known(what: str, table: Any) -> list[float]:
-    """Return the numbers of a table."""
+    """Return the numbers of a table; raise CannotTrace if they are traced."""
     if any(isinstance(each, Traced) for each in np.ravel(np.asarray(table, object))):
         raise CannotTrace(f"it uses {what} of a table that is not known before; write np.where")
     return np.asarray(table, float).tolist()
@@ -198,7 +198,7 @@ def _log_of_sum(x: Any, y: Any) -> Any:
     return where(x == y, x + np.log(2.0), larger + np.log1p(np.exp(less - larger)))
 
 
-# What is made of other functions, each a true choice: NaN in what is not chosen stays there.
+# Functions composed of others; selections ignore NaN in the other alternative.
 _COMPOSED: dict[Any, Callable[..., Any]] = {
     np.where: where,
     np.minimum: lambda x, y: where((x <= y) | np.isnan(x), x, y),
@@ -243,7 +243,7 @@ _OPERATORS: dict[Any, Any] = {
     np.floor_divide: operator.floordiv,
     np.fabs: np.absolute,
 }
-# What a graph holds as it is, beside the operators.
+# Functions that a graph represents directly, besides the operators.
 PRIMITIVES = (
     *(np.sqrt, np.cbrt, np.hypot, np.exp, np.exp2, np.expm1, np.log, np.log2, np.log10, np.log1p),
     *(np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.arctan2, np.sinc),
@@ -256,7 +256,7 @@ _OF_TABLES = (np.interp, np.searchsorted, np.choose)
 
 
 def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None = None) -> Any:
-    """Apply a function of NumPy's to traced and other numbers, or arrays of them."""
+    """Apply a NumPy function to traced and other numbers, or arrays of them."""
     if function in _OF_TABLES:
         return _COMPOSED[function](*inputs, **(options or {}))
     if any(not isinstance(each, Traced) and np.ndim(each) for each in inputs):
@@ -279,7 +279,7 @@ def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None
 
 
 def _power(trace: Trace, base: Any, exponent: Any) -> Any:
-    """Trace a power; of an integer by multiplication, as in Python's source."""
+    """Trace a power; integer exponents become multiplications, as in Python's source."""
     if isinstance(exponent, int | np.integer):
         return trace.number(trace.graph.power(trace.node_of(base), int(exponent)))
     return trace.number(trace.graph.apply(np.power, trace.node_of(base), trace.node_of(exponent)))
@@ -302,7 +302,7 @@ def _over_arrays(function: Any, inputs: tuple[Any, ...]) -> Any:
 
 
 def _methods() -> None:
-    """Define what NumPy calls of the objects in an array, such as `x.sin()`."""
+    """Define the methods that NumPy calls on the objects in an array, such as `x.sin()`."""
 
     def method(function: Any) -> Callable[..., Any]:
         return lambda *inputs: apply(function, inputs)
