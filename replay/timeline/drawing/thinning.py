@@ -110,7 +110,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Tell which rows are kept of their cells; of the widest, all time, the last stamp's are."""
+        """Find the rows that are kept in their cells; in the widest cell, those of the last stamp."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
