@@ -1,4 +1,4 @@
-"""Replays an ensemble of runs in time order, in one pass, through several estimators at once.
+"""Replay of an ensemble of runs in time order, in one pass, through several estimators.
 
-Begin with `streams.blocks`, which is what flows, and `replaying.replaying`, which lets it flow.
+Begin with `streams.blocks`, which defines the data, and `replaying.replaying`, which runs the replay.
 """

@@ -1,4 +1,4 @@
-"""Names the types of arrays and functions, and marks NamedTuples of arrays whose sizes vary."""
+"""Type aliases of arrays and functions, and a decorator for NamedTuples of arrays of varying size."""
 
 from collections.abc import Callable
 from functools import reduce
@@ -11,35 +11,35 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Numbers = tuple[float, ...]
-# The numbers that a model's functions read, by name: a NamedTuple that is made for each model, see
+# The numbers that a model's functions read, by name: a NamedTuple type made for each model, see
 # `fuselog.replay.inference.model.parameters.settings_type`.
 Settings = Any  # type: ignore[explicit-any]
-# An argument of a function whose number of arguments is not known here: numbers, arrays, tuples of them.
+# An argument of a function with any number of arguments: numbers, arrays, or tuples of them.
 AnyArgument = Any  # type: ignore[explicit-any]
-# Columns of several types, which a NamedTuple of arrays is made of.
+# Columns of several types, as in a NamedTuple of arrays.
 Columns = Any  # type: ignore[explicit-any]
-# An array of whatever kind a column is.
+# An array of any type that a column can have.
 AnyArray = NDArray[Any]  # type: ignore[explicit-any]
-RowSlice: TypeAlias = "slice[int, int, int]"  # of rows; unless told, its parameters are Any
+RowSlice: TypeAlias = "slice[int, int, int]"  # of rows; without type parameters they would be Any
 Kind = TypeVar("Kind", bound=type)
 
 
 def over_columns(ufunc: np.ufunc, matrix: AnyArray) -> AnyArray:
-    """Reduce each row of a matrix (n, m), m > 0: column by column, 30 times as fast as by its last axis.
+    """Reduce each row of a matrix column by column, 30 times as fast as along its last axis.
 
     Args:
-        ufunc: such as np.logical_and, for `all`.
-        matrix: (n, m), of few columns.
+        ufunc: the reduction, such as np.logical_and for `all`.
+        matrix: (n, m), with few columns and m > 0.
     """
     return reduce(ufunc, matrix.T) if matrix.shape[1] else ufunc.reduce(matrix, axis=1)
 
 
 def varying(axes: int, **of_fields: int) -> Callable[[Kind], Kind]:
-    """Mark a NamedTuple of arrays by how many of their first axes vary from log to log.
+    """Mark a NamedTuple of arrays with the number of leading axes whose sizes vary from log to log.
 
-    The sizes of all other axes are part of a kernel that gets them; see
-    `fuselog.recorders.compiling.kernels.native`. Of what is not marked these are the first axis, the
-    runs or messages, and none of a core's scratch.
+    The sizes of all other axes are compiled into a kernel that gets the arrays; see
+    `fuselog.recorders.compiling.kernels.native`. In an unmarked NamedTuple only the first axis (runs or
+    messages) varies, and no axis of a core's scratch memory does.
     """
 
     def marked(kind: Kind) -> Kind:

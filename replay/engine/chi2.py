@@ -1,7 +1,8 @@
-"""Computes the chi-squared distribution, by the names of `scipy.stats.chi2`.
+"""Chi-squared distribution, with the function names of `scipy.stats.chi2`.
 
-Importing scipy.special takes a fifth of the time of a short command, which is why these functions are
-kernels: half of a chi-squared number of k degrees of freedom has the gamma distribution of shape k / 2.
+Importing scipy.special takes a fifth of the run time of a short command, so these functions are
+kernels. Half of a chi-squared variable with k degrees of freedom has the gamma distribution with shape
+k / 2.
 """
 
 import math
@@ -13,22 +14,22 @@ from numpy.typing import ArrayLike
 from fuselog.recorders.compiling.compile import OverRuns, compile_over_runs
 from fuselog.replay.engine.arrays import Floats
 
-# One number, or an array of them, as what is given.
+# A number or an array, like the arguments.
 Numbers = Any  # type: ignore[explicit-any]
 
 _ROUNDING = 2.0**-53
-_STEPS = 100  # of Newton's method; it takes 3 to 12
-_CLOSE = 1e-9  # a relative step of Newton's method, whose square is below the rounding
-_FARTHEST = 2.0  # such a step, at most
+_STEPS = 100  # of Newton's method, which needs 3 to 12
+_CLOSE = 1e-9  # relative step of Newton's method whose square is below the rounding error
+_FARTHEST = 2.0  # largest relative step
 _TINY = 1e-300
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
-    """Return the value below which a number lies with this probability.
+    """Compute quantiles: the values below which a chi-squared variable is with given probabilities.
 
     Args:
         probability: (...), from 0 to 1.
-        degrees: (...), of freedom.
+        degrees: (...), degrees of freedom.
 
     Returns:
         (...), or one number.
@@ -37,11 +38,11 @@ def ppf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
 
 
 def isf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
-    """Return the value that a number exceeds with this probability.
+    """Compute upper quantiles: the values that a chi-squared variable exceeds with given probabilities.
 
     Args:
         probability: (...), from 0 to 1.
-        degrees: (...), of freedom.
+        degrees: (...), degrees of freedom.
 
     Returns:
         (...), or one number.
@@ -50,11 +51,11 @@ def isf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
 
 
 def sf(value: ArrayLike, degrees: ArrayLike) -> Numbers:
-    """Return the probability with which a number exceeds this value.
+    """Compute the probabilities with which a chi-squared variable exceeds given values.
 
     Args:
         value: (...), not negative.
-        degrees: (...), of freedom.
+        degrees: (...), degrees of freedom.
 
     Returns:
         (...), or one number.
@@ -67,7 +68,7 @@ def _quantile(below: ArrayLike, above: ArrayLike, degrees: ArrayLike) -> Numbers
 
 
 def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
-    """Run a kernel over the elements of arrays, the last of which are degrees of freedom."""
+    """Apply a kernel to the elements of broadcast arrays, the last of which are degrees of freedom."""
     same = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in numbers))
     columns = [np.ascontiguousarray(each).ravel() for each in same]
     shape = 0.5 * columns.pop()
@@ -78,10 +79,10 @@ def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
 
 
 def _log_tails(shape: float, log_gamma: float, value: float) -> tuple[float, float]:
-    """Compute the logarithms of the probabilities below and above a value by the gamma distribution.
+    """Compute the logarithms of the gamma distribution's probabilities below and above a value.
 
-    The smaller one is a series, or the continued fraction of Lentz's method (Press et al., Numerical
-    Recipes, 6.2); the other one is what is left.
+    The smaller one comes from a series, or from a continued fraction by Lentz's method (Press et al.,
+    Numerical Recipes, 6.2); the other one is its complement.
     """
     front = shape * math.log(value) - value - log_gamma
     if value < shape + 1.0:
@@ -114,7 +115,7 @@ def _log_of_rest(log_probability: float) -> float:
 
 
 def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floats) -> None:
-    """Find with which probability a value is exceeded."""
+    """Compute the probability with which a value is exceeded."""
     half = 0.5 * value[run]
     if not 0.0 < shape[run] < math.inf or not half >= 0.0:
         found[run] = math.nan
@@ -127,9 +128,10 @@ def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floa
 def _solve(
     run: int, found: Floats, below: Floats, above: Floats, shape: Floats, log_gamma: Floats
 ) -> None:
-    """Find the value with these probabilities below and above it, by Newton's method for its logarithm.
+    """Find the value with these probabilities below and above it, by Newton's method on its logarithm.
 
-    The logarithm of the smaller tail is nearly a line over that of a small value, and bends one way.
+    The logarithm of the smaller tail is nearly linear in the logarithm of a small value, and its
+    curvature has one sign.
     """
     if not 0.0 < shape[run] < math.inf or not 0.0 <= below[run] <= 1.0:
         found[run] = math.nan

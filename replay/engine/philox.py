@@ -1,8 +1,8 @@
-"""Draws random numbers inside kernels by Philox, whose state is a counter and a run's own key.
+"""Random numbers inside kernels by Philox, whose state is a counter and the key of the run.
 
-A kernel that makes no arrays cannot hold a generator of NumPy; this one is a few words of a run's state.
-The words are those of `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as
-easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method for
+A kernel that creates no arrays cannot hold a NumPy generator; the state of this one is a few words per
+run. The words are those of `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random numbers:
+as easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method for
 generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
 """
 
@@ -16,20 +16,20 @@ from fuselog.replay.engine.arrays import AnyArray, Floats
 
 Words = NDArray[np.uint64]
 
-WORDS = 4  # of a block
+WORDS = 4  # per block
 _ROUNDS = 10
 _MULTIPLIERS = 0xD2E7470EE14C6C93, 0xCA5A826395121157
 _WEYL = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
 _UNIT = 2.0**-53
-_LAYERS, _TAIL = 256, 3.6541528853610088  # of the ziggurat, and where its tail begins
-# erfc(_TAIL / sqrt 2) of scipy.special, which takes long to import.
+_LAYERS, _TAIL = 256, 3.6541528853610088  # number of layers of the ziggurat, and where its tail begins
+# erfc(_TAIL / sqrt 2); computing it would need scipy.special, which is slow to import.
 _BEYOND = 0.00025803248765390125
 
 
 def run_key(seed: int, first: Iterable[AnyArray]) -> Words:
-    """Return a run's own key (2,): of a seed and its first data.
+    """Compute the key (2,) of a run from a seed and the run's first data.
 
-    So its numbers are the same on any number of cores, and whatever other runs there are.
+    Its random numbers therefore depend neither on the number of cores nor on the other runs.
 
     Args:
         seed: the parameter.
@@ -40,7 +40,7 @@ def run_key(seed: int, first: Iterable[AnyArray]) -> Words:
 
 
 def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
-    """Return the upper 64 bits of a product of 128."""
+    """Return the upper 64 bits of a 128-bit product."""
     low, half = np.uint64(0xFFFFFFFF), np.uint64(32)
     a_low, a_high, b_low, b_high = a & low, a >> half, b & low, b >> half
     first = a_high * b_low + ((a_low * b_low) >> half)
@@ -49,11 +49,11 @@ def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
 
 
 def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Return the block of four words with this number.
+    """Compute the block of four words at a counter.
 
     Args:
-        counter: the number of the block.
-        key: (2,) of the run.
+        counter: number of the block.
+        key: (2,) key of the run.
     """
     a, b, c, d = np.uint64(counter), np.uint64(0), np.uint64(0), np.uint64(0)
     k0, k1 = key[0], key[1]
@@ -66,14 +66,14 @@ def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, n
 
 
 def unit(word: np.uint64) -> float:
-    """Return a number from the middles of 2^53 pieces of (0, 1): neither 0 nor 1."""
+    """Map a word to the midpoint of one of 2^53 intervals of (0, 1), so that it is neither 0 nor 1."""
     return (float(word >> np.uint64(11)) + 0.5) * _UNIT
 
 
 def _ziggurat() -> tuple[Floats, Floats, Floats]:
-    """Find layers of one area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
+    """Compute layers of equal area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
 
-    The lowest layer, number 0, has the tail with it: its end is that of a rectangle of the same area.
+    The lowest layer, number 0, includes the tail: its right end is that of a rectangle of the same area.
     """
     area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * _BEYOND
     ends = np.zeros(_LAYERS + 1)
@@ -91,16 +91,16 @@ _ENDS, _HEIGHTS, _SHARES = _ziggurat()
 
 
 def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int:
-    """Fill an array with draws of N(0, 1).
+    """Fill an array with draws from N(0, 1).
 
-    The blocks after number `counter` are used, a word for each draw, and after these another block for
-    each of the few draws, one in 67, that a word does not settle.
+    The blocks after number `counter` provide one word per draw. About one draw in 67 is not settled by
+    its word and uses further blocks after these.
 
     Args:
-        numbers: (n,), n a multiple of four, overwritten.
-        words: (n,), to work in.
+        numbers: (n,), overwritten; n is a multiple of four.
+        words: (n,), work space.
         key: (2,), see `run_key`.
-        counter: the number of the last block that was used before.
+        counter: number of the last block used before.
 
     Returns:
         The number of the last block that was used.
@@ -121,13 +121,13 @@ def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int
 
 
 def layer_of(word: np.uint64) -> tuple[int, float, float]:
-    """Return a layer of the ziggurat, how far to its right end, and a sign."""
+    """Extract a layer of the ziggurat, a relative position within it, and a sign from a word."""
     layer = int(word & np.uint64(_LAYERS - 1))
     return layer, unit(word), 1.0 if word & np.uint64(_LAYERS) else -1.0
 
 
 def settled(layer: int, share: float, sign: float, key: Words, counter: int) -> tuple[float, int]:
-    """Return the draw of a layer beyond what lies inside for certain, and the counter after it."""
+    """Draw from a layer beyond its inner part by rejection sampling, and return the counter reached."""
     while True:
         counter += 1
         a, b, c, _ = philox(counter, key)

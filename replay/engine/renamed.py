@@ -1,4 +1,4 @@
-"""Accepts the public names of the release before, and says what each is called now."""
+"""Support for public names of the previous release, with warnings that state the new names."""
 
 import warnings
 from collections.abc import Callable
@@ -6,13 +6,17 @@ from functools import wraps
 from operator import attrgetter
 from typing import Any, TypeVar
 
-# A function or a class of any arguments.
+# A function or a class with any arguments.
 Taking = Callable[..., Any]  # type: ignore[explicit-any]
 Target = TypeVar("Target", bound=Taking)
 
 
 def renamed(**names: str) -> Callable[[Target], Target]:
-    """Let a function or a dataclass take arguments by their old names too, with a FutureWarning.
+    """Make a function or a dataclass also accept arguments under their old names, with a FutureWarning.
+
+    Args:
+        names: the new name of each argument, by the old one. The fields of a dataclass can be read
+            under their old names as well.
 
     Args:
         names: the new name of each argument, by the old one. A dataclass lets the field be read by its

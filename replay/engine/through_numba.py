@@ -1,8 +1,9 @@
-"""Compiles recursions that make arrays through numba, with all that they call.
+"""Compilation by numba of recursions that create arrays, including all functions that they call.
 
-numba keeps what it compiled (`numba.njit(cache=True)`), but looks for changes only in the file of one
-function. So a kernel is kept under a name with the digest of all that it is made of: its code and the
-code of all that it calls, the constants, and the fields of the named tuples that it is given.
+numba caches what it compiles (`numba.njit(cache=True)`) but checks for changes only in the file of one
+function. A kernel is therefore cached under a name that contains a digest of everything it depends on:
+its code and the code of all functions that it calls, the constants, and the fields of the named tuples
+that it is given.
 """
 
 import dis
@@ -27,24 +28,24 @@ from fuselog.recorders.compiling.kinds import KernelFunction, RunOnce, Value
 from fuselog.recorders.compiling.notices import compiling
 from fuselog.recorders.compiling.scratch import Memory
 
-# One step of Python's byte code: its name, what it is about, its line.
+# One instruction of Python's byte code: its name, its argument, its line.
 _Step = tuple[str, Value, int | None]
-# How functions are compiled that only kernels call.
+# Compiler options of functions that only kernels call.
 _INNER: dict[str, Value] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def numba_over_runs(run_once: RunOnce, title: str = "") -> OverRuns:
-    """Compile a function of one run that makes arrays into a loop over all runs, on all cores.
+    """Compile a function of one run that creates arrays into a loop over all runs, on all cores.
 
-    Args and Returns are those of `compile_over_runs`. Raises BadInput, when the loop is called, if numba
-    is not installed or cannot compile the function.
+    Args and Returns are those of `compile_over_runs`. The loop raises BadInput when it is called, if
+    numba is not installed or cannot compile the function.
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
     return OverRuns(run_once, cache(lambda: _Loop(cast(FunctionType, run_once), title)))
 
 
 class _Loop:
-    """Represents a function of one run as a loop over runs, a kernel for each kinds of arguments."""
+    """Loop of a function over runs, with one kernel for each combination of argument types."""
 
     def __init__(self, run_once: FunctionType, title: str) -> None:
         try:
@@ -55,7 +56,7 @@ class _Loop:
                 "pip install 'fuselog[numba]', or set allocates=False if it makes no arrays"
             ) from error
         bounds = environment.is_on(environment.BOUNDSCHECK)
-        # a division by zero gives infinity, which is a failure of its run, and no exception
+        # a division by zero gives infinity, which fails the run, instead of an exception
         self._options: dict[str, Value] = {"error_model": "numpy", "nogil": True, "boundscheck": bounds}
         self._njit = numba.njit
         self._function, self._title = run_once, title
@@ -76,7 +77,7 @@ class _Loop:
         return lambda first, end: kernel(first, end, leaves)
 
     def _kernel(self, everything: tuple[Value, ...], leaves: tuple[Value, ...]) -> KernelFunction:
-        """Load or compile the loop; its arguments are taken apart, so that numba knows their types."""
+        """Load or compile the loop; its arguments are flattened so that numba knows their types."""
         scope: dict[str, Value] = {"__name__": __name__, "run_once": self._called}
         text = (
             "def kernel(first, end, leaves):\n"
@@ -93,7 +94,7 @@ class _Loop:
             return self._first_called(kernel, leaves, is_kept=True)
 
     def _first_called(self, kernel: FunctionType, leaves: Value, *, is_kept: bool) -> KernelFunction:
-        """Return the kernel when numba has it for such arguments; it goes through no run."""
+        """Return the kernel, compiled or loaded for such arguments; no run is processed."""
         from numba.core.errors import NumbaError
 
         try:
@@ -101,7 +102,7 @@ class _Loop:
             made(0, 0, leaves)
         except NumbaError as error:
             raise self._explained(error) from error
-        except Exception as error:  # no folder for its cache, a full disk, a damaged file
+        except Exception as error:  # no folder for the cache, a full disk, a damaged file
             if not is_kept:
                 raise
             say_once(f"numba's cache fails ({error}): {self._title} is compiled in every process")
@@ -109,7 +110,7 @@ class _Loop:
         return made
 
     def _compiled(self, function: FunctionType) -> Value:
-        """Make a function for numba, which knows all that it calls as such functions."""
+        """Compile a function with numba, together with all functions that it calls."""
         if function in self._known:
             return self._known[function]
         code, scope = function.__code__, dict(function.__globals__)
@@ -130,7 +131,7 @@ class _Loop:
         return self._known[function]
 
     def _usable(self, name: str, value: Value) -> Value:
-        """Return what a kernel uses by a name, as numba takes it."""
+        """Return the value of a name that a kernel uses, in the form that numba accepts."""
         if isinstance(value, np.ndarray) and value.flags.writeable:
             raise DoesNotCompile(
                 f"{self._function.__qualname__} uses the array '{name}', which could change: pass it as "
@@ -138,7 +139,9 @@ class _Loop:
             )
         if str(getattr(value, "__module__", "")).partition(".")[0] in OF_PYTHON:
             return value
-        function = inspect.unwrap(value)  # what has been compiled already is compiled with the rest
+        function = inspect.unwrap(
+            value
+        )  # a function that is already compiled is compiled again with the rest
         return self._compiled(function) if isinstance(function, FunctionType) else value
 
     def _explained(self, error: Exception) -> DoesNotCompile:
@@ -151,7 +154,7 @@ class _Loop:
 
 
 def _take_apart(value: Value, kinds: list[Value], leaves: list[Value]) -> None:
-    """Add the arrays and numbers of an argument to `leaves`, and what they and their tuples are."""
+    """Append the arrays and numbers of an argument to `leaves`, and their types to `kinds`."""
     if isinstance(value, tuple):
         kinds.append((type(value), len(value)))
         for each in value:
@@ -163,7 +166,7 @@ def _take_apart(value: Value, kinds: list[Value], leaves: list[Value]) -> None:
 
 
 def _put_together(value: Value, places: Iterator[int], scope: dict[str, Value]) -> str:
-    """Write the expression that makes an argument of `leaves`; named tuples get a name in the scope."""
+    """Write the expression that rebuilds an argument from `leaves`; named tuples are put in `scope`."""
     if not isinstance(value, tuple):
         return f"leaves[{next(places)}]"
     parts = "".join(f"{_put_together(each, places, scope)}, " for each in value)
@@ -175,7 +178,7 @@ def _put_together(value: Value, places: Iterator[int], scope: dict[str, Value]) 
 
 
 def _steps(code: CodeType) -> Iterator[_Step]:
-    """Yield the steps of a function, and then those of the functions inside it."""
+    """Yield the instructions of a function, then those of the functions defined inside it."""
     for each in dis.get_instructions(code):
         yield each.opname, each.argval, each.positions.lineno if each.positions else None
     for constant in code.co_consts:
@@ -184,7 +187,7 @@ def _steps(code: CodeType) -> Iterator[_Step]:
 
 
 def _refuse_random(function: FunctionType, steps: Sequence[_Step], outside: Mapping[str, Value]) -> None:
-    """Raise DoesNotCompile if a function draws from NumPy's generator, which is shared by all runs."""
+    """Raise DoesNotCompile if a function draws from NumPy's global generator, which all runs share."""
     for (_, before, _), (_, name, line) in pairwise(steps):
         used = outside.get(name)
         is_module = name == "random" and outside.get(before) is np

@@ -1,4 +1,4 @@
-"""Reads what a foreign filter says of itself: its topics, its state, its parameters; in JSON."""
+"""Description of a foreign filter in JSON: its topics, its state, its parameters."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -15,17 +15,17 @@ from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.channels import resolved
 from fuselog.replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
 
-MOST_COMPONENTS = 1000  # of a state: its covariance has a million numbers
+MOST_COMPONENTS = 1000  # of a state; the covariance then has a million numbers
 
 
 class ForeignParameters(Parameters):
-    """States how a foreign filter is run; beside these it has the parameters of its description.
+    """Settings of a foreign filter; the parameters in its description are added to them.
 
     Attributes:
-        time_limit_s: a run fails where one message takes longer.
-        memory_limit_mb: a run fails where the filter's process takes more memory.
-        every_s: estimates are given at the multiples of this time, too.
-        seed: of the filter's random numbers.
+        time_limit_s: a run fails if one message takes longer.
+        memory_limit_mb: a run fails if the filter's process takes more memory.
+        every_s: additional estimates are given at the multiples of this time.
+        seed: seed of the filter's random numbers.
     """
 
     time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 10.0
@@ -35,22 +35,22 @@ class ForeignParameters(Parameters):
 
 
 class _Part(BaseModel):
-    """Refuses unknown names, NaN and infinity in a part of a description."""
+    """Part of a description; unknown names, NaN and infinity are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class TopicRead(_Part):
-    """Describes a topic that a filter reads.
+    """Topic that a filter reads.
 
     Attributes:
-        topic: its name; one without a slash in front is looked for under every prefix.
-        fields: those that the filter is given, in this order; `position_m[2]` is a vector of two.
+        topic: its name; one without a leading slash is searched under every prefix.
+        fields: fields that the filter is given, in this order; `position_m[2]` is a vector of two.
         message: name of the message's schema, such as `fuselog.RangeBearing`; "" for any.
-        static: whether all of it is taken before the start, such as a map.
+        static: whether all of its messages are passed before the start, as for a map.
         optional: whether a log may lack it.
-        estimates: whether an estimate is wanted at its messages.
-        target: the field that says what a message is about.
+        estimates: whether estimates are wanted at its messages.
+        target: field with the identifier of the measured target.
     """
 
     topic: str = Field(min_length=1)
@@ -72,18 +72,18 @@ class TopicRead(_Part):
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Count how many numbers a vector field has; 0 for a field that is one number."""
+        """Return the length of each vector field, and 0 for a field that is one number."""
         parts = (field.partition("[") for field in self.fields)
         return {name: int(size[:-1]) if size else 0 for name, _, size in parts}
 
     @property
     def width(self) -> int:
-        """Count the numbers of a message."""
+        """Return the number of values in a message."""
         return sum(size or 1 for size in self.sizes.values())
 
 
 class ParameterRead(_Part):
-    """Describes a parameter: its default (none takes what the log's channels state), bounds, meaning."""
+    """Parameter: default (None: what the log's channels state), bounds, unit and meaning."""
 
     default: float | None = None
     unit: str = ""
@@ -96,20 +96,20 @@ class ParameterRead(_Part):
 
 
 class Description(_Part):
-    """Describes a foreign filter.
+    """Description of a foreign filter.
 
     Attributes:
-        summary: what it is, in one line.
-        topics: what it reads.
-        state: the components of the state by name, with their kinds.
-        innovation: those that its innovations have; none where it gives no innovations.
+        summary: one-line description.
+        topics: topics that it reads.
+        state: components of the state by name, with their kinds.
+        innovation: components of its innovations; empty if it gives none.
         parameters: by name.
-        prior: the topic of the prior; "" where it starts by itself.
-        truth: the topic of the truth.
-        output: what its topic of estimates ends with.
-        failures: sentences; a function that returns n means the n-th.
-        digest: of a filter that `fuselog deploy` wrote, that of its graphs and numbers.
-        protocol: of a program that answers messages, the version that it speaks.
+        prior: topic of the prior; "" if it starts by itself.
+        truth: topic of the truth.
+        output: last part of the name of its topic of estimates.
+        failures: sentences; a function that returns n means the n-th one.
+        digest: for a filter written by `fuselog deploy`, the digest of its graphs and numbers.
+        protocol: for a program that answers messages, its version of the protocol.
     """
 
     summary: str
@@ -126,16 +126,16 @@ class Description(_Part):
 
     @cached_property
     def tangent(self) -> int:
-        """Count the components of the tangent space."""
+        """Return the number of components of the tangent space."""
         return len(tangent_components(list(self.state), list(self.state.values())))
 
     @cached_property
     def width(self) -> int:
-        """Count the numbers of the widest message."""
+        """Return the number of values in the widest message."""
         return max(each.width for each in self.topics)
 
     def bindings(self, topics: Mapping[str, Topic]) -> Iterator[tuple[str, dict[str, Topic]]]:
-        """Find where a log has all topics: prefix, and the topics that are there by name."""
+        """Yield each prefix under which a log has all topics, and the topics found by name."""
         own = [each.topic for each in self.topics if not each.topic.startswith("/")]
         prefixes = dict.fromkeys(
             name.removesuffix(f"/{topic}")
@@ -157,7 +157,7 @@ class Description(_Part):
 
     @property
     def requirements(self) -> str:
-        """Say what a log must have."""
+        """Describe what a log must contain."""
         return ", ".join(
             resolved(each.topic, "...")
             + (f" ({each.message})" if each.message else "")
@@ -166,7 +166,7 @@ class Description(_Part):
         )
 
     def parameters_over(self, base: type[Parameters]) -> type[Any]:
-        """Make the type of all parameters: those of how it is run, and the filter's own."""
+        """Make the type of all parameters: the settings in `base`, and the filter's own parameters."""
         fields: dict[str, Any] = {}
         for name, each in self.parameters.items():
             bounds = {
@@ -185,11 +185,11 @@ class Description(_Part):
 
 
 def read_description(text: str | bytes, where: str) -> Description:
-    """Read a description; raises BadInput where it is none, or contradicts itself.
+    """Read a description; raise BadInput if it is invalid or inconsistent.
 
     Args:
         text: JSON.
-        where: whose it is, for messages.
+        where: name of the filter in messages.
     """
     try:
         found = parse_json(text.decode() if isinstance(text, bytes) else text)
@@ -229,6 +229,6 @@ _TAKEN = {"kind", "path", "command", "in_process", "topics", "truth", "model_con
 
 
 class _Described(Parameters):
-    """Holds what a program answers when it is asked to describe itself."""
+    """Answer of a program that is asked to describe itself."""
 
     description: Description

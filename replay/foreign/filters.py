@@ -1,7 +1,7 @@
-"""Makes estimators of foreign filters: bound to the topics of a log like any other.
+"""Estimators made from foreign filters, bound to the topics of a log like any other.
 
-A filter in this process goes through its messages block by block. One in a process of its own is given
-a run's messages at once, when all are there: so a run that ends its process costs no other run anything.
+A filter in this process gets its messages block by block. A filter in a process of its own gets all
+messages of a run when the replay ends, so that a run that crashes its process affects no other run.
 """
 
 import weakref
@@ -56,16 +56,16 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 from fuselog.replay.inference.run.timing import add_output_times
 
 Prior = tuple[Integers, Floats, Floats]
-# Takes runs through their filters in other processes; None of a run that takes no part.
+# Processes runs by their filters in other processes; None for a run that does not take part.
 FollowRuns = Callable[[Sequence[RunGiven | None], Limits], list[Ran | None]]
 
 
 class LibraryParameters(ForeignParameters):
-    """Names a filter of a shared library.
+    """Settings of a filter in a shared library.
 
     Attributes:
         path: the library, which has the functions of `fuselog_filter.h`.
-        in_process: call it in this process: faster, and what it breaks breaks the replay.
+        in_process: call it in this process: this is faster, but a crash of the filter ends the replay.
     """
 
     path: str = ""
@@ -74,15 +74,15 @@ class LibraryParameters(ForeignParameters):
 
 @dataclass(frozen=True)
 class FoundFilter:
-    """Describes a filter that was found in a log.
+    """Filter bound to the topics of a log.
 
     Attributes:
-        name: what its output topics begin with, after `/estimates/`.
-        description: what the filter says of itself.
-        prefix: of its topics.
-        topics: those that the log has, by the description's names.
-        prior: the topic of the prior; "" where it starts by itself.
-        parameters: all of them.
+        name: name of its output topics, after `/estimates/`.
+        description: description of the filter.
+        prefix: prefix of its topics.
+        topics: topics that the log has, by the names in the description.
+        prior: topic of the prior; "" if it starts by itself.
+        parameters: all of its parameters.
     """
 
     name: str
@@ -94,7 +94,7 @@ class FoundFilter:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Return the filter's own parameters; raises BadInput where the log does not state one."""
+        """Return the filter's own parameters; raise BadInput if the log does not state a missing one."""
         asked = list(self.topics.values())
         return tuple(
             given_or_stated(self.parameters, asked, name) for name in self.description.parameters
@@ -102,11 +102,11 @@ class FoundFilter:
 
     @property
     def truth(self) -> str:
-        """Name the topic of the truth."""
+        """Return the topic of the truth."""
         return resolved(self.description.truth, self.prefix)
 
     def bound(self, start: Any, run: Any, finish: Any) -> Recursive:
-        """Return the estimator, from its functions."""
+        """Make the bound estimator from its functions `start`, `run` and `finish`."""
         read = [each for each in self.description.topics if each.topic in self.topics]
         static = [self.topics[each.topic].name for each in read if each.static]
         return Recursive(
@@ -122,14 +122,17 @@ class FoundFilter:
         )
 
     def started(self, given: Mapping[str, Ragged], runs: int) -> tuple[Static, Prior | None]:
-        """Return what filters are given before their messages."""
+        """Return the static messages and the priors in `given` for this number of runs."""
         prior = gaussians(given[self.prior]) if self.prior else None
         return static_of(self.description, self.topics, given, runs), prior
 
     def events(
         self, block: Block, start_ns: Integers, next_output: Integers
     ) -> tuple[FilterEvents, Integers]:
-        """Turn a block into events, with those of `every_s`, and the numbers of the next of these."""
+        """Convert a block to events, including those of `every_s`, and count the latter.
+
+        Returns the events, and the numbers of the next events of `every_s` (runs,).
+        """
         events = events_of(self.description, self.topics, block)
         every_s = self.parameters.every_s
         if every_s is None or not len(events.time_ns):
@@ -140,7 +143,7 @@ class FoundFilter:
 def bind_all(
     label: str, description: Description, topics: Mapping[str, Topic], parameters: Any
 ) -> list[FoundFilter]:
-    """Find everything in a log that a filter can estimate."""
+    """Bind a filter to everything in a log that it can estimate."""
     found = []
     for prefix, read in description.bindings(topics):
         name = label + prefix
@@ -153,9 +156,10 @@ def bind_all(
 def _named(
     label: str, what: str, name: str, prefix: str, schema: Schema, topics: Mapping[str, Topic]
 ) -> str:
-    """Return the topic that a description names as its prior or truth; "" where the log has none.
+    """Return the topic that a description names as its prior or truth; "" if the log has none.
 
-    Raises BadInput where the log has another one beside what the filter reads: the name is wrong then.
+    Raises BadInput if the log has another such topic next to those that the filter reads, because the
+    name is then wrong.
     """
     topic = resolved(name, prefix)
     if not name or topic in topics:
@@ -179,7 +183,7 @@ def _named(
 
 
 class _Running(NamedTuple):
-    """Holds what filters in this process carry from block to block; `owner` ends them with itself."""
+    """State that filters in this process carry from block to block; `owner` destroys them."""
 
     filters: Filters
     static: Static
@@ -189,7 +193,7 @@ class _Running(NamedTuple):
 
 
 class _Owner:
-    """Owns filters: they end when nobody refers to it any more."""
+    """Owner of filters, which destroys them when it is garbage-collected."""
 
     def __init__(self, library: Library, handles: Integers) -> None:
         weakref.finalize(self, library.destroy_all, handles.tolist())
@@ -211,7 +215,7 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
 
     def run(state: _Running | None, block: Block) -> tuple[_Running, list[Ragged]]:
         before = state or started({}, len(block.events.offsets) - 1)
-        filters = copies_of(library, before.filters)  # the block may have to be processed again
+        filters = copies_of(library, before.filters)  # a block may have to be processed again
         own_start = np.where(filters.has_prior == 1, before.start_ns, _first_ns(block))
         start_ns = np.where(filters.begun == 1, before.start_ns, own_start)
         events, next_output = found.events(block, start_ns, before.next_output)
@@ -234,7 +238,7 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
 
 
 def _first_ns(block: Block) -> Integers:
-    """Return the stamp of every run's first message (runs,); 0 where it has none."""
+    """Return the stamp of every run's first message (runs,); 0 if it has none."""
     offsets, times_ns = block.events.offsets, np.append(block.events.time_ns, 0)
     return np.where(np.diff(offsets) > 0, times_ns[offsets[:-1]], 0)
 
@@ -243,7 +247,7 @@ def _first_ns(block: Block) -> Integers:
 
 
 class _Waiting(NamedTuple):
-    """Holds what came until now."""
+    """Messages that have come so far."""
 
     static: Static
     prior: Prior | None
@@ -253,12 +257,13 @@ class _Waiting(NamedTuple):
 
 
 def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_ORDER) -> Recursive:
-    """Bind a filter that is given a run's messages at once.
+    """Bind a filter that gets all messages of a run in one call.
 
     Args:
         found: the filter.
-        follow_runs: takes runs through their filters.
-        window_ns: how late messages may be, which are given as they arrive; IN_ORDER for none.
+        follow_runs: function that processes runs with their filters.
+        window_ns: how late out-of-sequence messages may be, if messages are passed in order of arrival;
+            IN_ORDER if they are passed in order of their stamps.
     """
     description, numbers = found.description, found.numbers
 
@@ -283,12 +288,12 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
         if state.prior is not None:
             time_ns, mean, covariance = (column[run] for column in state.prior)
             if not np.isfinite(mean.sum()):
-                return None  # without a prior that can be used it takes no part
+                return None  # a run without a usable prior does not take part
             prior = int(time_ns), mean, covariance
         static = static_of_run(state.static, run)
         events = of_run(state.events, run)
         given = RunGiven(static, events, prior, numbers, found.parameters.seed, window_ns)
-        if window_ns != IN_ORDER and prior is not None:  # what is older says nothing
+        if window_ns != IN_ORDER and prior is not None:  # older messages are not used
             given = given.from_time(prior[0])
         return given if len(given.events.time_ns) else None
 
@@ -316,18 +321,18 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
 
 
 def description_of_library(label: str, settings: Mapping[str, Any]) -> Description:
-    """Read what the library that settings name says of itself; raises BadInput where it may not run."""
+    """Read the description of the library named in settings; raise BadInput if it may not run."""
     file = _file(Path(what_runs(label, "lib", settings)).absolute())
     return _description(file, in_process=False)
 
 
 @dataclass(frozen=True)
 class _OfLibraries(Estimator[Any]):
-    """Makes an estimator of the library that settings name."""
+    """Estimator that makes the estimator of the library named in settings."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
-        """Return the estimator of the library."""
-        # absolute, for processes have folders of their own
+        """Return the estimator of the library named in `settings` of `label`."""
+        # absolute, because processes have folders of their own
         file = _file(Path(what_runs(label, "lib", settings)).absolute())
         in_process = settings.get("in_process", False) is True
         description = _description(file, in_process)
@@ -355,7 +360,7 @@ class _OfLibraries(Estimator[Any]):
 
 
 def _going_back(found: FoundFilter, follow_runs: FollowRuns, window_ns: int) -> Recursive:
-    """Bind a filter whose messages are given as they arrive; raises BadInput where it has to wait."""
+    """Bind a filter to messages in order of arrival; raise BadInput if `every_s` is set."""
     if found.parameters.every_s is not None:
         raise BadInput(
             f"estimator {found.name}: --late rewind: there are no estimates between messages (every_s, "
@@ -365,7 +370,7 @@ def _going_back(found: FoundFilter, follow_runs: FollowRuns, window_ns: int) -> 
 
 
 class _File(NamedTuple):
-    """Tells a library from one that was compiled again in its place."""
+    """Identity of a library file; it changes when the library is compiled again."""
 
     path: Path
     changed_ns: int
@@ -392,7 +397,7 @@ def _loaded(file: _File) -> Library:
 
 
 def unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:  # noqa: ARG001
-    """Refuse to bind what no settings specify."""
+    """Raise BadInput because no settings name a program."""
     raise BadInput(f"estimator {label}: no program is named; give -e lib:PATH or -e exec:COMMAND")
 
 

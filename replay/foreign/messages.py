@@ -1,4 +1,4 @@
-"""Turns messages into the rows of numbers that a foreign filter takes, and what it says into streams."""
+"""Conversion of messages to rows of numbers for foreign filters, and of their results to streams."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +25,10 @@ from fuselog.replay.inference.run.timing import at_stamps_of
 
 
 def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
-    """Lay the fields of a topic side by side (n, width), NaN beyond; raises BadInput where one lacks."""
+    """Combine the fields of a topic in rows (n, width), padded with NaN.
+
+    Raises BadInput if a field is missing.
+    """
     data, column = np.full((len(stream), width), np.nan), 0
     for field, size in topic.sizes.items():
         if field not in stream.columns:
@@ -49,7 +52,7 @@ def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
 def static_of(
     description: Description, found: Mapping[str, Topic], given: Mapping[str, Ragged], runs: int
 ) -> Static:
-    """Return the messages of the static topics of all runs, topic by topic."""
+    """Combine the messages of the static topics in all runs, topic by topic."""
     parts = [
         (number, topic, given[found[topic.topic].name])
         for number, topic in enumerate(description.topics)
@@ -86,7 +89,7 @@ def static_of_run(static: Static, run: int) -> Static:
 
 
 def events_of(description: Description, found: Mapping[str, Topic], block: Block) -> FilterEvents:
-    """Turn a block's messages into events, whose sources count in the description's topics."""
+    """Convert a block's messages to events, with sources as indices of the description's topics."""
     numbers = {
         found[each.topic].name: number
         for number, each in enumerate(description.topics)
@@ -122,7 +125,7 @@ def streams_of(
     followed: Followed,
     failures: Mapping[int, Failure],
 ) -> list[Ragged]:
-    """Make the output topics of what filters said."""
+    """Make the output streams of filters' results."""
     topic, (issued_ns, estimates, offsets, innovations, recorded) = f"/estimates/{name}", followed
     state = state_stream(
         f"{topic}/{description.output}",
@@ -151,7 +154,7 @@ def of_run(parts: Sequence[FilterEvents], run: int) -> FilterEvents:
 
 
 def joined(of_runs: Sequence[Followed]) -> Followed:
-    """Lay what the filters of single runs said end to end."""
+    """Join the results of single runs."""
     estimates = zip(*(run.estimates for run in of_runs), strict=True)
     innovations = zip(*(run.innovations for run in of_runs), strict=True)
     return Followed(

@@ -1,8 +1,8 @@
-"""Says how programs of others are named: `lib:PATH` and `exec:COMMAND`, and where they may be named.
+"""Names of foreign programs, `lib:PATH` and `exec:COMMAND`, and where they may be given.
 
-What runs has to be named where a person speaks: in a command, a Python call, the experiment's file that
-is given. There the text becomes `Allowed`. What is read of goldens, results, settings files and logs is
-mere text, and so is refused; nothing that writes and reads keeps the mark.
+A program runs only if a person names it: in a command, a Python call, or the experiment file that is
+given. The text then becomes `Allowed`. A name read from goldens, results, settings files or logs is
+plain text, and the program does not run; writing and reading a file never preserves the mark.
 """
 
 import re
@@ -14,20 +14,20 @@ from typing import Any
 
 from fuselog.recorders.errors import BadInput
 
-KINDS = {"lib": "path", "exec": "command"}  # and the entry that says what is run
+KINDS = {"lib": "path", "exec": "command"}  # with the setting that names the program
 _INTERPRETER = re.compile(
     r"(python|pypy|ruby|perl|node|julia|java|Rscript|octave|bash|sh)[\d.]*(\.exe)?"
 )
 
 
 class Allowed(str):
-    """Represents the path or command of a program that may be run."""
+    """Path or command of a program that may be run."""
 
     __slots__ = ()
 
 
 def shorthand(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the label and the settings that an estimator's name stands for.
+    """Return the label and the settings for which an estimator's name is an abbreviation.
 
     >>> shorthand("lib:./filters/libmine.so")
     ('libmine', {'kind': 'lib', 'path': './filters/libmine.so'})
@@ -45,7 +45,7 @@ def shorthand(name: str) -> tuple[str, dict[str, Any]]:
 
 
 def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the name that stands for an estimator, and the settings that it does not stand for.
+    """Return the abbreviated name of an estimator, and the settings that it does not contain.
 
     >>> name_of("mine", {"kind": "lib", "path": "./mine.so", "speed": 2.0})
     ('lib:./mine.so', {'speed': 2.0})
@@ -64,7 +64,7 @@ def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any
 
 
 def _label(kind: str, rest: str) -> str:
-    """Take the stem of a library or program; of a script where an interpreter comes first."""
+    """Return the stem of a library or program, or of a script if an interpreter comes first."""
     words = [rest]
     if kind == "exec":
         words = split_command(rest)
@@ -74,7 +74,7 @@ def _label(kind: str, rest: str) -> str:
 
 
 def split_command(command: str) -> list[str]:
-    """Return the words of a command; raises BadInput where a quote is open."""
+    """Split a command into words; raise BadInput if a quote is not closed."""
     try:
         words = shlex.split(command)
     except ValueError as error:
@@ -85,7 +85,7 @@ def split_command(command: str) -> list[str]:
 
 
 def allowed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings, of one estimator or by label, as a person stated them: programs may be run.
+    """Mark the programs in settings of one estimator, or of several by label, as stated by a person.
 
     >>> isinstance(allowed({"mine": {"kind": "lib", "path": "mine.so"}})["mine"]["path"], Allowed)
     True
@@ -101,7 +101,7 @@ def allowed(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def allowed_in(settings: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return settings by label as an experiment's file states them: paths count from its folder."""
+    """Mark the programs in settings of an experiment's file; library paths are relative to `folder`."""
     found = allowed(settings)
     for own in found.values():
         if isinstance(own, dict) and own.get("kind") == "lib" and isinstance(own.get("path"), str):
@@ -109,22 +109,22 @@ def allowed_in(settings: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return found
 
 
-# Whether what files name may be run: goldens, results, settings. A command says so for itself.
+# Whether programs named in files (goldens, results, settings) may run; each command sets this.
 _FILES_MAY: ContextVar[bool] = ContextVar("_FILES_MAY", default=False)
 
 
 def allow_programs_of_files(may: bool) -> None:
-    """Say whether programs may run that goldens, results and settings files name."""
+    """Set whether programs named in goldens, results and settings files may run."""
     _FILES_MAY.set(may)
 
 
 def of_file(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as a file has them: programs may be run only where the command says so."""
+    """Return settings read from a file; their programs may run only if the command allows it."""
     return allowed(settings) if _FILES_MAY.get() else dict(settings)
 
 
 def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings without the program that was named as well, as those of `fuselog tune` have it."""
+    """Remove the program that was also named from settings, such as those of `fuselog tune`."""
     return {
         name: value
         for name, value in settings.items()
@@ -133,7 +133,7 @@ def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict
 
 
 def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
-    """Raise BadInput where settings by label, which were read of a file, name a program."""
+    """Raise BadInput if settings by label that were read from a file name a program."""
     for label, own in tables.items():
         for entry in KINDS.values() if isinstance(own, Mapping) else ():
             if entry in own and not isinstance(own[entry], Allowed):
@@ -144,7 +144,7 @@ def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
 
 
 def what_runs(label: str, kind: str, settings: Mapping[str, Any]) -> str:
-    """Return what is run of an estimator; raises BadInput where it may not be, or is not named."""
+    """Return the program of an estimator; raise BadInput if it is not named or may not run."""
     text = settings.get(KINDS[kind])
     if not isinstance(text, str) or not text:
         raise BadInput(
@@ -159,7 +159,7 @@ def what_runs(label: str, kind: str, settings: Mapping[str, Any]) -> str:
 
 
 def program_files(settings: Mapping[str, Mapping[str, Any]]) -> list[Path]:
-    """Return the files of programs that settings by label name: libraries, and words of commands."""
+    """Return the files in settings by label: libraries, and words of commands that are files."""
     found = []
     for label, own in settings.items():
         kind = own.get("kind", label)

@@ -1,4 +1,4 @@
-"""Makes estimators of programs: those that stream, and those that read a log and write estimates."""
+"""Estimators made from programs: those that stream, and those that read a log and write estimates."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -34,25 +34,25 @@ from fuselog.replay.foreign.processes.tasks import RunGiven
 _PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 LOG, TABLES, OUT = "log", "csv", "out"
 ESTIMATE = "/estimates/"
-LIMITS = ("time_limit_s", "memory_limit_mb")  # which hold from the start of a program on
+LIMITS = ("time_limit_s", "memory_limit_mb")  # these also apply while a program starts
 
 
 class StreamParameters(ForeignParameters):
-    """Names a program that answers messages.
+    """Settings of a program that answers messages.
 
     Attributes:
-        command: what is started, with its arguments.
+        command: the command to start, with its arguments.
     """
 
     command: str = ""
 
 
 class ProgramParameters(StreamParameters):
-    """Names a program that reads a log and writes estimates.
+    """Settings of a program that reads a log and writes estimates.
 
     Attributes:
-        time_limit_s: a run fails where the program takes longer for it.
-        truth: the topic of the truth; without it the only one of the log.
+        time_limit_s: a run fails if the program takes longer for it.
+        truth: topic of the truth; by default the only one of the log.
     """
 
     time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 600.0
@@ -61,10 +61,10 @@ class ProgramParameters(StreamParameters):
 
 @dataclass(frozen=True)
 class _OfPrograms(Estimator[Any]):
-    """Makes an estimator of the command that settings name."""
+    """Estimator that makes the estimator of the command named in settings."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
-        """Return the estimator of the command; one with {out} among its words reads a log."""
+        """Return the estimator of the command in `settings` of `label`; with {out} it reads a log."""
         words = tuple(split_command(what_runs(label, "exec", settings)))
         if any("{" + OUT + "}" in word for word in words):
             return _of_files(label, words)
@@ -106,7 +106,7 @@ def _of_stream(words: tuple[str, ...], limits: Limits) -> Estimator[Any]:
 
 
 def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
-    """Refuse to go back."""
+    """Raise BadInput because programs cannot reprocess messages."""
     raise BadInput(
         f"estimator {label}: --late rewind: a program cannot be copied, as a filter of a library (lib:) "
         "can; give --late drop or --late wait:SECONDS"
@@ -114,7 +114,7 @@ def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
 
 
 def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return sizes and last changes of the files that a command names, by which it is asked again."""
+    """Return sizes and modification times of the files in a command, part of its cache key."""
     found = []
     for word in words:
         with suppress(OSError, ValueError):
@@ -167,7 +167,7 @@ def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
 
 
 def _parameters_in(label: str, words: Sequence[str]) -> dict[str, float]:
-    """Return the parameters that places such as {sigma_m=0.1} declare, with their defaults."""
+    """Return the parameters declared by placeholders such as {sigma_m=0.1}, with their defaults."""
     found: dict[str, float] = {}
     for name, default in (place for word in words for place in _PLACE.findall(word)):
         if name in (LOG, TABLES, OUT) and not default:
@@ -189,7 +189,7 @@ def _is_map(topic: Topic) -> bool:
 
 
 def _truth(label: str, topics: Mapping[str, Topic], named: str) -> Topic | None:
-    """Return the truth that estimates are of; raises BadInput where several are."""
+    """Return the truth of the estimates; raise BadInput if there are several."""
     truths = {
         name: topic
         for name, topic in topics.items()
@@ -213,7 +213,7 @@ def _solve(
     truth: Topic | None,
     given: Mapping[str, Ragged],
 ) -> list[Ragged]:
-    """Run the program for every run, some at once, and join what they wrote."""
+    """Run the program for every run, several in parallel, and join the estimates."""
     runs = next(iter(given.values())).runs
     started: list[Program] = []
 
@@ -253,7 +253,7 @@ def _run(
     streams: Sequence[Stream],
     started: list[Program],
 ) -> dict[str, Stream]:
-    """Run the program for one run; raises Ended where it fails, BadInput where its file is none."""
+    """Run the program for one run; raise Ended if it fails, BadInput if its file is invalid."""
     with scratch_folder("fuselog-program") as folder:
         places = {LOG: folder / "log.mcap", TABLES: folder / "csv", OUT: folder / "estimates"}
         command = " ".join(words)

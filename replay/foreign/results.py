@@ -1,6 +1,6 @@
-"""Lays what filters say into memory: of this process, or of a file that another process fills.
+"""Memory layout of filters' results, in this process or in a file that another process fills.
 
-What another process had written before it crashed is there all the same.
+If the other process crashes, what it had written is still there.
 """
 
 import math
@@ -17,7 +17,7 @@ from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class Sizes(NamedTuple):
-    """Holds the numbers of components: of the state n, of its tangent space t, of the innovations m."""
+    """Numbers of components: of the state n, of its tangent space t, of the innovations m."""
 
     n: int
     t: int
@@ -25,13 +25,13 @@ class Sizes(NamedTuple):
 
 
 class Results(NamedTuple):
-    """Holds what is filled in.
+    """Results of filters, filled in place.
 
     Attributes:
-        progress: (runs,) the message at work, which another process sees.
-        issued_ns: of every estimate, when the message arrived that called for it; its stamp where
-            messages are taken in the order of their stamps.
-        estimates, innovations: run r has the rows from the offsets' r-th on.
+        progress: (runs,) index of the message in work, visible to another process.
+        issued_ns: for every estimate, the arrival time of the message that triggered it; its stamp if
+            messages are processed in order of their stamps.
+        estimates, innovations: the rows of run r begin at the r-th offset.
     """
 
     progress: Integers
@@ -43,13 +43,13 @@ class Results(NamedTuple):
 def results(
     due: Integers, recorded: Integers, sizes: Sizes, memory: Callable[[int], np.ndarray] = np.zeros
 ) -> Results:
-    """Lay out results: run r has the rows from due[r] and recorded[r] up to the next run's.
+    """Lay out results: run r has the rows from due[r] and recorded[r] up to those of the next run.
 
     Args:
         due: (runs + 1,) offsets of the estimates.
         recorded: (runs + 1,) offsets of the innovations.
-        sizes: of states and innovations.
-        memory: makes so many numbers of 8 bytes.
+        sizes: sizes of states and innovations.
+        memory: memory(count) -> an array of `count` numbers of 8 bytes.
     """
     runs, (n, t, m) = len(due) - 1, sizes
     shapes = [
@@ -73,11 +73,11 @@ def results(
 
 
 def begun(made: Results, due: Integers, recorded: Integers) -> Results:
-    """Set the ends of all runs to their beginnings, and what is not filled in to NaN; returns it.
+    """Set the ends of all runs to their beginnings and all values to NaN, and return the results.
 
     Args:
-        made: of all runs, changed.
-        due, recorded: (runs + 1,), where the rows for estimates and innovations of each run begin.
+        made: results of all runs, changed in place.
+        due, recorded: (runs + 1,), first rows of the estimates and innovations of each run.
     """
     made.estimates.end[:], made.innovations.end[:] = due[:-1], recorded[:-1]
     for each in (*made.estimates[2:], *made.innovations[3:]):
@@ -86,7 +86,7 @@ def begun(made: Results, due: Integers, recorded: Integers) -> Results:
 
 
 def in_file(path: Path) -> Callable[[int], np.ndarray]:
-    """Make memory of a file, which is made where it is not there."""
+    """Return a function that maps a file as memory; the file is created if it does not exist."""
 
     def memory(count: int) -> np.ndarray:
         if not path.exists():
@@ -98,9 +98,10 @@ def in_file(path: Path) -> Callable[[int], np.ndarray]:
 
 
 def fill_squares(innovations: InnovationRows) -> int:
-    """Fill NIS and log-likelihood of one run's innovations, in place, up to the first without one.
+    """Fill NIS and log-likelihood of one run's innovations, up to the first with an invalid covariance.
 
-    Returns the row whose covariance is not positive definite, where the innovations end then; else -1.
+    Returns the row whose covariance is not positive definite, at which the innovations then end;
+    otherwise -1.
     """
     end = int(innovations.end[0])
     present = ~np.isnan(innovations.difference[:end])

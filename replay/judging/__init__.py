@@ -1,4 +1,4 @@
-"""Judges estimates by truth: errors, consistency, metrics; begin with `judge`.
+"""Judging of estimates by truth: errors, consistency, metrics; begin with `judge`.
 
-What families judge in addition, such as sets and tracks, registers; see `kinds`.
+What families judge in addition, such as sets and tracks, is registered; see `kinds`.
 """

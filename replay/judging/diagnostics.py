@@ -1,4 +1,4 @@
-"""Collects what a replay says of itself: failures, what was skipped or assumed, how much came out."""
+"""Diagnostic messages of a replay: failures, skipped or assumed values, share of the span estimated."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,17 +19,17 @@ from fuselog.replay.judging.metrics.metrics import covered, estimated_share
 ESTIMATE = schemas.GAUSSIAN_ESTIMATE.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
 STARTED, COVERAGE = schemas.STARTED.full_name, schemas.COVERAGE.full_name
-# Leaves of such topics: no estimates, nothing to judge.
+# Last parts of the names of topics without estimates, which are not judged.
 LEAVES = ("failure", "skipped", "started", "coverage")
-# Less than this share of a span is said; a run's first measurements may well be before the prior.
+# A smaller share of the span is reported; a run's first measurements are often before the prior.
 LEAST_SHARE = 0.995
-# A standard deviation of an angle beyond which a Gaussian says little: 0.2 % is beyond half a turn.
+# Above this standard deviation of an angle, a Gaussian is a poor model: 0.2 % is beyond half a turn.
 WIDE_RAD = 1.0
 
 
 @dataclass
 class StreamDiagnostics:
-    """Collects what one topic says of the replay."""
+    """Diagnostics of one topic of a replay."""
 
     failed: dict[int, str] = field(default_factory=dict)
     with_estimates: set[int] | None = None
@@ -40,7 +40,7 @@ class StreamDiagnostics:
     wide: Counter[str] = field(default_factory=Counter)
 
     def merge(self, other: "StreamDiagnostics") -> None:
-        """Add those of other runs."""
+        """Add the diagnostics of other runs."""
         self.failed |= other.failed
         self.skipped.update(other.skipped)
         self.started.update(other.started)
@@ -52,10 +52,10 @@ class StreamDiagnostics:
 
 
 class Diagnostics:
-    """Collects what the topics of a replay say of it, for sentences.
+    """Diagnostics of the topics of a replay, which become sentences.
 
     Args:
-        first_run: the number of the first run in the whole ensemble.
+        first_run: number of the first run in the whole ensemble.
     """
 
     def __init__(self, first_run: int) -> None:
@@ -87,15 +87,15 @@ class Diagnostics:
             found.covered = plus(found.covered, covered(Output("", "", "", rows, sources)))
 
     def merge(self, other: "Diagnostics") -> None:
-        """Add those of other runs."""
+        """Add the diagnostics of other runs."""
         for topic, found in other._topics.items():
             self._topics.setdefault(topic, StreamDiagnostics()).merge(found)
 
     def failures(self, names: Mapping[int, str]) -> list[str]:
-        """Return a sentence for every run that an estimator did not follow to the end, or not at all.
+        """Return a sentence for every run that an estimator did not process to the end, or not at all.
 
         Args:
-            names: of all runs, by number.
+            names: names of all runs, by number.
         """
         sentences: dict[tuple[str, int], str] = {}
         for topic, found in self._topics.items():
@@ -110,7 +110,7 @@ class Diagnostics:
         return [f"{names[run]}: {sentence}" for (_, run), sentence in sentences.items()]
 
     def notes(self) -> list[str]:
-        """Return a sentence for what was assumed, then for what was not estimated or not used."""
+        """Return sentences on assumptions, then on time spans without estimates and unused messages."""
         notes = []
         for topic, found in self._topics.items():
             for reason, count in found.started.items():
@@ -134,7 +134,7 @@ class Diagnostics:
 
 
 def _wide_angles(estimates: Stream) -> dict[str, int]:
-    """Count by angle the estimates in which its standard deviation is beyond `WIDE_RAD`."""
+    """Count the estimates whose standard deviation exceeds `WIDE_RAD`, by angle."""
     components = stated_components(estimates.metadata, {}, estimates.topic)
     errors = tangent_components([*components], [*components.values()])
     size = len(errors)
@@ -150,5 +150,5 @@ def _wide_angles(estimates: Stream) -> dict[str, int]:
 
 
 def name_of(topic: str) -> str:
-    """Return the estimator and the case of a topic, as a sentence names them."""
+    """Return the estimator and the case of a topic, as used in sentences."""
     return " ".join(filter(None, split_topic(topic)))

@@ -1,9 +1,9 @@
-"""Gives numbers 95 % intervals, by the one rule that docs/judge.md states.
+"""95 % intervals of numbers, by the rule in docs/judge.md.
 
-The run is the unit: errors within a run are correlated, runs are independent. The interval of a mean is
-Student's. That of a root mean square is by the percentile bootstrap over runs, widened for few runs as
-Student's t is: Hesterberg, "What Teachers Should Know About the Bootstrap", The American Statistician 69
-(2015).
+The unit is the run: errors within a run are correlated, runs are independent. The interval of a mean is
+Student's t interval. That of a root mean square is a percentile bootstrap over runs, widened for few
+runs as Student's t is: Hesterberg, "What Teachers Should Know About the Bootstrap", The American
+Statistician 69 (2015).
 """
 
 import math
@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-# Fewer runs say nothing of what others would give.
+# Fewer runs say nothing about other runs.
 FEWEST_RUNS = 5
 RESAMPLES = 2000
-# Of more runs the mean square is normal: resamples would take much memory to say the same.
+# Over more runs the mean square is normal; resampling would only take more memory.
 MANY_RUNS = 500
-LARGE = 1e100  # whose square may be infinite, in sums
+LARGE = 1e100  # sums of squares of larger numbers may be infinite
 
 
 class Interval(NamedTuple):
-    """Holds a number and where it lies with 95 %.
+    """Number and its 95 % interval.
 
     Attributes:
         value: the number.
-        low, high: the ends; NaN where there is no interval, both the number itself where it is exact.
-        unit: of all three; may be empty.
-        name: what it is of, where that is not clear from its place.
+        low, high: the ends; NaN if there is no interval, equal to the number if it is exact.
+        unit: unit of all three; may be empty.
+        name: name of the number, if it is not clear from its context.
     """
 
     value: float
@@ -44,22 +44,22 @@ class Interval(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Tell whether neither it nor an end is NaN."""
+        """Test whether neither the value nor an end is NaN."""
         return not any(map(math.isnan, self[:3]))
 
     @property
     def is_bounded(self) -> bool:
-        """Tell whether both ends are finite numbers."""
+        """Test whether both ends are finite."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     def rising(self, function: Callable[[float], float]) -> "Interval":
-        """Apply a function that rises, such as `math.exp` to an interval of a logarithm.
+        """Apply an increasing function, such as `math.exp` for an interval of a logarithm.
 
         Args:
-            function: of a number.
+            function: function of a number.
 
         Returns:
-            The interval with the function of its value and ends.
+            The interval with the function applied to its value and ends.
         """
         return self._replace(
             value=function(self.value), low=function(self.low), high=function(self.high)
@@ -67,18 +67,18 @@ class Interval(NamedTuple):
 
 
 def too_few(runs: int) -> str:
-    """Say why there is no interval over so few runs."""
+    """Return why there is no interval over this number of runs."""
     there = "is 1" if runs == 1 else f"are {runs}"
     return f"an interval needs at least {FEWEST_RUNS} runs, and there {there}"
 
 
 def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
-    """Compute the mean of runs (n,), and where it lies by Student's distribution.
+    """Compute the mean of runs (n,) and its interval by Student's t distribution.
 
     Args:
-        values: of the runs.
-        fewest: of fewer there is no interval. Only a study whose units nobody can multiply, such as the
-            robots of a recording, states another number than the rule's.
+        values: one value per run.
+        fewest: smallest number of runs for an interval. Only a study whose units cannot be multiplied,
+            such as the robots of a recording, uses another number than the default.
     """
     from scipy.special import stdtrit
 
@@ -92,7 +92,7 @@ def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
 
 
 def rms_interval(values: ArrayLike) -> Interval:
-    """Compute the root mean square of runs (n,), and where it lies by bootstrap."""
+    """Compute the root mean square of runs (n,) and its interval by bootstrap."""
     from scipy.special import ndtr, stdtrit
 
     value = root_mean_square(values)
@@ -111,13 +111,13 @@ def rms_interval(values: ArrayLike) -> Interval:
 
 
 def root_mean_square(values: ArrayLike) -> float:
-    """Compute the root mean square of numbers (n,), whose squares may be infinite."""
+    """Compute the root mean square of numbers (n,), even if their squares overflow."""
     values, scale = _with_finite_squares(np.asarray(values, float))
     return scale * math.sqrt(np.mean(np.square(values))) if len(values) else math.nan
 
 
 def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
-    """Return numbers (n,) as multiples of a number, which is one unless an estimator diverged."""
+    """Divide numbers (n,) by a scale, which is one unless an estimator diverged, and return both."""
     largest = float(np.max(np.abs(values), initial=0.0))
     scale = largest if LARGE < largest < math.inf else 1.0
     return values / scale, scale

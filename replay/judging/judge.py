@@ -1,7 +1,7 @@
-"""Judges what the outputs of a replay are worth, block by block as they come.
+"""Judge of the outputs of a replay, block by block as they come.
 
-What it keeps are sums: of every metric, by step over the runs, and for each run by time. So memory does
-not grow with the length of a log, except by two numbers for each step of NEES.
+It keeps sums: of every metric, by step over the runs, and by time for each run. Memory therefore does
+not grow with the length of a log, except for two numbers per step of NEES.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,17 +53,17 @@ if TYPE_CHECKING:
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
-# A table has at most so many steps; of more, neighbours share a row.
+# The most steps in a table; beyond this, neighbouring steps share a row.
 STEPS = 1 << 17
-# The sums over time of one run: at most so many bins, of a millisecond times a power of two.
+# The most bins of the sums over time of one run; a bin is a millisecond times a power of two.
 TIME_BINS = 64
-# Of very many runs they are fewer each: so many bins in all.
+# The most bins over all runs; very many runs have fewer bins each.
 TIME_CELLS = 1 << 18
 TIME_BIN_NS = 1_000_000
 
 
 class Judged(NamedTuple):
-    """Holds what is judged of a block: errors of estimates, innovations, and what families judge."""
+    """Judged results of a block: errors of estimates, innovations, and what families judge."""
 
     errors: list[Errors]
     innovations: list[Innovations]
@@ -71,17 +71,17 @@ class Judged(NamedTuple):
 
 
 class Judge:
-    """Judges an ensemble, or a part of one, as its replay goes on.
+    """Judge of an ensemble, or of a part of one, while its replay runs.
 
     Args:
         sources: the runs.
-        metrics: what to compute; see `find_metrics`.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        first_run: the number of the first run in the whole ensemble.
-        burn_in_s: errors up to so long after the epoch are left out.
-        on_errors: is handed the errors of every block.
+        metrics: the metrics to compute; see `find_metrics`.
+        gap_limit_s: longest gap in s over which the truth is interpolated.
+        first_run: number of the first run in the whole ensemble.
+        burn_in_s: errors up to this time in s after the epoch are left out.
+        on_errors: called with the errors of every block.
 
-    `innovations` are their sums by topic, `conditioning` what rounding has left of covariances.
+    `innovations` has the sums of innovations by topic, `conditioning` that of covariances by topic.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Judge:
         kept.constant.add(errors)
 
     def close(self) -> None:
-        """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
+        """Release the runs after judging; only sums are left, which can be pickled."""
         self._doubts = self.doubts
         self._sources, self._truths, self._kinds, self._on_errors = (), [], {}, None
         self._steps.clear()
@@ -206,7 +206,7 @@ class Judge:
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
 
     def merge(self, other: "Judge") -> None:
-        """Take in what was judged of other runs."""
+        """Add the results of other runs."""
         self.runs += other.runs
         self._names |= other._names
         self._doubts = other.doubts | self.doubts
@@ -233,19 +233,20 @@ class Judge:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Return the numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
+        """Return the numbers, as `estimator.quantity[.case]`; raise BadInput if a metric raises."""
         return self._measured.finish()
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Compute where metrics of NEES and NIS lie with 95 % for consistent estimators, by key."""
+        """Return the 95 % intervals of NEES and NIS metrics of consistent estimators, by key."""
         return self.intervals(0.95)
 
     def intervals(self, probability: float) -> dict[str, tuple[float, float]]:
-        """Compute where metrics of NEES and NIS lie with a probability if all is well, by key.
+        """Compute the intervals of NEES and NIS metrics of consistent estimators, by key.
 
-        Errors of a run's steps hang together, so that NEES has the interval of one step's mean over the
-        runs; innovations do not, and NIS has that of them all.
+        The errors of a run's steps are correlated, so NEES has the interval of one step's mean over the
+        runs; innovations are not, so NIS has the interval of the mean of all of them. The intervals
+        contain the metrics with `probability`.
         """
         found: dict[str, tuple[float, float]] = {}
         for key, (size, runs, aim) in self._sizes().items():
@@ -254,7 +255,7 @@ class Judge:
         return {key: found[key] for key in self.metrics if key in found}
 
     def _sizes(self) -> dict[str, tuple[int, int, int]]:
-        """Return of NEES and NIS by key of how many components and runs they are, and what is right."""
+        """Return number of components, number of runs and expected value of NEES and NIS, by key."""
         found: dict[str, tuple[int, int, int]] = {}
         for quantities in self._quantities.values():
             errors, cells = quantities.errors, quantities.by_time.filled()[0]
@@ -270,7 +271,10 @@ class Judge:
         return found
 
     def squares(self, estimator: str, quantity: str, case: str) -> Squares:
-        """Return what decides by NEES or NIS whether an estimator is overconfident."""
+        """Return the NEES or NIS of an `estimator` and `case` that decides whether it is overconfident.
+
+        `quantity` is the name of the metric.
+        """
         key = metric_key(estimator, quantity, case)
         found = Interval(self.metrics[key])
         if self.runs >= FEWEST_RUNS and quantity in (table := self.runs_table):
@@ -280,30 +284,30 @@ class Judge:
 
     @property
     def constants(self) -> dict[tuple[str, str], Constant]:
-        """Return by estimator and case the errors that stay, see `ConstantSums`."""
+        """Return the constant errors by estimator and case, see `ConstantSums`."""
         found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
         return {what: each for what, each in found.items() if each is not None}
 
     @property
     def uninformed(self) -> dict[tuple[str, str], list[str]]:
-        """Name by estimator and case the components of which no measurement informs it."""
+        """Return the components that no measurement affects, by estimator and case."""
         found = {split_topic(topic): each.found() for topic, each in self._uninformed.items()}
         return {what: names for what, names in found.items() if names}
 
     @property
     def unestimated(self) -> dict[tuple[str, str], list[str]]:
-        """Name by estimator and case the errors of sensors in the truth that it does not estimate."""
+        """Return the sensor errors in the truth that are not estimated, by estimator and case."""
         found = {split_topic(topic): names for topic, names in self._unestimated.items()}
         return {what: names for what, names in found.items() if names}
 
     @property
     def has_numbers(self) -> bool:
-        """Tell whether there are numbers, but for what a replay says of itself."""
+        """Test whether there are numbers besides those on failures, skipped messages and coverage."""
         return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in LEAVES))
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """Return by topic what is doubtful about a truth, of the first run that has something."""
+        """Return doubts about truths by topic, from the first run that has one."""
         found = dict(self._doubts)
         for truths in self._truths:
             found = truths.doubts | found
@@ -311,12 +315,12 @@ class Judge:
 
     @property
     def components_without_truth(self) -> list[str]:
-        """Say of every estimate of which components the truth lacks, or that it is in another plane."""
+        """Return a sentence for every estimate that cannot be judged, or only in part."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
     def worst(self) -> dict[str, Moment]:
-        """Return by estimator the moment of its largest NEES; without NEES, of its largest error."""
+        """Return by estimator the moment of its largest NEES, or without NEES of its largest error."""
         found: dict[str, list[Moment]] = {}
         for moment in self._moments.found:
             found.setdefault(moment.estimator, []).append(moment)
@@ -329,15 +333,12 @@ class Judge:
 
     @property
     def failures(self) -> list[str]:
-        """Say of every run that an estimator could not follow it to the end, or not at all."""
+        """Return a sentence for every run that an estimator did not process to the end or not at all."""
         return self._diagnostics.failures(self._names)
 
     @property
     def notes_of_coverage(self) -> list[str]:
-        """Say of every case that was not estimated throughout, and of measurements not used.
-
-        Those for what was assumed, as of where to begin, come first.
-        """
+        """Return sentences on assumptions, time spans without estimates, unused messages and bounds."""
         averaged = "averaged along the true trajectories, since"
         return [*self._diagnostics.notes(), *self._notes] + [
             f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
@@ -347,7 +348,7 @@ class Judge:
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
-        """Return by topic, for estimates with truth, a row per step: see `tables.step_table`."""
+        """Return a table by topic of estimates with truth, a row per step: see `tables.step_table`."""
         from fuselog.replay.judging.tables import step_table
 
         return {
@@ -357,40 +358,40 @@ class Judge:
 
     @property
     def runs_table(self) -> "pd.DataFrame":
-        """Return one row per estimator, case and run: see `tables.table_of_runs`."""
+        """Return a table with a row per estimator, case and run: see `tables.table_of_runs`."""
         from fuselog.replay.judging.tables import table_of_runs
 
         return table_of_runs(self._quantities.values(), self.innovations)
 
     @property
     def times(self) -> "pd.DataFrame":
-        """Return the same by run and span of time; `until_s` is where a span ends, after the epoch."""
+        """Return a table with a row per run and time span, which ends `until_s` after the epoch."""
         from fuselog.replay.judging.tables import joined, time_table
 
         return joined(time_table(each) for each in self._quantities.values())
 
     @property
     def modes(self) -> "pd.DataFrame":
-        """Return modes' probabilities: a row per estimator, case, span and mode; see `MeansOfAll`."""
+        """Return mode probabilities: a row per estimator, case, time span and mode; see `MeansOfAll`."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.modes())
 
     @property
     def effective(self) -> "pd.DataFrame":
-        """Return the effective share of the particles: a row per estimator, case and span of time."""
+        """Return the effective share of particles: a row per estimator, case and time span."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.effective())
 
     @property
     def late(self) -> "pd.DataFrame":
-        """Return messages that came late: a row per estimator, case, what became of them, and span."""
+        """Return late messages: a row per estimator, case, treatment and time span."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.late())
 
     @property
     def judged(self) -> dict[str, Errors]:
-        """Return by topic the last block of estimates that have errors: its names and kinds."""
+        """Return, by topic, the last block of estimates with errors, for its names and kinds."""
         return {topic: each.errors for topic, each in self._quantities.items()}

@@ -1,7 +1,7 @@
-"""Defines how a family judges outputs of a kind of its own, such as tracks, in addition to estimates.
+"""Interface for families that judge outputs of their own kind, such as tracks, besides estimates.
 
-The class registers as an entry point `fuselog.judges`. Metrics that judge the type of what it returns
-make numbers of that.
+The class is registered as an entry point `fuselog.judges`. Metrics that judge the type of its results
+compute numbers from them.
 """
 
 from abc import ABC, abstractmethod
@@ -14,13 +14,13 @@ from fuselog.replay.judging.errors.truths import Truths
 
 
 class JudgedRuns(NamedTuple):
-    """Holds the runs of an ensemble, or of a part of one, and their truths.
+    """Runs of an ensemble, or of a part of one, and their truths.
 
     Attributes:
         sources: the runs.
-        truths: of each run.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        first_run: the number of the first run in the whole ensemble.
+        truths: truths of each run.
+        gap_limit_s: longest gap in s over which the truth is interpolated.
+        first_run: number of the first run in the whole ensemble.
     """
 
     sources: Sequence[Source]
@@ -30,12 +30,12 @@ class JudgedRuns(NamedTuple):
 
 
 class KindJudge(ABC):
-    """Judges outputs of one kind, block by block.
+    """Judge of outputs of one kind, block by block.
 
     Attributes:
-        runs: whose outputs these are.
+        runs: the judged runs.
         unjudged: by topic, why the truths cannot judge it; empty if they can.
-        notes: what to say about these truths.
+        notes: sentences on these truths.
     """
 
     def __init__(self, runs: JudgedRuns) -> None:
@@ -45,4 +45,4 @@ class KindJudge(ABC):
 
     @abstractmethod
     def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
-        """Judge a block of a replay's outputs: what metrics judge, with the topic that it is of."""
+        """Judge a block of a replay's outputs, and return the inputs of metrics, each with its topic."""

@@ -1,6 +1,6 @@
-"""Makes tables of what is judged: rows per step, per run and span of time, per estimate.
+"""Tables of judged results: rows per step, per run and time span, or per estimate.
 
-They are made of the judge's sums when they are asked for: what prints metrics alone needs no pandas.
+They are made from the judge's sums on request, so that printing only metrics does not import pandas.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,16 +15,17 @@ from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities
 
 
 def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """Return the rows of all tables; what one of them has no column for is NaN there."""
+    """Concatenate tables; a column that a table lacks is NaN in its rows."""
     filled = [table for table in tables if len(table)]
     return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
 
 
 def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
-    """Return one row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
+    """Make one row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
-    Where there are more than `judge.STEPS` steps, a row is of several; `step` is the first of them. Of
-    a bound there is what it is over the ensemble, if there is that.
+    If there are more than `judge.STEPS` steps, a row covers several, and `step` is the first of them.
+    If `bounds` has a bound over the ensemble, its values are used instead of those along the
+    trajectories.
     """
     errors, by_step = quantities.errors, quantities.by_step
     cells, count, sums = by_step.filled()
@@ -51,7 +52,7 @@ def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataF
 
 
 def time_table(quantities: Quantities) -> pd.DataFrame:
-    """Return one row per run and span of time."""
+    """Make one row per run and time span."""
     errors, by_time = quantities.errors, quantities.by_time
     cells, count, sums = by_time.filled()
     columns: dict[str, object] = {
@@ -67,10 +68,11 @@ def time_table(quantities: Quantities) -> pd.DataFrame:
 def table_of_runs(
     quantities: Iterable[Quantities], innovations: Mapping[str, InnovationSums]
 ) -> pd.DataFrame:
-    """Return one row per estimator, case and run.
+    """Make one row per estimator, case and run.
 
-    How many estimates, the RMSE of each quantity and mean NEES; of what gives innovations NIS per
-    component, the share that a gate kept out, and the log-likelihood of what it let in.
+    Columns are the number of estimates, the RMSE of each quantity and the mean NEES. If there are
+    innovations, NIS per component, the share rejected by a gate and the log-likelihood of accepted
+    measurements are added.
     """
     keys = ["estimator", "case", "run"]
     errors = joined(run_table(each) for each in quantities)
@@ -82,7 +84,7 @@ def table_of_runs(
 
 
 def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
-    """Return one row per run that has innovations."""
+    """Make one row per run that has innovations."""
     estimator, case = split_topic(topic)
     run, of = sums.by_run()
     with np.errstate(invalid="ignore"):
@@ -95,7 +97,7 @@ def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
 
 
 def run_table(quantities: Quantities) -> pd.DataFrame:
-    """Return one row per run."""
+    """Make one row per run."""
     errors = quantities.errors
     cells, count, sums = quantities.by_time.filled()
     runs, place = np.unique(cells[:, 0], return_inverse=True)
@@ -111,7 +113,7 @@ def run_table(quantities: Quantities) -> pd.DataFrame:
 
 
 def error_table(errors: Errors) -> pd.DataFrame:
-    """Return one row per run and step: error and sigma of every component, NEES."""
+    """Make one row per run and step: error and sigma of every component, NEES."""
     sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
     columns: dict[str, object] = {
         "estimator": errors.estimator,
@@ -129,7 +131,7 @@ def error_table(errors: Errors) -> pd.DataFrame:
 
 
 def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
-    """Return columns of RMSE by quantity and of the mean NEES."""
+    """Compute columns of RMSE by quantity and of the mean NEES."""
     mean = sums / count[:, None]
     columns: dict[str, Floats] = {}
     if errors.position:

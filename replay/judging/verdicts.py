@@ -1,6 +1,6 @@
-"""Defines the verdicts that commands, reports and result.json give: one enum a question.
+"""Verdicts in the output of commands, in reports and in result.json: one enum for each question.
 
-Whether an estimator is overconfident is decided by `Squares.verdict` alone; all others ask it.
+Only `Squares.verdict` decides whether an estimator is overconfident; all other code asks it.
 """
 
 import math
@@ -10,15 +10,15 @@ from enum import StrEnum
 
 from fuselog.replay.judging.intervals import Interval
 
-# A mean of squares may be off by this share: nobody would act on less, however many runs show it.
+# A mean of squares may be off by this fraction: less has no practical importance, even if significant.
 MATERIAL = 0.1
-FAR = 1.25  # times larger than claimed: errors of that are no matter of a few percent
-# Squared errors so many times too large are no matter of covariances: 10,000 standard deviations.
+FAR = 1.25  # times larger than claimed: such errors are off by more than a few percent
+# Squared errors above this multiple, 10,000 standard deviations, mean divergence, not wrong covariances.
 DIVERGED = 1e8
 
 
 class Consistency(StrEnum):
-    """Answers whether errors are as large as an estimator's covariances say."""
+    """Verdict on whether errors are as large as an estimator's covariances say."""
 
     CONSISTENT = "consistent"
     OVERCONFIDENT = "overconfident"
@@ -27,10 +27,10 @@ class Consistency(StrEnum):
 
 
 class Comparison(StrEnum):
-    """Answers whether a second estimator is better than a first.
+    """Verdict on whether a second estimator is better than a first.
 
-    Of a metric that has no right value it is only higher or lower. The answer is withheld if changes
-    that should not matter move the metric further than the two differ.
+    For a metric without a target value, the verdict is only higher or lower. It is withheld if changes
+    that should not matter move the metric by more than the difference.
     """
 
     BETTER = "better"
@@ -43,17 +43,17 @@ class Comparison(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Comparison | None":
-        """Read what results of before said."""
+        """Accept values of older results."""
         return {"no difference": cls.TIE, "unclear": cls.UNDECIDED}.get(str(value))
 
 
-# Verdicts on a difference beyond chance and margin, and those on two that are not told apart.
+# Verdicts on a difference beyond chance and margin, and verdicts without such a difference.
 DIFFER = (Comparison.WORSE, Comparison.BETTER, Comparison.HIGHER, Comparison.LOWER)
 ALIKE = (Comparison.TIE, Comparison.UNDECIDED, Comparison.WITHHELD)
 
 
 class Claimed(StrEnum):
-    """Answers whether a claim holds; there is no verdict if it is made of another recording."""
+    """Verdict on whether a claim holds; there is no verdict if the claim is about another recording."""
 
     CONFIRMED = "confirmed"
     REFUTED = "refuted"
@@ -63,19 +63,19 @@ class Claimed(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Claimed | None":
-        """Read what results of before said."""
+        """Accept values of older results."""
         return cls.INCONCLUSIVE if value == "not shown" else None
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Holds a mean of normalised squares, NEES or NIS per component.
+    """Mean of normalised squares: NEES, or NIS per component.
 
     Attributes:
-        name: which of the two.
+        name: NEES or NIS.
         found: the mean, with its interval over the runs if there are enough.
-        aim: what it should be.
-        usual: where it lies with 95 % if the estimator is consistent.
+        aim: the expected value.
+        usual: the 95 % interval of a consistent estimator.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Squares:
 
     @property
     def verdict(self) -> Consistency:
-        """Decide what it says of the estimator: by chance over covariances, and over the runs."""
+        """Return the verdict, from the interval of a consistent estimator and that over the runs."""
         low, high = self.usual
         if math.isnan(self.found.value):
             return Consistency.UNDECIDED
@@ -98,21 +98,21 @@ class Squares:
 
     @property
     def factor(self) -> float:
-        """Return how many times larger errors are than the estimator claims."""
+        """Return the ratio of errors to the errors that the estimator claims."""
         return math.sqrt(max(self.found.value, 0.0) / self.aim)
 
     @property
     def is_far(self) -> bool:
-        """Tell whether errors are so far beyond what is claimed that the covariance is no guide."""
+        """Test whether errors exceed the claimed ones so far that the covariance is no guide."""
         return self.factor > FAR
 
     @property
     def has_diverged(self) -> bool:
-        """Tell whether errors are so large that they are no matter of covariances."""
+        """Test whether errors are so large that the estimator has diverged."""
         return self.found.value > DIVERGED * self.aim
 
 
 def decisive(squares: Sequence[Squares]) -> Squares | None:
-    """Return the one that decides of an estimator: the first that is not consistent, else the first."""
+    """Return the squares that decide the verdict: the first inconsistent ones, or else the first."""
     off = (each for each in squares if each.verdict != Consistency.CONSISTENT)
     return next(off, squares[0] if squares else None)

@@ -1,4 +1,5 @@
-"""Draws the Rerun timeline: sinks, columns, the scenes of robots and inertial units; begin with `show`.
+"""Rerun timelines: sinks, columns, the scenes of robots and inertial units; begin with `show`.
 
-Families draw theirs in `fuselog.replay.families`; `generic` draws a log of which no scene is registered.
+Families draw their scenes in `fuselog.replay.families`; `generic` draws a log without a registered
+scene.
 """

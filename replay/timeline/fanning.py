@@ -1,4 +1,4 @@
-"""Draws copies of an estimate that fan out from it: how far each is away, over time."""
+"""Plots of the distances between an estimate and copies that diverge from it, over time."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -12,13 +12,13 @@ from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 
 
 class Fan(NamedTuple):
-    """States how far one copy is from its estimate.
+    """Distances between one copy and its estimate.
 
     Attributes:
-        estimate: what it is a copy of; those of one estimate share a plot.
-        copy: its name.
+        estimate: the original estimate; the copies of one estimate share a plot.
+        copy: name of the copy.
         time_ns: (n,) stamps.
-        sigmas: (n,) how many sigmas of the estimate it is away.
+        sigmas: (n,) distance in standard deviations of the estimate.
     """
 
     estimate: str
@@ -28,7 +28,7 @@ class Fan(NamedTuple):
 
 
 def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
-    """Return the layout above a plot for each estimate that copies fan out from."""
+    """Return the layout above a plot for each estimate that has copies."""
     plots = []
     for estimate in dict.fromkeys(fan.estimate for fan in fans):
         plot = entity_path("plots", "stress", estimate)

@@ -1,8 +1,8 @@
-"""Draws a log that no family draws: all that it holds, by schema.
+"""Scene of a log without a family of its own: everything in the log, by schema.
 
-Places are on a plane, one for each frame of the log, and on a map of the earth: truths, estimates,
-fixes, poses, landmarks with what is seen of them. What a sensor sees is drawn about it, what it measures
-is a plot for each quantity. Beside it are errors, NEES and NIS, where there are estimates.
+Positions are drawn in one plane for each frame of the log and on a map of the earth: truths, estimates,
+fixes, poses, and landmarks with the measurements of them. A sensor's measurements are drawn around it,
+and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to this.
 """
 
 from collections.abc import Iterator, Sequence
@@ -77,7 +77,7 @@ ANGLES = ("roll", "pitch", "yaw")
 def draw(canvas: Canvas, scene: Scene) -> Board:
     """Draw planes, maps, plots and events for each case.
 
-    Raises BadInput where there is nothing to draw.
+    Raises BadInput if there is nothing to draw.
     """
     topics = {topic for case in scene.cases for topic in scene.topics_near(case)}
     if not scene.outputs and not any(scene.source.topics[topic].messages for topic in topics):
@@ -107,7 +107,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     boards: list[Board] = [*_draw_space(canvas, case, turned), *_draw_sensors(canvas, case, sensed)]
     components = draw_components(canvas, scene, case)
     state: list[Board] = [in_strips(components, "state")] if components else []
-    # what is estimated is seen first, on a map where it has a place
+    # estimates are shown first, on a map if they have a position
     is_estimated = bool(scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE))
     is_placed = bool(in_space) or any(each.name != "truth" for each in tracks_of(scene, case))
     first = is_estimated and not is_placed
@@ -121,7 +121,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
 
 
 def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
-    """Tell what has no drawing, by topic, and why."""
+    """Return the reasons why topics are not drawn, by topic."""
     shown_elsewhere = NOT_SENSED - {schemas.LINK_EVENT.full_name}
     return {
         stream.topic: "none of its fields is a quantity over time"
@@ -131,7 +131,7 @@ def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
 
 
 def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:
-    """Draw everything that has a place, side by side for each frame: no board where nothing has."""
+    """Draw everything with a position, one view per frame side by side; no board without positions."""
     by_frame: dict[str, list[Stream]] = {"": []}
     for stream in sensed:
         if stream.schema.full_name in {*FIXES, LANDMARK} and stream["position_m"].shape[1] >= 2:
@@ -149,7 +149,7 @@ def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) 
 def _draw_plane(
     canvas: Canvas, scene: Scene, case: str, frame: str, sensed: list[Stream]
 ) -> list[Board]:
-    """Draw the places of one frame; truths and estimates are in the log's own, which has no name."""
+    """Draw the positions in one frame; truths and estimates are in the log's own, which has no name."""
     root, shown, paths = entity_path(ROOT, case), [], []
     named: dict[str, Colour] = {}
     if frame:
@@ -165,7 +165,7 @@ def _draw_plane(
         named |= draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
     for stream, colour in zip(sensed, scene.spare_colours, strict=False):
         entity, stroke = f"{root}/{_name(stream, case)}", Stroke(colour)
-        if stream.schema.full_name != LANDMARK:  # which is numbered
+        if stream.schema.full_name != LANDMARK:  # landmarks have numbers instead
             named[_name(stream, case)] = colour
         rows = thin(stream.publish_time_ns)
         time_ns, places = stream.publish_time_ns[rows], stream["position_m"][rows, :2]
@@ -192,7 +192,7 @@ def _draw_plane(
 
 
 def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
-    """Draw geodetic fixes on a map of the earth, and estimates' ways where an origin is stated."""
+    """Draw geodetic fixes on a map of the earth, and paths of estimates if an origin is stated."""
     root = entity_path("geodetic", case)
     origin = stated_origin({each.topic: scene.source.topics[each.topic] for each in fixes[:1]})
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
@@ -209,7 +209,7 @@ def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]
 
 
 def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb.Spatial3DView]:
-    """Draw orientations as triads about one origin."""
+    """Draw orientations as triads around one origin."""
     root = entity_path("space", case)
     for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
         rows = thin(stream.publish_time_ns)
@@ -220,7 +220,7 @@ def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb
 
 
 def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[rrb.Container]:
-    """Draw what a sensor sees about it, and plot each number that it measures, unless covariances."""
+    """Draw each sensor's measurements around it, and plot all of their numbers except covariances."""
     for stream in sensed:
         if stream.schema.full_name in NOT_SENSED:
             continue
@@ -258,8 +258,8 @@ def _draw_field(
 
 
 def _euler_deg(quaternions: Floats) -> Floats:
-    """Return roll, pitch, yaw (n, 3), turned about z, y, x in this order; NaN where no rotation is."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    """Convert quaternions to roll, pitch, yaw (n, 3) in deg (about x, y, z); NaN if invalid."""
+    from scipy.spatial.transform import Rotation  # slow to import
 
     angles = np.full((len(quaternions), 3), np.nan)
     known = np.linalg.norm(quaternions, axis=1) > 0.0
@@ -269,7 +269,7 @@ def _euler_deg(quaternions: Floats) -> Floats:
 
 
 def _name(stream: Stream, case: str) -> str:
-    """Name a topic as it is called within its case."""
+    """Return the name of a topic within its case."""
     return stream.topic.removeprefix(f"/{case}").removeprefix("/")
 
 

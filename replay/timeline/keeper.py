@@ -1,6 +1,7 @@
-"""Runs `rerun ARGUMENTS` for as long as somebody holds the other end of standard input.
+"""Runner of `rerun ARGUMENTS` that ends when the other end of its standard input is closed.
 
-A pipe closes with the process that holds it, however that ends, so no viewer outlives its fuselog.
+The operating system closes the pipe when the process that holds it ends in any way, so no viewer
+outlives its fuselog.
 """
 
 import os
@@ -13,8 +14,8 @@ import rerun_cli.__main__ as rerun
 
 
 def _end_with_the_holder() -> None:
-    os.read(0, 1)  # not sys.stdin, which cannot be closed while a thread reads it
-    while True:  # it may be about to start
+    os.read(0, 1)  # not sys.stdin, which could not be closed while a thread reads it
+    while True:  # a child may be about to start
         for child in psutil.Process().children(recursive=True):
             child.terminate()
         time.sleep(0.1)

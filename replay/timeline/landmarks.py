@@ -1,4 +1,4 @@
-"""Draws robots: each on its map of landmarks, its errors, NEES, NIS and events."""
+"""Scene of robots, each on its map of landmarks, with its errors, NEES, NIS and events."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -47,11 +47,11 @@ from fuselog.replay.timeline.drawing.plots import draw_quality
 from fuselog.replay.timeline.drawing.registered import draw_registered
 
 HEADING = "heading_rad"
-# An arrow is so long, as a share of the scene.
+# Length of an arrow as a fraction of the scene.
 ARROW_SHARE = 0.04
-# A single place is a dot so much wider than a path.
+# A single position is a dot; its width is this multiple of a path's.
 SINGLE = 1.5
-# Schemas of what is seen of a landmark, and the field that has its number.
+# Schemas of measurements of landmarks, and the field with the landmark's number.
 SIGHTINGS = {
     schemas.RANGE_BEARING.full_name: "target_id",
     schemas.RANGE.full_name: "target_id",
@@ -60,16 +60,16 @@ SIGHTINGS = {
 }
 SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
-# What states how far and how widely a sensor sees; how its view is drawn.
+# Parameters of a sensor's field of view; number of vertices and colour of its drawing.
 VIEW, CORNERS, SEEN_UP_TO = ("maximum_range_m", "field_of_view_deg"), 49, (110, 110, 90)
-# At most so many views are drawn.
+# The most fields of view that are drawn.
 VIEWS = 500
-# A pose is too old to look from after so long.
+# A measurement is drawn from a pose only if the pose is not older than this.
 FRESH_NS = 500_000_000
 
 
 class Track(NamedTuple):
-    """Holds poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
+    """Poses (n, 3) of a robot, x, y, heading, from the truth or an estimator.
 
     A heading that is not stated is NaN.
     """
@@ -82,7 +82,7 @@ class Track(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return a map and plots for each robot."""
+    """Draw a map and plots for each robot, and return the layout."""
     landmarks = landmarks_of(scene)
     turn_up(canvas)
     draw_points(canvas, f"{ROOT}/landmarks", landmarks.index.to_numpy(), landmarks.to_numpy())
@@ -90,7 +90,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def landmarks_of(scene: Scene) -> pd.DataFrame:
-    """Return places (n, 2) by number; none where the log has no map, as that of estimates."""
+    """Return the positions (n, 2) of landmarks by number; empty if the log has no map."""
     maps = topics_of(scene.source.topics, schemas.LANDMARK)
     stream = scene.read("/landmarks" if "/landmarks" in maps else maps[0]) if maps else None
     if stream is None or not len(stream):
@@ -118,7 +118,7 @@ def _draw_robot(
 
 
 def tracks_of(scene: Scene, robot: str) -> list[Track]:
-    """Return the truth and every estimate that says where the robot is, thinned to what is drawn."""
+    """Return the truth and every estimate with a position of the robot, thinned for drawing."""
     found = [("truth", TRUE, each, each["state"]) for each in scene.truths_of(robot)]
     for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, stroke_of(scene, estimator), stream, stream["mean"]))
@@ -141,11 +141,11 @@ def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
 
 
 def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
-    """Draw path, arrows and ellipses of a robot in a scene so wide; return the entity of the path."""
+    """Draw path, arrows and ellipses of a robot in a scene of this extent; return the path's entity."""
     entity = f"{root}/{track.name}"
     if track.name == "truth":
         draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
-    if len(track.time_ns) == 1:  # which has no path
+    if len(track.time_ns) == 1:  # a single position has no path
         stroke = Stroke(track.stroke.colour, SINGLE * track.stroke.radius_px)
         draw_dots(canvas, f"{entity}/place", track.time_ns, track.poses[:, :2], stroke)
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
@@ -161,7 +161,7 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
 def draw_sights(
     canvas: Canvas, scene: Scene, robot: str, tracks: list[Track], landmarks: pd.DataFrame
 ) -> dict[str, Colour]:
-    """Draw lines from the robot to landmarks that it sees, red if rejected; return names of colours."""
+    """Draw lines from the robot to measured landmarks, red if rejected; return the colours by name."""
     sensors = [
         scene.read(topic)
         for topic in scene.topics_near(robot)
@@ -182,7 +182,7 @@ def draw_sights(
 
 
 def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) -> dict[str, Colour]:
-    """Draw up to where the robot sees landmarks, if the run's parameters state it; names the colour."""
+    """Draw the field of view of a sensor if the run's parameters state it; return its colour by name."""
     run, truths = scene.source.run, [track for track in tracks if track.name == "truth"]
     for topic in scene.topics_near(robot):
         sensor = topic.rpartition("/")[2]
@@ -204,7 +204,7 @@ def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) ->
 
 
 def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
-    """Return the distinct (time, target) of some streams, sorted; each with the field of its targets."""
+    """Return the sorted distinct (time, target) pairs of streams, each with the field of its targets."""
     times, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for stream, field in streams:
         times.append(stream.publish_time_ns)
@@ -214,7 +214,7 @@ def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
 
 
 def _places_at(tracks: list[Track], time_ns: Times) -> Floats:
-    """Find where the robot was (n, 2): by the truth, or by the first estimate that has one then."""
+    """Interpolate the robot's position (n, 2), from the truth or else the first recent estimate."""
     places = np.full((len(time_ns), 2), np.nan)
     for track in tracks:
         row = np.searchsorted(track.time_ns, time_ns, side="right") - 1

@@ -1,4 +1,4 @@
-"""Keeps the worst moments of a run in its timeline, and finds one for the viewer's cursor."""
+"""Worst moments of a run, stored in its timeline and used for the viewer's cursor."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ _ENTITY = "moments"
 
 
 def keep_moments(recording: rr.RecordingStream, moments: Sequence[Moment]) -> None:
-    """Log moments as a table of the timeline, a column for each field."""
+    """Log moments as a table in the timeline, with a column for each field."""
     if moments:
         columns: dict[str, Any] = {
             name: [getattr(each, name) for each in moments] for name in Moment._fields
@@ -24,7 +24,7 @@ def keep_moments(recording: rr.RecordingStream, moments: Sequence[Moment]) -> No
 
 
 def read_moments(rrd: Path) -> list[Moment]:
-    """Read the moments that a timeline keeps; none of one without errors."""
+    """Read the moments stored in a timeline; empty if the timeline has no errors."""
     for chunk in rc.RrdReader(str(rrd)).stream().filter(content=f"/{_ENTITY}", is_static=True):
         batch = chunk.to_record_batch()
         columns = [batch.column(name).to_pylist()[0] for name in Moment._fields]
@@ -33,7 +33,7 @@ def read_moments(rrd: Path) -> list[Moment]:
 
 
 def worst_at(moments: Sequence[Moment], at: str) -> Moment:
-    """Return the moment that `worst`, or `worst:ESTIMATOR`, names.
+    """Return the moment that `worst` or `worst:ESTIMATOR` selects.
 
     Raises BadInput if there are no errors, or none of that estimator.
     """

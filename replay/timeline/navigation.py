@@ -1,7 +1,7 @@
-"""Draws a body that moves and turns in space: its path, its axes, and how well both are known.
+"""Scene of a body that moves and rotates in space: its path, its axes, and the uncertainty of both.
 
-Drawn for every estimate of a position in space with an orientation, whatever made the log. Where fixes
-are silent for long, the path is marked, and the plots are shaded.
+It is drawn for every estimate of a 3D position with an orientation, whatever program wrote the log. If
+there are long gaps between fixes, the path is marked and the plots are shaded there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,26 +42,27 @@ PLACE = ("x_m", "y_m", "z_m")
 ORIENTATION = tuple(f"orientation_{part}" for part in "wxyz")
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 ANGLES = ("roll", "pitch", "yaw")
-# What is plotted in one view, by the ends of the components' names.
+# Components plotted in one view, by the beginning of their names.
 BIASES = (("gyro_bias_", "Gyro bias"), ("accelerometer_bias_", "Accelerometer bias"))
 FORWARD: tuple[Colour, ...] = ((230, 60, 40), (0, 158, 115), (0, 114, 178))
-# Ellipsoids along a path, which overlap to a tube: at most so many, so far apart for their size.
+# Ellipsoids along a path, which overlap to a tube: their largest number, and their distance by size.
 TUBE, TUBE_STEP = 300, 0.5
-# No tube is drawn where it would be thinner than this share of the scene, and hide the path.
+# A tube thinner than this fraction of the scene is not drawn, because it would hide the path.
 TUBE_SHARE = 0.005
-# By how much a vector's axes differ in brightness where several bodies are plotted.
+# Brightness of the axes of a vector if several bodies are plotted.
 SHADES = (1.0, 0.75, 0.5)
 
 
 class Body(NamedTuple):
-    """States where a body is thought to be, or truly is.
+    """Estimated or true states of a body.
 
     Attributes:
-        width: of its lines, in pixels.
+        width: width of its lines in pixels.
         time_ns: (n,).
-        values: (n, components), by `names`.
-        deviations: (n, tangent components) by `tangent`, None for the truth.
-        covariance: (n, 3, 3) of the place, None for the truth.
+        values: (n, components), in the order of `names`.
+        deviations: (n, tangent components) standard deviations in the order of `tangent`, None for the
+            truth.
+        covariance: (n, 3, 3) of the position, None for the truth.
     """
 
     label: str
@@ -82,7 +83,7 @@ class Body(NamedTuple):
 def draw_navigation(
     canvas: Canvas, scene: Scene, case: str, sensed: Sequence[Stream]
 ) -> list[rrb.Container]:
-    """Draw a scene in space and plots of the motion, if an estimate has position and orientation."""
+    """Draw a 3D scene and plots of the motion, if an estimate has a position and an orientation."""
     bodies = list(_bodies(scene, case))
     if all(body.deviations is None for body in bodies):
         return []
@@ -103,7 +104,7 @@ def draw_navigation(
 
 
 def _bodies(scene: Scene, case: str) -> Iterator[Body]:
-    """Yield the truth where it has a place in space, and all estimates with an orientation too."""
+    """Yield the truth if it has a 3D position, and all estimates that also have an orientation."""
     for truth in scene.truths_of(case):
         if set(PLACE) <= set(truth.components):
             known = np.isfinite(truth["state"]).all(axis=1)
@@ -143,7 +144,7 @@ def _bodies(scene: Scene, case: str) -> Iterator[Body]:
 
 
 def _fixes_of(sensed: Sequence[Stream]) -> Iterator[tuple[str, Stream]]:
-    """Yield fixes in the plane, also those of latitude and longitude where their plane is stated."""
+    """Yield fixes in the local tangent plane, including geodetic fixes if their origin is stated."""
     for stream in sensed:
         name = stream.topic.strip("/").replace("/", " ")
         schema = stream.schema.full_name
@@ -155,7 +156,7 @@ def _fixes_of(sensed: Sequence[Stream]) -> Iterator[tuple[str, Stream]]:
 
 
 def _silent(stream: Stream, end_ns: int) -> Times:
-    """Find spans (n, 2) in which fixes are missed, that after the last one included."""
+    """Find spans (n, 2) in which fixes are missing, including the one after the last fix."""
     times = np.append(stream.publish_time_ns, end_ns)
     long = np.diff(times) > gap_limit_ns(stream.publish_time_ns)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)
@@ -170,7 +171,7 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
 
 
 def _fix_colours(fixes: Sequence[tuple[str, Stream]]) -> dict[str, Colour]:
-    """Name the colours of fixes, by the standard deviation that they state."""
+    """Return the names of the colours of fixes, by the standard deviation that they state."""
     drawn = [by_deviation(stream["covariance_m2"], MUTED) for _, stream in fixes]
     found = {tuple(colour) for colours in drawn for colour in np.unique(colours, axis=0).tolist()}
     named = {f"fixes to {limit:g} m": colour for limit, colour in QUALITIES}
@@ -179,7 +180,7 @@ def _fix_colours(fixes: Sequence[tuple[str, Stream]]) -> dict[str, Colour]:
 
 
 def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
-    """Draw the whole path with its tube, red where fixes are silent, and the axes at the cursor."""
+    """Draw the whole path with its tube, red in gaps between fixes, and the axes at the cursor."""
     place, radii = body.columns(PLACE), rr.Radius.ui_points(body.width)
     canvas.fix(f"{entity}/path", rr.LineStrips3D([place], colors=[body.colour], radii=radii))
     if body.covariance is not None:
@@ -202,11 +203,11 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
-    """Draw ellipsoids of two standard deviations along the path, where they are larger than its line.
+    """Draw ellipsoids of two standard deviations along the path, if they are larger than its line.
 
-    They are wires, because a viewer may be in one.
+    They are wireframes, because the viewer's eye may be inside one.
     """
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    from scipy.spatial.transform import Rotation  # slow to import
 
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
     reach = SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[rows])[:, -1].clip(0.0))
@@ -217,7 +218,7 @@ def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, c
     rows = rows[kept]
     rows = rows[reach[kept] > TUBE_SHARE * _extent(place)]
     values, vectors = np.linalg.eigh(covariance[rows])
-    vectors[np.linalg.det(vectors) < 0, :, 0] *= -1.0  # a rotation, no reflection
+    vectors[np.linalg.det(vectors) < 0, :, 0] *= -1.0  # a rotation, not a reflection
     canvas.fix(
         entity,
         rr.Ellipsoids3D(
@@ -236,7 +237,7 @@ def _extent(place: Floats) -> float:
 
 
 def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
-    """Show the scene from south-west and above."""
+    """Return a view of the scene from the south-west and above."""
     place = np.concatenate([body.columns(PLACE) for body in bodies])
     centre, extent = 0.5 * (place.min(axis=0) + place.max(axis=0)), _extent(place)
     return rrb.Spatial3DView(
@@ -249,7 +250,7 @@ def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
 
 
 def _groups(bodies: Sequence[Body]) -> Iterator[tuple[str, str, str, list[str]]]:
-    """Yield what is plotted together: a name, a title with its unit, components."""
+    """Yield the plots: a name, a title, its unit and its components."""
     names = dict.fromkeys(name for body in bodies for name in body.names)
     if set(VELOCITY) <= set(names):
         yield "velocity", "Velocity", "m/s", list(VELOCITY)
@@ -270,7 +271,7 @@ def _draw_group(
     components: Sequence[str],
     outages: Times,
 ) -> rrb.TimeSeriesView:
-    """Plot some components of all bodies, biases with their bands, shades where fixes are silent."""
+    """Plot some components of all bodies, with bands for biases and shades in gaps between fixes."""
     plot, largest = entity_path("plots", case, "motion", name), 0.0
     for body in bodies:
         shades = [_shaded(body.colour, share) for share in SHADES]
@@ -296,7 +297,7 @@ def _shaded(colour: Colour, share: float) -> Colour:
 
 
 def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
-    """Return a component's values (n,) and standard deviations (n,), in the unit that is shown."""
+    """Return a component's values (n,) and sigmas (n,) in the displayed unit; None if missing."""
     if component in ANGLES:
         if not set(ORIENTATION) <= set(body.names):
             return None
@@ -325,7 +326,7 @@ def _draw_band(
 
 
 def _draw_shades(canvas: Canvas, entity: str, outages: Times, extent: float) -> None:
-    """Shade the whole height where fixes are silent; between outages there is nothing."""
+    """Shade the whole height of a plot in gaps between fixes."""
     if not len(outages):
         return
     # a NaN after each outage ends its shade

@@ -1,4 +1,4 @@
-"""Shows one run of a replay in Rerun: in a file, in a live viewer, or both from one pass."""
+"""Drawing of one run of a replay in Rerun: to a file, a live viewer, or both in one pass."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,29 +28,29 @@ from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
-# A receiver is sent so many messages of outputs at once.
+# Number of output messages that are sent to a receiver at a time.
 LIVE_MESSAGES = 20_000
 
 
 class Drawing:
-    """Draws the timeline of one run while it is replayed.
+    """Timeline of one run, drawn while the run is replayed.
 
-    A receiver is sent every block as it comes. A file is drawn when all is there, from what is kept: the
-    run itself while it is short, else evenly in time. Use it as a context: it is finished at the end,
-    unless something was raised.
+    A receiver is sent every block as it comes. A file is drawn at the end, from the messages that were
+    kept: all of them in a short run, otherwise a selection that is even in time. Use it as a context
+    manager: it is finished at the end, unless an exception was raised.
 
     Args:
         source: the run.
-        identity: what tells this recording from others; a viewer mixes those of one identity.
-        focus: the case that is seen first, such as `robot3`.
+        identity: identifier of the recording; a viewer merges recordings with the same identifier.
+        focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
-        connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
-        at: `worst` or `worst:ESTIMATOR`: without a focus, the case of that moment is seen first.
-        sides: estimators whose scenes stand side by side, with the differences of their errors.
-        fans: how far copies are from their estimates.
+        connect: URL of a receiver, rerun+http://HOST:PORT/proxy.
+        at: `worst` or `worst:ESTIMATOR`: without a focus, the case of that moment is shown first.
+        sides: estimators whose scenes are shown side by side, with the differences of their errors.
+        fans: distances of copies from their estimates.
 
-    Raises BadInput where neither is given or a sink fails (see `open_recording`), or there is no such
-    focus.
+    Raises BadInput if neither `save` nor `connect` is given, if a sink fails (see `open_recording`), or
+    if there is no such focus.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Drawing:
         return None
 
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
-        """Take in a block of the run's outputs, and the errors of its estimates."""
+        """Add a block of the run's `outputs`, and the `errors` of its estimates."""
         self._kept.add(outputs, errors)
         for each in errors:
             self._moments.add(each)
@@ -116,9 +116,9 @@ class Drawing:
                 self._send(self._live, self._fresh.last_ns)
 
     def _send(self, live: rr.RecordingStream, until_ns: int, last: Scene | None = None) -> None:
-        """Send what has come since the last time, and what was sensed up to a stamp.
+        """Send everything new since the last time, and sensor messages up to a stamp.
 
-        `last` is the whole run, at its end.
+        `last` is the scene of the whole run, at its end.
         """
         sensed = self._sensed.read_to(until_ns)
         scene = Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus)
@@ -143,7 +143,8 @@ class Drawing:
         )
         if self._live is not None:
             self._send(self._live, np.iinfo(np.int64).max, scene)
-        if self._live is not None and self._sent > 1:  # what moves is there; ranges are of the last part
+        # moving entities have been sent; the ranges of views are still those of the last part
+        if self._live is not None and self._sent > 1:
             self._draw(self._live, scene, is_still=True)
         if self._save is not None:
             with open_recording(*self._names, save=self._save) as recording:
@@ -180,18 +181,18 @@ def show(
     save: Path | None = None,
     connect: str | None = None,
 ) -> None:
-    """Draw one run of an ensemble with all its estimators, as its scenario's family draws it.
+    """Draw one run of an ensemble with all its estimators, with the drawing of its scenario's family.
 
     Args:
         source: the run.
-        outputs: the estimators' streams of the ensemble, by topic; none shows the log alone.
+        outputs: the estimators' streams of the ensemble, by topic; without any, only the log is shown.
         errors: the errors of the ensemble's estimates.
-        run: which run of the ensemble `source` is.
-        focus: the case that is seen first, such as `robot3`.
+        run: index in the ensemble of the run `source`.
+        focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
-        connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
+        connect: URL of a receiver, rerun+http://HOST:PORT/proxy.
 
-    Raises BadInput where there is no such run or focus, or a sink fails (see `open_recording`).
+    Raises BadInput if there is no such run or focus, or if a sink fails (see `open_recording`).
     """
     runs = max((ragged.runs for ragged in outputs.values()), default=1)
     if not 0 <= run < runs:
@@ -214,7 +215,7 @@ def _canvas(
 
 
 def _divergences(outputs: Mapping[str, Stream]) -> dict[str, Divergence]:
-    """Find where estimators diverge, by topic of their innovations."""
+    """Find the points at which estimators diverge, by topic of their innovations."""
     found = {
         topic: find_divergence(stream)
         for topic, stream in outputs.items()
@@ -224,7 +225,7 @@ def _divergences(outputs: Mapping[str, Stream]) -> dict[str, Divergence]:
 
 
 def _identity(outputs: Mapping[str, Stream]) -> str:
-    """Say in short what was estimated."""
+    """Compute a digest of the outputs."""
     digest = hashlib.sha256()
     for topic, stream in outputs.items():
         digest.update(topic.encode())

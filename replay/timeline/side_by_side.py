@@ -1,7 +1,7 @@
-"""Puts estimators side by side: a family's scenes once for each, and by how much one is off more.
+"""Estimators side by side: a family's scenes once for each, and the differences of their errors.
 
-The family has drawn everything once: a scene beside the other shows the same entities, but for those of
-the other estimators. So colours, cursor and all else are the same in both.
+The family has drawn everything once; each scene shows the same entities except those of the other
+estimators. Colours, cursor and everything else are therefore the same in all scenes.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 def draw_side_by_side(
     canvas: Canvas, scene: Scene, layout: Board, estimators: Sequence[str]
 ) -> rrb.Container:
-    """Return the layout with a scene for each estimator, above the differences of their errors."""
+    """Return the layout with a scene for each estimator, above plots of the differences of errors."""
     plots = [view for case in scene.cases for view in _draw_differences(canvas, scene, case, estimators)]
     board = _split(layout, estimators)
     if not plots:
@@ -29,7 +29,7 @@ def draw_side_by_side(
 
 
 def _split(layout: Board, estimators: Sequence[str]) -> Board:
-    """Split every view of a scene in the layout by estimator; a legend is the same for all."""
+    """Split every view of a scene in the layout by estimator; legends are not split."""
     if isinstance(layout, rrb.Container):
         layout.contents = [
             _split(each, estimators) if isinstance(each, rrb.Container | rrb.View) else each
@@ -56,7 +56,7 @@ def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.Vie
 def _draw_differences(
     canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot how much larger the errors of others are than the first's, at the stamps that both have."""
+    """Plot how much larger the errors of others are than the first's, at their common stamps."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
     plot, unit, drawn = entity_path("plots", case, "difference"), "-", False
@@ -76,7 +76,7 @@ def _draw_differences(
 
 
 def _sizes(errors: Errors) -> Floats:
-    """Tell how large the error of the main quantity is (n,)."""
+    """Compute the size (n,) of the error of the main quantity."""
     _, columns, scale = errors.main
     sizes: Floats = scale * np.linalg.norm(errors.error[:, columns], axis=1)
     return sizes

@@ -1,9 +1,9 @@
-"""Sends a timeline to a file, or to a live viewer.
+"""Sinks of a timeline: a file or a live viewer.
 
-A file appears under its name only when it is whole. Rerun encodes it into memory, and it is written from
-here: Rerun's own writer of files tells nobody of a disk that is full as it ends, and may wait forever.
-A live receiver is asked before anything is sent, because Rerun itself waits many seconds for one that is
-not there, and forever for one that is silent.
+A file appears under its name only when it is complete. Rerun encodes it in memory and it is written
+here, because Rerun's own writer does not report a disk that is full at the end, and may wait forever. A
+live receiver is contacted before anything is sent, because Rerun itself waits many seconds for a
+missing receiver, and forever for one that does not answer.
 """
 
 import os
@@ -31,16 +31,16 @@ _GIVEN_UP_S = 2.0
 def open_recording(
     application_id: str, recording_id: str, *, save: Path | None = None, connect: str | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """Open a recording whose rows carry no clock of this machine: the same input is the same content.
+    """Open a recording without clocks of this machine, so that equal input gives equal content.
 
     Args:
-        application_id: what the viewer keeps one layout for.
-        recording_id: recordings of one id are one recording to a viewer.
+        application_id: identifier for which the viewer stores one layout.
+        recording_id: recordings with the same identifier are one recording in a viewer.
         save: the .rrd file to write, in a folder that exists.
-        connect: in place of a file a receiver, `rerun+http://HOST:PORT/proxy`.
+        connect: receiver to use instead of a file, `rerun+http://HOST:PORT/proxy`.
 
-    Raises BadInput where neither is given, the file cannot be written, or the receiver is not there or
-    goes away; then no file is left.
+    Raises BadInput if neither `save` nor `connect` is given, if the file cannot be written, or if the
+    receiver is missing or is lost; no file is left in these cases.
     """
     if connect is not None:
         _require_receiver(connect)
@@ -63,9 +63,9 @@ def open_recording(
 
 
 def rerun_path(path: Path) -> str:
-    """Return a file's name where Rerun takes it as UTF-8, whatever the locale is.
+    """Return a file's name in the form that Rerun reads as UTF-8, in any locale.
 
-    Raises BadInput where the name is not UTF-8.
+    Raises BadInput if the name is not UTF-8.
     """
     try:
         return os.fsencode(path).decode("utf-8")
@@ -74,14 +74,14 @@ def rerun_path(path: Path) -> str:
 
 
 def _finish(recording: rr.RecordingStream, connect: str) -> None:
-    """Hand over everything that is still queued, and close."""
+    """Send everything that is still queued, and close."""
     failure: Exception | None = None
     try:
         recording.flush(timeout_sec=_FLUSH_S)
     except RuntimeError as error:
         failure = error
     is_closed = _close(recording, _FLUSH_S if failure is None else _GIVEN_UP_S)
-    if not _answers(connect):  # which a flush does not always notice
+    if not _answers(connect):  # a flush does not always report this
         raise BadInput(
             f"--connect {connect}: the connection to the receiver was lost; start it again"
         ) from failure
@@ -91,7 +91,7 @@ def _finish(recording: rr.RecordingStream, connect: str) -> None:
 
 
 def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
-    """Disconnect, and tell whether that ended: with a silent receiver, Rerun may wait forever."""
+    """Disconnect and test whether that ended; if a receiver does not answer, Rerun may wait forever."""
     closing = threading.Thread(target=recording.disconnect, daemon=True)
     closing.start()
     closing.join(limit_s)
@@ -99,7 +99,7 @@ def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
 
 
 def _require_receiver(url: str) -> None:
-    """Raise BadInput unless a receiver answers there."""
+    """Raise BadInput unless a receiver answers at the URL."""
     host, port = _address(url)
     if host is None or port is None:
         raise BadInput(
@@ -112,7 +112,7 @@ def _require_receiver(url: str) -> None:
 
 
 def _address(url: str) -> tuple[str | None, int | None]:
-    """Host and port; None where the URL is not that of a receiver."""
+    """Return host and port of a receiver's URL; None if it is not such a URL."""
     try:
         parts = urlsplit(url)
         is_receiver = parts.scheme == "rerun+http" and parts.path == "/proxy"
@@ -122,7 +122,7 @@ def _address(url: str) -> tuple[str | None, int | None]:
 
 
 def _answers(url: str) -> bool:
-    """Tell whether an HTTP/2 server, as Rerun's receivers are, greets back."""
+    """Test whether an HTTP/2 server, such as a Rerun receiver, answers."""
     try:
         with socket.create_connection(_address(url), timeout=_ANSWER_S) as connection:
             connection.sendall(_HTTP2_GREETING)

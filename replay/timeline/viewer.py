@@ -1,7 +1,7 @@
-"""Starts Rerun's viewer, which rerun-sdk brings along: its window, a picture, or a page for a browser.
+"""Rerun's viewer, which rerun-sdk includes: its window, a picture, or a page for a browser.
 
-It listens on the loopback interface only, reports no usage, reaches no network, and ends with the
-process that started it, however that ends.
+It listens only on the loopback interface, reports no usage, connects to no network, and ends with the
+process that started it, even if that is killed.
 """
 
 import os
@@ -26,21 +26,21 @@ from fuselog.recorders.processes import start_module
 from fuselog.replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-# What a picture says of who made it, in the PNG keyword `Software`.
+# Value of the PNG keyword `Software` of a picture.
 SOFTWARE = "fuselog"
 _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0
 _SAID = "rerun.log"
-# The viewer's own messages lie on top of its first three or four pictures, however long these take, so
-# that those are of an empty window. Of a timeline, the first picture may not show all.
+# The viewer's own messages cover its first three or four pictures, however long these take, so the
+# first pictures are taken of an empty window. The first picture of a timeline may be incomplete.
 _EMPTY_PICTURES, _PICTURES = 7, 3
 # The height in pixels of the viewer's bar, with its menu and badges of its environment.
 _BAR = 36
 
 
 class Listener(NamedTuple):
-    """Represents a running Rerun process and the address that it receives at."""
+    """Running Rerun process and the address at which it receives."""
 
     url: str
     process: subprocess.Popen[bytes]
@@ -54,18 +54,18 @@ def screenshot(
     size: tuple[int, int] = (1600, 1000),
     progress: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
-    """Save the viewer's picture of a timeline, without its bar; needs no screen, only a Vulkan driver.
+    """Save the viewer's picture of a timeline, without its bar; needs only a Vulkan driver, no screen.
 
     Args:
         rrd: the timeline.
         png: the picture to write.
-        at_s: where the cursor stands, in seconds since the run's epoch; None is the middle.
+        at_s: time of the cursor in seconds since the run's epoch; None for the middle.
         size: width and height in pixels.
-        progress: is told what is being done.
+        progress: called with descriptions of the current step.
 
-    Returns what the views complain of, an empty list where all is well.
+    Returns the reports of errors in views; empty if there are none.
 
-    Raises BadInput where a file cannot be found or written, `at_s` is outside the run, or no Vulkan
+    Raises BadInput if a file cannot be found or written, if `at_s` is outside the run, or if no Vulkan
     driver is installed.
     """
     _require_timeline(rrd)
@@ -98,9 +98,9 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
 
     Args:
         rrd: the timeline.
-        at_s: where the cursor stands, in seconds since the run's epoch; None leaves that to the viewer.
+        at_s: time of the cursor in seconds since the run's epoch; None to leave it to the viewer.
 
-    Raises BadInput where there is no such file, no screen, or the viewer cannot run.
+    Raises BadInput if there is no such file or no screen, or if the viewer cannot run.
     """
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
@@ -123,11 +123,11 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
 
 
 def serve(rrd: Path, announce: Callable[[str], None]) -> None:
-    """Serve a timeline to browsers of this machine by Rerun's web viewer, until it is interrupted.
+    """Serve a timeline to browsers on this machine with Rerun's web viewer until it is interrupted.
 
     Args:
         rrd: the timeline.
-        announce: is told the page's address, as soon as it answers.
+        announce: called with the address of the page as soon as it answers.
 
     Raises BadInput if there is no such file, or the viewer ends.
     """
@@ -143,9 +143,9 @@ def serve(rrd: Path, announce: Callable[[str], None]) -> None:
 
 
 def view_inline(rrd: Path) -> None:
-    """Show a timeline in a notebook's cell, by the widget of the package rerun-notebook.
+    """Show a timeline in a notebook cell with the widget of the package rerun-notebook.
 
-    Raises BadInput where that is not installed, or there is no such file.
+    Raises BadInput if the package is not installed, or if there is no such file.
     """
     _require_timeline(rrd)
     try:
@@ -162,16 +162,16 @@ def view_inline(rrd: Path) -> None:
 
 
 def in_notebook() -> bool:
-    """Tell whether this process is the kernel of a notebook."""
+    """Test whether this process is the kernel of a notebook."""
     ipython = sys.modules.get("IPython")
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
 @contextmanager
 def listen(folder: Path, *options: str) -> Iterator[Listener]:
-    """Run `rerun OPTIONS` as a receiver on the loopback interface, at home in a folder of its own.
+    """Run `rerun OPTIONS` as a receiver on the loopback interface, with `folder` as its home directory.
 
-    Raises BadInput where it does not come up, or ends while it is still needed.
+    Raises BadInput if it does not start, or ends while it is still needed.
     """
     port = _free_port()
     address = ["--port", str(port), "--bind", "127.0.0.1"]
@@ -192,7 +192,7 @@ def listen(folder: Path, *options: str) -> Iterator[Listener]:
 def _running(
     folder: Path, options: Sequence[str], environment: Mapping[str, str]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `rerun OPTIONS`, which says what it has to say in a file of the folder."""
+    """Run `rerun OPTIONS` with its output in a file of the folder."""
     with (folder / _SAID).open("wb") as output:
         process = start_module(
             "fuselog.replay.timeline.keeper",
@@ -206,12 +206,15 @@ def _running(
     try:
         yield process
     finally:
-        process.stdin.close()  # which ends it
+        process.stdin.close()  # this ends the process
         process.wait()
 
 
 def _private_environment(folder: Path) -> dict[str, str]:
-    """Return folders of its own, usage reports off; the update check meets a proxy that is not there."""
+    """Return an environment with its own folders and without usage reports.
+
+    The viewer's check for updates fails, because the proxy for it does not exist.
+    """
     environment = {name: value for name, value in os.environ.items() if not _is_proxy(name)}
     for kind in ("CONFIG", "DATA", "CACHE"):
         environment[f"XDG_{kind}_HOME"] = str(folder / kind.lower())
@@ -247,7 +250,7 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
 
 
 def _ended(process: subprocess.Popen[bytes]) -> bool:
-    """Tell whether the process is at its end, or soon will be: its port closes before it is gone."""
+    """Test whether the process has ended or soon will; its port closes before it ends."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
     return process.poll() is not None

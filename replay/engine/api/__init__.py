@@ -1,4 +1,4 @@
-"""Makes estimators from plain functions, and defines what these are given and return.
+"""Estimators made from plain functions, and the types that these functions are given and return.
 
 Begin with `functions`.
 """

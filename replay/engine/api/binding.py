@@ -1,4 +1,4 @@
-"""Binds estimators from functions to the topics of a log, and says in words what they need of one."""
+"""Binding of estimators made from functions to the topics of a log, and their requirements in words."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
@@ -21,7 +21,7 @@ def bindings_by_name(
     topics: Mapping[str, Topic],
     _values: Parameters,
 ) -> Iterator[Binding]:
-    """Find topics by their names, under every prefix that has them."""
+    """Find topics by their names, under every prefix that has all required ones."""
     for prefix, found in bindings(topics, {**streams, **static}, optional):
         followed, needed = (
             {name: found[name] for name in names if name in found} for names in (streams, static)
@@ -31,7 +31,7 @@ def bindings_by_name(
 
 
 def requirements_of(asked: Mapping[str, Schema], optional: Collection[str]) -> str:
-    """Say what a log needs: the topics that are asked for, with their schemas."""
+    """Describe what a log needs: the requested topics with their schemas."""
     return ", ".join(
         f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
         for name, schema in asked.items()
@@ -39,7 +39,7 @@ def requirements_of(asked: Mapping[str, Schema], optional: Collection[str]) -> s
 
 
 def topics_of(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the topics that are followed, and of those that are static."""
+    """Return the names of the processed topics and of the static ones."""
     streams, static = (
         tuple(topic.name for topic in each.values()) for each in (bound.streams, bound.static)
     )
@@ -47,7 +47,7 @@ def topics_of(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def priors_of(bound: Binding) -> dict[str, Components]:
-    """Return by topic the components that are wanted of each prior."""
+    """Return the components wanted from each prior, by topic."""
     return {bound.static[name].name: components for name, components in bound.priors.items()}
 
 
@@ -59,7 +59,7 @@ def estimator_of(
     find: Find,
     bind_one: Callable[[str, Binding, ParametersType], Bound],
 ) -> Estimator[ParametersType]:
-    """Make the estimator that binds, one by one, what `find` finds."""
+    """Make an estimator that binds everything that `find` finds, one by one."""
 
     def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
         return [bind_one(f"{label}{each.suffix}", each, values) for each in find(label, topics, values)]

@@ -1,8 +1,9 @@
-"""Makes estimators from plain functions: binding, outputs and failures are the same for all of them.
+"""Estimators made from plain functions, with the same binding, outputs and failure handling for all.
 
-`recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
-`batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix
-that has them, name the outputs, and tell of a run that failed while the others go on.
+`recursive` makes an estimator from a function that processes the messages of one run in order; `batch`
+makes one from a function that solves whole streams. Both look up their topics under every prefix that
+has them (one estimator per robot, for example), name the outputs, and report a failed run while the
+other runs continue.
 """
 
 import copy
@@ -79,54 +80,58 @@ def recursive(
     compiled: bool = True,
     allocates: bool = True,
 ) -> Estimator[ParametersType]:
-    """Make an estimator that follows its messages in time.
+    """Make an estimator that processes its messages in time order.
 
     Args:
-        summary: what it is, in one line.
-        parameters: their type; without one there are none.
-        streams: the topics to follow, with their schemas; see `bindings` for their names.
-        static: the topics that `start` needs from beginning to end, such as a map or a prior. Gaussian
-            estimates among them are priors: of the estimate's components, see `Given.prior`.
-        find: in place of `streams` and `static`, where their names depend on the log or the parameters:
-            find(name, topics, parameters) gives a `Binding` for everything that can be estimated there;
-            none where the log does not fit. The name is the estimator's, for errors.
-        requirements: with `find`, what a log has to have, in words.
-        variant: the parameter that the rest of a name such as `shooter:bearings-only` sets.
-        components: the estimate's components by name, with their kinds.
-        truth: the topic with the truth of what is estimated.
-        measured: the components of the innovations, where `follow` fills them.
-        vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
-            does not state of them is refused; without an entry here vectors come as the log has them.
-        optional: which of `streams` and `static` a log may lack.
+        summary: one-line description of the estimator.
+        parameters: type of its parameters; without it, the estimator has no parameters.
+        streams: topics to process, with their schemas; see `bindings` for how their names are resolved.
+        static: topics that `start` needs as a whole, such as a map or a prior. Gaussian estimates among
+            them are priors with the components of the estimate; see `Given.prior`.
+        find: replaces `streams` and `static` if their names depend on the log or the parameters:
+            find(name, topics, parameters) returns a `Binding` for everything that can be estimated in
+            the log, and nothing if the log does not fit. The name is the estimator's, for error
+            messages.
+        requirements: with `find`, a description of what the log must contain.
+        variant: the parameter that is set by the second part of a name such as `shooter:bearings-only`.
+        components: components of the estimate by name, with their kinds.
+        truth: topic with the true values of the estimated quantities.
+        measured: components of the innovations, if `follow` fills them.
+        vectors: by topic of `streams`, the vector components to read. A log that does not state them is
+            refused; without an entry here, vectors are read as they are in the log.
+        optional: topics of `streams` and `static` that a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
-        draws: whether random numbers are drawn: `follow` then gets the run's own generator as its last
-            argument, `follow_all` those of all runs. It depends on the parameter `seed` and the run's
-            first message, not on other runs, blocks or cores.
-        start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
-            runs. A run has failed where its row in the first of them is not finite.
-        follow: follow(run, settings, messages, state, results) takes one run through a block of its
-            messages: it changes that run's rows of `state`, and fills `results`, in place.
-        follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
-            at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
-        advance: in place of both, where the outputs are other than one Gaussian estimate:
-            advance(settings, state, block) -> the state after a block, and the output streams, whose
-            topics are /estimates/ + `Given.name` and more. There are no `components` then; the state is
-            of any type, and is not changed.
-        out_of_sequence: with `advance`, for an estimator that goes back for late messages:
-            out_of_sequence(parameters, back_ns) gives what takes the place of `advance` where messages
-            come in the order of their arrival, and their stamps go back by up to so many nanoseconds.
-            Raises BadInput where the parameters do not let it go back.
-        finish: with `advance`: finish(settings, state) -> the output streams that waited for messages
-            which did not come any more, such as those that are smoothed.
+        draws: whether the estimator draws random numbers. `follow` then gets the generator of the run
+            as its last argument, and `follow_all` those of all runs. A generator depends on the
+            parameter `seed` and on the first message of the run, not on other runs, blocks or cores.
+        start: start(given) -> the settings and the initial state: a NamedTuple of arrays whose first
+            axis is the run. A run has failed if its row in the first of these arrays is not finite.
+        follow: follow(run, settings, messages, state, results) processes the messages of one run in a
+            block: it updates the rows of `state` that belong to the run and fills `results`, both in
+            place.
+        follow_all: replaces `follow`: follow_all(settings, messages, state, results) processes all runs
+            in one call and is called as given, for NumPy code with an axis of runs or for a loop that
+            is already compiled.
+        advance: replaces both if the output is not one Gaussian estimate: advance(settings, state,
+            block) -> the state after the block and the output streams, whose topics begin with
+            /estimates/ + `Given.name`. In that case there are no `components`; the state can be of any
+            type and must not be modified.
+        out_of_sequence: with `advance`, for an estimator that reprocesses out-of-sequence messages:
+            out_of_sequence(parameters, back_ns) returns the function that replaces `advance` if
+            messages come in order of arrival and their stamps go back by at most `back_ns` nanoseconds.
+            It raises BadInput if the parameters do not allow this.
+        finish: with `advance`: finish(settings, state) -> the output streams that were still waiting
+            for further messages when the log ended, such as smoothed estimates.
         compiled: whether `follow` is compiled; plain Python is a hundred times slower.
-        allocates: whether `follow` may make arrays, and call all that numba knows: numba, an extra,
-            compiles it. One that makes no arrays is compiled without numba, in a twentieth of the time,
-            see `fuselog.recorders.compiling.compile.compile_over_runs`.
+        allocates: whether `follow` may create arrays and call everything that numba supports; it is
+            then compiled by numba, an optional dependency. A function that creates no arrays is
+            compiled without numba in a twentieth of the time, see
+            `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     Returns:
-        The estimator, which `replay` takes.
+        The estimator, for `replay`.
 
-    The shortest range so far, of everything that was seen:
+    The shortest range so far, over all targets:
 
     >>> from fuselog.recorders.log import RunMetadata, make_stream, schemas
     >>> class Shortest(NamedTuple):
@@ -202,7 +207,7 @@ def recursive(
             return started(maps, next(iter(maps.values())).runs) if maps else None
 
         def begun(carried: _Carried | None, block: Block) -> _Carried:
-            # without static topics, the first block is what tells how many runs there are
+            # without static topics, the number of runs is known only from the first block
             return carried or started({}, len(block.events.offsets) - 1)
 
         def by(step: Advance, carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
@@ -258,9 +263,9 @@ def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
 
 
 def _drawn_on(generators: Generators, messages: Messages, parameters: AnyParameters) -> Generators:
-    """Copy the runs' generators for one block, since a block may have to be processed again.
+    """Copy the generators of the runs for one block, because a block may have to be processed again.
 
-    A run that has none yet gets one at its first message.
+    A run without a generator gets one at its first message.
     """
     return tuple(
         copy.deepcopy(generator)
@@ -292,25 +297,25 @@ def batch(
     """Make an estimator that solves whole streams.
 
     Args:
-        summary: what it is, in one line.
-        parameters: their type; without one there are none.
-        streams: the topics of measurements, within the span that is replayed, with their schemas.
-        static: the topics that are read whole, such as a map or a prior.
+        summary: one-line description of the estimator.
+        parameters: type of its parameters; without it, the estimator has no parameters.
+        streams: topics of measurements within the replayed span, with their schemas.
+        static: topics that are read as a whole, such as a map or a prior.
         find: as for `recursive`.
         requirements: as for `recursive`.
         variant: as for `recursive`.
-        components: the estimate's components by name, with their kinds.
-        truth: the topic with the truth of what is estimated.
-        measured: the components of the innovations, where `solve` gives them.
-        optional: which of `streams` and `static` a log may lack.
+        components: components of the estimate by name, with their kinds.
+        truth: topic with the true values of the estimated quantities.
+        measured: components of the innovations, if `solve` returns them.
+        optional: topics of `streams` and `static` that a log may lack.
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
-        solve: solve(given) gets the streams and static topics of all runs, by the names asked for;
-            `each_run` makes it of a function of one run. Where the outputs are other than Gaussian
-            estimates there are no `components`, and it returns the output streams, whose topics are
-            /estimates/ + `Given.name` and more.
+        solve: solve(given) gets the streams and static topics of all runs under the requested names;
+            `each_run` makes such a function from one that solves a single run. If the output is not a
+            Gaussian estimate, there are no `components`, and it returns the output streams, whose
+            topics begin with /estimates/ + `Given.name`.
 
     Returns:
-        The estimator, which `replay` takes.
+        The estimator, for `replay`.
 
     The mean of all ranges:
 
@@ -362,13 +367,14 @@ def batch(
 def each_run(
     solve: Callable[[OneRun, ParametersType], Estimates],
 ) -> Callable[[Given[ParametersType]], Solved]:
-    """Make a function that solves run by run, for `batch`, of one that solves a run.
+    """Make a function for `batch` that solves all runs from a function that solves one run.
 
-    Where `solve` raises, that run has failed; where all do, it is the input that is bad.
+    If `solve` raises for a run, that run has failed; if it raises for all runs, the first exception is
+    raised.
 
     Args:
-        solve: (streams, parameters) -> the estimates of a run. The streams go by name, and know more
-            of the run: `OneRun.prior`, `stated` and a `generator`.
+        solve: solve(streams, parameters) -> the estimates of a run. `streams` maps topic names to
+            streams, and has `OneRun.prior`, `stated` and a `generator` of the run.
 
     Returns:
         The function, for the argument `solve` of `batch`.
@@ -396,9 +402,10 @@ def each_run(
 
 
 class _Carried(NamedTuple):
-    """Holds what a recursion carries from block to block; `reported` (runs,): whose failure was.
+    """State that a recursion carries from block to block; `reported` (runs,) marks reported failures.
 
-    A run's generator is None until there is a message, or where none is wanted.
+    A generator is None before the first message of its run, and if the estimator draws no random
+    numbers.
     """
 
     settings: Carried

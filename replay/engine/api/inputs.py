@@ -1,4 +1,4 @@
-"""Defines what estimators from plain functions are given: streams, one run, a block's messages."""
+"""Types that the functions of an estimator are given: streams, a single run, the messages of a block."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,19 +22,20 @@ from fuselog.replay.engine.vectors.components import Components
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# What else the functions of an estimator get, and their parameters: of the estimator's own types.
+# Further data for the functions of an estimator, and their parameters: the estimator defines both types.
 Setup = Any  # type: ignore[explicit-any]
 AnyParameters = Any  # type: ignore[explicit-any]
 
 
 class Binding(NamedTuple):
-    """Says what one estimator is bound to, where a log may have several.
+    """Topics that one estimator is bound to; a log may have several bindings.
 
     Attributes:
-        streams, static: the topics by the names under which its functions know them, see `recursive`.
-        suffix: what its name ends with, such as `/robot1`.
-        priors: the components wanted of the static topics that are Gaussian priors, by the same names.
-        setup: what else its functions get, as `Given.setup`.
+        streams, static: the topics by the names that the functions use for them, see `recursive`.
+        suffix: the end of the estimator's name, such as `/robot1`.
+        priors: components that are wanted of the static topics that are Gaussian priors, by the same
+            names.
+        setup: further data for the functions, as `Given.setup`.
     """
 
     streams: Mapping[str, Topic]
@@ -46,17 +47,17 @@ class Binding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Given(Mapping[str, Ragged], Generic[ParametersType]):
-    """Holds what is given of all runs; topics go by the names under which an estimator asked for them.
+    """Input of all runs, by the topic names that the estimator's functions use.
 
-    It maps the static topics to their streams: of a recursion what it starts from, of a batch
-    all. A topic that is optional and that the log lacks is not in it.
+    As a mapping, it maps the names of static topics to their streams: for a recursion those that it
+    starts from, for a batch estimator all topics. An optional topic that the log lacks is not a key.
 
     Attributes:
-        parameters: the estimator's.
-        topics: all that it is bound to.
-        static: see above.
-        runs: how many.
-        name: the estimator's, with the suffix of its binding.
+        parameters: the estimator's parameters.
+        topics: all topics that the estimator is bound to.
+        static: the streams, see above.
+        runs: number of runs.
+        name: the estimator's name, with the suffix of its binding.
         setup: see `Binding`.
     """
 
@@ -68,30 +69,30 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     setup: Setup = None
 
     def stated(self, topic: str, name: str) -> float:
-        """Return the parameter `name`, or where it is None the number that `topic`'s channel states.
+        """Return the parameter `name`, or, if it is None, the number that the channel of `topic` states.
 
-        Raises BadInput where neither does.
+        Raises BadInput if neither has a value.
         """
         return given_or_stated(self.parameters, [self.topics[topic]], name)
 
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
-        """Return each run's prior of `topic`: stamps (runs,), means (runs, d), covariances (runs, t, t).
+        """Return the priors on `topic`: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
-        They are of the estimate's components, in their order, whatever the log's order is. NaN where a
-        run has none that can be used: it has failed, and gets no messages.
+        The components are those of the estimate, in its order, regardless of the order in the log. The
+        numbers are NaN for a run without a usable prior: that run has failed and gets no messages.
         """
         return gaussians(self.static[topic])
 
     def __getitem__(self, topic: str) -> Ragged:
-        """Return a static topic, all runs end to end."""
+        """Return the stream of the static topic `topic`, all runs end to end."""
         return self.static[topic]
 
     def __iter__(self) -> Iterator[str]:
-        """Return the names of what is given."""
+        """Iterate over the names of the given topics."""
         return iter(self.static)
 
     def __len__(self) -> int:
-        """Count how many topics are given."""
+        """Return the number of given topics."""
         return len(self.static)
 
 
@@ -100,53 +101,53 @@ AnyGiven = Given[Any]  # type: ignore[explicit-any]
 
 @dataclass(frozen=True, eq=False)
 class OneRun(Mapping[str, Stream]):
-    """Holds what is given of one run, stream by stream; see `Given` and `each_run`.
+    """Input of one run as a mapping from topic names to streams; see `Given` and `each_run`.
 
     Attributes:
-        given: what is given of all runs.
-        run: its number among them.
+        given: the input of all runs.
+        run: the number of this run.
     """
 
     given: AnyGiven
     run: int
 
     def stated(self, topic: str, name: str) -> float:
-        """Return the parameter `name`, or what the channel of `topic` states; see `Given.stated`."""
+        """Return the parameter `name`, or what `topic`'s channel states; see `Given.stated`."""
         return self.given.stated(topic, name)
 
     def prior(self, topic: str) -> tuple[int, Floats, Floats]:
-        """Return the run's prior of `topic`: stamp, mean (d,), covariance (t, t); see `Given.prior`."""
+        """Return the run's prior on `topic`: stamp, mean (d,), covariance (t, t); see `Given.prior`."""
         stream = self[topic]
         time_ns, mean, covariance = gaussians(Ragged(stream, np.array([0, len(stream)])))
         return int(time_ns[0]), mean[0], covariance[0]
 
     @cached_property
     def generator(self) -> np.random.Generator:
-        """Make the run's own generator, from the parameter `seed` and the first messages of its streams.
+        """Make the run's random generator from the parameter `seed` and its first messages.
 
-        So it is the same on any number of cores, and whatever other runs there are.
+        The generator therefore depends neither on the number of cores nor on the other runs.
         """
         first = [column[:1] for stream in self.values() for column in stream.columns.values()]
         return generator_of(self.given.parameters, first)
 
     def __getitem__(self, topic: str) -> Stream:
-        """Return a topic's messages of this run."""
+        """Return the messages of `topic` in this run."""
         return self.given[topic].of_run(self.run)
 
     def __iter__(self) -> Iterator[str]:
-        """Return the names of what is given."""
+        """Iterate over the names of the given topics."""
         return iter(self.given)
 
     def __len__(self) -> int:
-        """Count how many topics are given."""
+        """Return the number of given topics."""
         return len(self.given)
 
 
 def generator_of(parameters: AnyParameters, first: Iterable[AnyArray]) -> np.random.Generator:
-    """Return a counter-based generator (Philox), keyed by a seed and a run's first data.
+    """Make a counter-based random generator (Philox), keyed by a seed and the first data of a run.
 
     Args:
-        parameters: with a `seed`.
+        parameters: the estimator's parameters; their `seed` is used, or 0 if they have none.
         first: arrays of the run's first messages.
     """
     key = run_key(getattr(parameters, "seed", 0), first)
@@ -154,14 +155,14 @@ def generator_of(parameters: AnyParameters, first: Iterable[AnyArray]) -> np.ran
 
 
 class Messages(NamedTuple):
-    """Holds the messages of all runs in time order: run r owns the rows offsets[r]:offsets[r + 1].
+    """Messages of all runs in time order: rows offsets[r]:offsets[r + 1] belong to run r.
 
     Attributes:
-        offsets: (runs + 1,).
-        time_ns: (n,).
-        topic: (n,) which stream, in the order in which they were asked for.
-        value: (n, width) the fields after the sensor's clock, in order of declaration; NaN beyond. Of
-            vectors there are the components that were asked for, in that order.
+        offsets: (runs + 1,) first row of each run, and the total number of rows.
+        time_ns: (n,) stamps.
+        topic: (n,) index of the stream, in the order in which the streams were requested.
+        value: (n, width) the fields after the sensor's clock, in order of declaration, padded with NaN.
+            Vectors contribute only the requested components, in the requested order.
     """
 
     offsets: Integers
@@ -171,7 +172,7 @@ class Messages(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """Holds messages that were not used: offsets by run, stamps, and the number of each's reason."""
+    """Messages that were not used: offsets by run, stamps, and for each the index of its reason."""
 
     offsets: Integers
     time_ns: Integers
@@ -182,12 +183,12 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: AnyParameters
 ) -> tuple[Messages, Skipped]:
-    """Return a block's messages, their fields as numbers; and those that lack a covariance.
+    """Extract the messages of a block, their fields as numbers, and those that lack a covariance.
 
     Args:
-        block: of all runs.
-        vectors: the vectors that are wanted of topics, by name.
-        parameters: the estimator's.
+        block: messages of all runs.
+        vectors: by topic, the vectors to read.
+        parameters: the estimator's parameters.
     """
     events = block.events
     read = [
@@ -200,7 +201,7 @@ def messages_of(
     skipped = Skipped(
         ragged_rows(skip, events.offsets), events.time_ns[skip], events.topic[skip], reasons
     )
-    # the messages of one topic are in order already
+    # the messages of a single topic are already in order
     value = tables[0] if len(tables) == 1 else _side_by_side(tables)[events.source]
     rows = ~skip if skip.any() else slice(None)
     kept = Messages(
@@ -213,7 +214,7 @@ def messages_of(
 
 
 def _side_by_side(tables: Sequence[Floats]) -> Floats:
-    """Lay tables one after another, NaN where one has fewer columns than the widest."""
+    """Stack tables of different widths vertically, padded with NaN to the widest."""
     width = max(table.shape[1] for table in tables)
     found = np.full((sum(map(len, tables)), width), np.nan)
     for begin, table in zip(np.cumsum([0, *map(len, tables)]), tables, strict=False):

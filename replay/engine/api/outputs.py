@@ -1,4 +1,4 @@
-"""Defines what estimators from plain functions fill or return, and makes output topics of it."""
+"""Types that the functions of an estimator fill or return, and the output topics made from them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,18 +28,19 @@ DIVERGED = "the estimate is no longer finite: the filter diverged"
 
 
 class Results(NamedTuple):
-    """Holds what a recursion fills, one row for every message; a row of NaN is none.
+    """Arrays that a recursion fills, one row for every message; a row of NaN means no value.
 
     Attributes:
         mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
-            space (see `fuselog.replay.engine.vectors.tangent`), d where all are linear or angles.
-        innovation, innovation_covariance: (n, m), (n, m, m) of the message.
-        squared: (n,) the normalised innovation squared. With the two above the message has a likelihood,
-            by which `tune` and `diagnose` go.
-        accepted: (n,) whether a gate let the message in; 1 unless set.
-        target: (n,) what the message was about; 0 unless set.
-        further: (n, k) the fields of the further outputs that were named, after the sensor's clock, side
-            by side in order; an output has a message where its first field is a number.
+            space (see `fuselog.replay.engine.vectors.tangent`), d of them if all are linear or angles.
+        innovation, innovation_covariance: (n, m), (n, m, m) the innovation of the message and its
+            covariance.
+        squared: (n,) the normalised innovation squared. Together with the two above it gives the
+            likelihood of the message, which `tune` and `diagnose` use.
+        accepted: (n,) whether a gate accepted the message; 1 unless set.
+        target: (n,) identifier of the target that was measured; 0 unless set.
+        further: (n, k) the fields of the further outputs after the sensor's clock, side by side in
+            order of declaration; an output has a message if its first field is finite.
     """
 
     mean: Floats
@@ -53,13 +54,13 @@ class Results(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Describes how the solutions ended, (n,) each; the cost is what was minimised.
+    """Convergence statistics of the solutions, (n,) each.
 
     Attributes:
-        iterations: how many there were.
-        converged: 1 where the solver converged, else 0.
-        rank: of the Jacobian at the solution.
-        cost: what was minimised.
+        iterations: number of iterations.
+        converged: 1 if the solver converged, otherwise 0.
+        rank: rank of the Jacobian at the solution.
+        cost: the minimised cost at the solution.
     """
 
     iterations: Integers
@@ -69,7 +70,7 @@ class Solution(NamedTuple):
 
 
 class Diagnostics(NamedTuple):
-    """Holds numbers that a batch gives beside its estimates: stamps (n,), and columns of a schema.
+    """Additional numbers that a batch estimator returns: stamps (n,) and the columns of a schema.
 
     Attributes:
         time_ns: (n,), the stamps.
@@ -81,13 +82,13 @@ class Diagnostics(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Holds innovations of a batch's measurements.
+    """Innovations of the measurements of a batch estimator.
 
     Attributes:
         time_ns: (n,), the stamps.
         innovation: (n, m), measured minus predicted.
-        covariance: (n, m, m), those of the innovations.
-        target: (n,), what each was about; 0 unless given.
+        covariance: (n, m, m), the covariances of the innovations.
+        target: (n,), identifiers of the measured targets; 0 if not given.
     """
 
     time_ns: Integers
@@ -97,13 +98,13 @@ class Measured(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """Holds what one run's streams were solved to.
+    """Solution of one run.
 
     Attributes:
         time_ns, mean, covariance: stamps (n,), means (n, d), covariances (n, t, t).
-        solution: how it ended.
-        innovations: of the measurements, where the batch names what is `measured`.
-        further: by name, the batch's further `outputs`.
+        solution: convergence statistics.
+        innovations: innovations of the measurements, if the batch estimator declares `measured`.
+        further: the further `outputs` of the batch estimator, by name.
     """
 
     time_ns: Integers
@@ -115,11 +116,11 @@ class Estimates(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Holds the estimates by run, and the failures; a run that failed has no estimates.
+    """Estimates and failures of the runs; a failed run has no estimates.
 
     Attributes:
         estimates: by the number of the run.
-        failures: when and why a run failed, likewise.
+        failures: time and reason of each failure, by the number of the run.
     """
 
     estimates: Mapping[int, Estimates]
@@ -128,7 +129,7 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True)
 class Outputs:
-    """Makes the output topics of one bound estimator: state, failures and innovations."""
+    """Builder of the output topics of one bound estimator: state, failures and innovations."""
 
     name: str
     topic: str
@@ -139,11 +140,11 @@ class Outputs:
 
     @property
     def tangent(self) -> int:
-        """Count how many components the tangent space has."""
+        """Return the number of components of the tangent space."""
         return len(tangent_components(list(self.components), list(self.components.values())))
 
     def blank(self, rows: int) -> Results:
-        """Return results that are all NaN."""
+        """Return results of `rows` rows that are all NaN, accepted and of target 0."""
         d, t, m = len(self.components), self.tangent, len(self.measured)
         width = sum(len(schema.fields) - 1 for schema in self.further.values())
         return Results(
@@ -158,8 +159,8 @@ class Outputs:
         )
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
-        """Return the outputs of one block; of several estimates at a stamp the last stands."""
-        # what is said of a covariance that is none is for the replay to find
+        """Make the output streams of one block; the last of several estimates at a stamp is kept."""
+        # invalid covariances are found and reported by the replay
         is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
         rows = np.flatnonzero(is_estimate)
         rows = rows[last_of_equals(np.searchsorted(rows, messages.offsets), messages.time_ns[rows])]
@@ -180,7 +181,7 @@ class Outputs:
         return [*made, *self._further_of_block(messages, results.further)]
 
     def of_skipped(self, skipped: Skipped) -> list[Ragged]:
-        """Return what was not used, for estimators of what may lack a covariance."""
+        """Make the stream of skipped messages for measurements without a covariance."""
         if not any(skipped.reasons):
             return []
         topic = f"{self.topic}/skipped"
@@ -188,7 +189,7 @@ class Outputs:
         return [Ragged(stream, skipped.offsets)]
 
     def of_solved(self, solved: Solved, runs: int) -> list[Ragged]:
-        """Return the outputs of a batch."""
+        """Make the output streams of a batch estimator."""
         made = [failures_by_run(self.topic, solved.failures, runs)]
         parts: dict[str, dict[int, Stream]] = {}
         for run, estimates in solved.estimates.items():
@@ -228,7 +229,7 @@ class Outputs:
             yield Ragged(stream, np.searchsorted(rows, messages.offsets))
 
     def _of_run(self, estimates: Estimates) -> Iterator[Stream]:
-        """Make the output streams of one run; raises BadInput where a shape is wrong."""
+        """Yield the output streams of one run; raise BadInput if an array has a wrong shape."""
         time_ns, mean, covariance = self._checked(
             "", estimates[:3], ((), (len(self.components),), (self.tangent,) * 2)
         )
@@ -268,7 +269,7 @@ class Outputs:
     def _checked(
         self, part: str, arrays: Sequence[Columns], shapes: Sequence[tuple[int, ...]]
     ) -> tuple[Integers, Floats, Floats]:
-        """Return stamps, means and covariances as arrays; raises BadInput where a shape is wrong."""
+        """Convert stamps, means and covariances to arrays; raise BadInput if a shape is wrong."""
         time_ns, mean, covariance = (np.asarray(array) for array in arrays)
         names = ("time_ns", "innovation" if part else "mean", "covariance")
         for name, array, shape in zip(names, (time_ns, mean, covariance), shapes, strict=True):

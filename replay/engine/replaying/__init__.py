@@ -1,4 +1,4 @@
-"""Replays: takes estimators through messages, in order or late, and monitors their runs.
+"""Replay of messages through estimators, in time order or in order of arrival, and monitoring of runs.
 
 Begin with `replaying`.
 """

@@ -1,8 +1,9 @@
-"""Finds which topic each innovation is of, where an estimator takes several: the same stamp tells.
+"""Assignment of innovations to topics by their stamps, for estimators that use several topics.
 
-Innovations do not say it. Where messages of several topics have one stamp, and as many innovations have
-it, these are of them in the order of the file. Where they are fewer or more, or have another stamp, as
-those of an estimator that shifts its messages by their delay, the topics are counted together.
+Innovations do not state their topic. If messages of several topics have the same stamp, and the same
+number of innovations has it, the innovations belong to these messages in the order of the file. If the
+numbers differ, or innovations have other stamps, as from an estimator that shifts its messages by their
+delay, the topics are counted together.
 """
 
 from collections import Counter
@@ -17,12 +18,12 @@ from fuselog.recorders.log import Clock
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 
 Integers = NDArray[np.int64]
-# Messages that no innovation has passed, of a run that ended, are let go from so many on.
+# The most messages kept for later innovations; a run that has ended gives none for its last ones.
 MOST_WAITING = 1 << 18
 
 
 class _Messages(NamedTuple):
-    """Holds messages (n,): of which run, when, the place in its file, the number of the topic."""
+    """Messages (n,): their run, stamp, position in the file and index of the topic."""
 
     run: Integers
     time_ns: Integers
@@ -32,11 +33,11 @@ class _Messages(NamedTuple):
 
 @dataclass
 class Attribution:
-    """Counts innovations by topic, for one estimator.
+    """Counts of the innovations of one estimator by topic.
 
     Attributes:
-        used, gated: how many were taken, and how many refused, by topic.
-        is_known: whether every innovation was of one topic.
+        used, gated: numbers of accepted and rejected innovations, by topic.
+        is_known: whether every innovation could be assigned to one topic.
     """
 
     used: Counter[str] = field(default_factory=Counter)
@@ -46,7 +47,7 @@ class Attribution:
     _topics: list[str] = field(default_factory=list)
 
     def note_given(self, streams: Mapping[str, Ragged], order: Clock) -> None:
-        """Take in a block of measurements; all blocks have the same topics."""
+        """Add a block of measurements; all blocks have the same topics."""
         if not self.is_known or not streams:
             return
         self._topics = list(streams)
@@ -87,12 +88,12 @@ class Attribution:
         self._waiting = [_Messages(*(column[left] for column in there))]
 
     def end(self, *, is_known: bool = True) -> None:
-        """Let go of the messages that no innovation has passed."""
+        """Discard the messages that still wait for innovations."""
         self.is_known &= is_known
         self._waiting.clear()
 
     def merge(self, other: "Attribution") -> None:
-        """Take in what was counted over other runs."""
+        """Add the counts of other runs."""
         self.used.update(other.used)
         self.gated.update(other.gated)
         self.is_known &= other.is_known
@@ -105,7 +106,7 @@ def _joined(parts: list[_Messages]) -> _Messages:
 
 
 def _topic_of(there: _Messages, run: Integers, time_ns: Integers) -> Integers | None:
-    """Return the number (n,) of the topic that each innovation is of; None where not known of all."""
+    """Return the index (n,) of each innovation's topic; None if it is not known for all of them."""
     stamps, stamp = np.unique(np.concatenate([there.time_ns, time_ns]), return_inverse=True)
     of_run = np.concatenate([there.run, run]) * len(stamps) + stamp
     moments, moment = np.unique(of_run, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Measures for how much of each run a case was estimated, from the stamps of its estimates."""
+"""Share of each run for which a case was estimated, computed from the stamps of its estimates."""
 
 import math
 from functools import cached_property
@@ -14,15 +14,15 @@ Integers = NDArray[np.int64]
 
 
 class Coverage:
-    """Counts the intervals between a case's estimates, run by run, in bins of factors of two.
+    """Counts of the intervals between a case's estimates, by run, in bins that double in length.
 
-    Intervals much longer than the usual one, and than a second, are gaps. The last block is counted
-    when somebody asks.
+    Intervals much longer than both the median and a second are gaps. The last block is counted only
+    when a result is requested.
     """
 
     BINS = 64
     SECOND = 30  # the bin of intervals about one second long, 2^30 ns
-    GAP = 4  # a gap is this many bins beyond the median: 8 to 32 times as long
+    GAP = 4  # a gap is more than this many bins above the median: at least 8 to 32 times as long
 
     def __init__(self, topic: str, starts_ns: Integers) -> None:
         self.topic = topic
@@ -32,7 +32,7 @@ class Coverage:
         self._last_block: tuple[Integers, ...] = ()
 
     def note(self, estimates: Ragged) -> None:
-        """Take in the stamps of a block."""
+        """Add the stamps of a block."""
         self._count()
         offsets, time_ns = estimates.offsets, estimates.stream.publish_time_ns
         self._last_block = offsets, time_ns, self.last_ns
@@ -43,15 +43,15 @@ class Coverage:
 
     @cached_property
     def _counts(self) -> Integers:
-        """Hold how many intervals there are in a bin, of all runs side by side.
+        """Return the number of intervals in each bin and run (BINS, runs).
 
-        Most runs use one or two bins, and the rest is never touched.
+        Most runs use one or two bins; the memory of the others is never touched.
         """
         return np.zeros((self.BINS, self._runs), np.int64)
 
     @cached_property
     def _sums_ns(self) -> Floats:
-        """Hold how long these are together."""
+        """Return the total length of the intervals in each bin and run (BINS, runs)."""
         return np.zeros((self.BINS, self._runs))
 
     def _count(self) -> None:
@@ -61,20 +61,20 @@ class Coverage:
             self._last_block = ()
 
     def estimated_s(self) -> Floats:
-        """Compute for how long (runs,) there were estimates, gaps left out."""
+        """Compute for how long (runs,) there were estimates, excluding gaps."""
         self._count()
         is_gap = np.arange(self.BINS)[:, None] > self._longest()
         seconds: Floats = np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
         return seconds
 
     def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
-        """Tell whether the time (runs,) since each run's last estimate is a gap."""
+        """Test whether the time (runs,) from each run's last estimate to `now_ns` is a gap."""
         since_ns = now_ns - self.last_ns
         missed: NDArray[np.bool_] = since_ns >= 2 << self.SECOND
         return missed & (_bin_of(since_ns) > self._longest()) if missed.any() else missed
 
     def _longest(self) -> Integers:
-        """Return the bin (runs,) of the longest intervals that are no gaps."""
+        """Return the bin (runs,) of the longest intervals that are not gaps."""
         self._count()
         reached = np.cumsum(self._counts, axis=0)
         median = np.argmax(2 * reached >= reached[-1], axis=0)
@@ -95,15 +95,16 @@ def count_intervals(
     counts: Integers,
     sums_ns: Floats,
 ) -> None:
-    """Take in the stamps of a run; see `Coverage`.
+    """Count the intervals between the stamps of a run; see `Coverage`.
 
     Args:
-        run: which.
-        offsets: (runs + 1,) of the stamps.
+        run: number of the run.
+        offsets: (runs + 1,) first stamp of each run.
         time_ns: (n,) the stamps.
-        before_ns: (runs,) the last one before these; negative where there is none.
-        counts: (BINS, runs) of the intervals of every bin, how many there are.
-        sums_ns: (BINS, runs) and their sum, exact up to 2^53 ns, a hundred days.
+        before_ns: (runs,) the last stamp before these; negative if there is none.
+        counts: (BINS, runs) number of intervals in each bin, updated.
+        sums_ns: (BINS, runs) total length of these intervals, updated; exact up to 2^53 ns, a hundred
+            days.
     """
     last_ns = before_ns[run]
     for row in range(offsets[run], offsets[run + 1]):

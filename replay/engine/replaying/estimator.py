@@ -1,9 +1,9 @@
-"""Defines an estimator as a replay sees it: its parameters, its topics, and how it is called.
+"""Estimators as the replay uses them: their parameters, their topics, and how they are called.
 
-An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
-the blocks of its topics one after another and carries a state from block to block; a batch one gets
-whole streams and is done. The same call serves one run and many, so an ensemble's results are those of
-the runs replayed one by one, bit for bit.
+An estimator is bound to topics and turns ragged streams into ragged streams. A recursive estimator gets
+the blocks of its topics one after another and carries a state from block to block; a batch estimator
+gets whole streams. One run and many use the same call, so the results of an ensemble equal those of its
+runs replayed one by one, bit for bit.
 """
 
 import re
@@ -30,7 +30,7 @@ from fuselog.replay.engine.vectors.components import Components
 
 
 class Initialized(NamedTuple):
-    """Holds what the first messages of a log give: static topics to start from, and output streams."""
+    """Result of an initialization: static topics to start from, and output streams."""
 
     static: dict[str, Ragged]
     outputs: list[Ragged]
@@ -38,16 +38,16 @@ class Initialized(NamedTuple):
 
 @dataclass(frozen=True)
 class Initialization:
-    """Describes how an estimator finds what a log does not state, such as where to begin.
+    """Method by which an estimator finds what a log does not state, such as the initial state.
 
     Attributes:
-        topics: those whose first messages it is handed.
-        find: (first messages, the static topics, clock) -> what there is to start
-            from; by the clock by which the replay stamps estimates.
-        find_broad: (first messages, the static topics, clock, a stamp for each run) -> the equally
-            likely starts of all runs there, so broad that no parameter counts: likelihoods with other
-            parameters, or of the log without a fault, are compared over these. None for what `find`
-            finds.
+        topics: topics whose first messages it is given.
+        find: find(first messages, static topics, clock) -> what the estimator starts from; the clock is
+            the one by which the replay stamps estimates.
+        find_broad: find_broad(first messages, static topics, clock, a stamp for each run) -> the
+            equally likely starts of all runs there, so broad that parameters have no influence on them:
+            likelihoods with other parameters, or of a log without a fault, are compared from these
+            starts. None if `find` is used instead.
     """
 
     topics: tuple[str, ...]
@@ -58,30 +58,30 @@ class Initialization:
     ) = None
 
 
-NEEDED_MESSAGES = 4096  # that are read at once, until one has a value that is needed
+NEEDED_MESSAGES = 4096  # read at a time, until a message has a needed value
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Describes what an estimator reads of its topics and parameters, as its model's functions do.
+    """What an estimator reads of its topics and parameters, as the functions of its model do.
 
     Attributes:
-        controls: the topics that drive it.
-        kinds: by topic, the kinds of the numbers that it reads of a message: controls, or what is
-            measured.
-        measured: by topic of a sensor, the names of these numbers, as innovations have them.
-        numbers: stream of one of these topics -> these numbers (n, m); NaN where one is missing.
-        noises: parameters that are standard deviations of noise, with the topic of the sensor whose it
-            is; "" for that of the motion.
-        augmentable: parameters that may be estimated beside the state, each with its kind and the
-            topics of what reads it, "" for the motion.
-        biases, factors: by topic and the place of a number, the parameter that is added to it, or that
-            it is multiplied by: to a control, or to what is measured.
-        delays: by topic, the parameter that says how late its messages are.
-        calibration: parameters that say how its sensors are mounted, scaled, biased and delayed, each
-            with a useful standard deviation.
-        control_noise: how long a message of a control holds, in s -> by topic and the place of a number,
-            the variance that the model states of it; nothing if it states none.
+        controls: topics that drive the motion.
+        kinds: by topic, the kinds of the numbers that it reads from a message: controls or measured
+            components.
+        measured: by topic of a sensor, the names of these numbers, as used for innovations.
+        numbers: numbers(stream of one of these topics) -> these numbers (n, m); NaN if one is missing.
+        noises: parameters that are standard deviations of noise, each with the topic of its sensor, or
+            "" for the motion.
+        augmentable: parameters that can be estimated together with the state, each with its kind and
+            the topics of the sensors that read it ("" for the motion).
+        biases, factors: by topic and index of a number, the parameter that is added to it or multiplies
+            it; the number is a control or a measured component.
+        delays: by topic, the parameter that is the delay of its messages.
+        calibration: parameters of the mounting, scale, bias and delay of its sensors, each with a
+            useful standard deviation.
+        control_noise: control_noise(time in s for which a control message holds) -> by topic and index
+            of a number, the variance that the model states; empty if it states none.
     """
 
     controls: tuple[str, ...]
@@ -97,18 +97,18 @@ class Reading:
     control_noise: Callable[[float], Mapping[tuple[str, int], float]]
 
 
-# What a recursion carries from block to block: its own.
+# The state that a recursion carries from block to block; its type is up to the recursion.
 Carried = Any  # type: ignore[explicit-any]
-# What a parameter is set to: a number, a text, a list or a table.
+# The value of a setting: a number, a string, a list or a table.
 Setting = Any  # type: ignore[explicit-any]
 
 
 class Needed(NamedTuple):
-    """States that a field needs a value in some message of a topic, which its layout does not tell.
+    """Requirement that some message of a topic has a value of a field; the layout does not show this.
 
     Attributes:
-        field: its name.
-        refusal: the sentence if no message has a value of it.
+        field: name of the field.
+        refusal: error message if no message has a value of it.
     """
 
     field: str
@@ -116,13 +116,13 @@ class Needed(NamedTuple):
 
 
 class Alike(NamedTuple):
-    """Describes bound estimators that differ only in numbers, which may go through runs together.
+    """Description of bound estimators that differ only in numbers and can process runs together.
 
     Attributes:
-        key: equal for those that may.
-        numbers: those of this estimator.
-        together: the numbers of each run -> the estimator in which each run has numbers of its own. An
-            initialization must not depend on them.
+        key: equal for estimators that can be combined.
+        numbers: the numbers of this estimator.
+        together: together(numbers of each run) -> an estimator in which each run has its own numbers.
+            An initialization must not depend on them.
     """
 
     key: Hashable
@@ -133,36 +133,36 @@ class Alike(NamedTuple):
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True, eq=False)
 class Recursive:
-    """Describes an estimator that goes through its topics in time.
+    """Bound estimator that processes its topics in time order.
 
     Attributes:
-        name: what its output topics begin with, `/estimates/` + name.
-        streams: the topics that `run` is handed, in the order its `Events.topic` counts them.
-        static: the topics that `start` needs from beginning to end, such as a map or a prior.
-        start: static topics -> the state before the first block.
-        run: state and block -> the state after it, and the output streams. States are values: `run`
-            never changes the one it is handed.
-        priors: the static topics that are Gaussian priors, and the components that are wanted of each.
-            `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
+        name: its output topics begin with `/estimates/` + name.
+        streams: topics that `run` gets, in the order of the indices in `Events.topic`.
+        static: topics that `start` needs as a whole, such as a map or a prior.
+        start: start(static topics) -> the state before the first block.
+        run: run(state, block) -> the state after the block, and the output streams. `run` never
+            modifies the state that it is given.
+        priors: static topics that are Gaussian priors, and the components wanted from each. `start`
+            gets one message of each for every run, with these components, NaN if the run cannot start;
             see `fuselog.replay.engine.streams.priors`.
         given: static topics that are not read from the runs, see `fuselog.pipeline.runs.initial_states`.
-        finish: the state after the last block -> the outputs that waited for messages which did not
-            come any more.
-        parameters: those that it was bound with, defaults included.
-        out_of_sequence: the same estimator for a block's messages in the order in which they came, whose
-            stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
-            where its parameters do not let it.
-        initialization: how it finds what a log does not state; None where that states all.
-        assumed: the parameters that are assumed, since the log does not state them.
-        is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
-            parameters.
-        offers: by topic that it does not take, the setting with which it would.
-        reading: what it reads; None where that is not known.
+        finish: finish(state after the last block) -> the outputs that were still waiting for further
+            messages.
+        parameters: its parameters, including defaults.
+        out_of_sequence: out_of_sequence(nanoseconds) -> the same estimator for messages in order of
+            arrival whose stamps go back by at most this time; None if it cannot reprocess messages. It
+            raises BadInput if the parameters do not allow this.
+        initialization: how it finds what a log does not state; None if the log states everything.
+        assumed: values of the parameters that are assumed, because the log does not state them.
+        is_random: whether it draws random numbers, so that its likelihood is not a smooth function of
+            its parameters.
+        offers: by topic that it does not use, the setting that would make it use the topic.
+        reading: what it reads; None if that is not known.
         needed: by topic, a field without which it does not fit a log.
-        truth: the topic by which its estimates are judged, which it must not read.
-        is_bound: whether it is a bound of estimates, which may read the truth.
-        alike: how it goes through runs together with others that differ only in numbers; None if it
-            cannot.
+        truth: topic against which its estimates are judged, and which it must not read.
+        is_bound: whether it computes a bound instead of estimates; a bound may read the truth.
+        alike: how it processes runs together with other estimators that differ only in numbers; None if
+            it cannot.
     """
 
     name: str
@@ -189,20 +189,20 @@ class Recursive:
 @renamed(whole="static")
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Describes an estimator that needs everything at once: `solve` turns its topics into outputs.
+    """Bound estimator that needs its topics as a whole.
 
-    `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
+    `streams` are the measurements within the replayed span; everything else is as for `Recursive`.
 
     Attributes:
         name: the label, and what is estimated.
         streams: topics of measurements.
-        static: topics that are read whole.
-        solve: streams by topic, of all runs -> outputs.
+        static: topics that are read as a whole.
+        solve: solve(streams of all runs by topic) -> the output streams.
         priors: topics of priors, with their components.
-        given: streams that the replay hands it beside those of the log.
-        parameters: as it was bound with.
+        given: streams that the replay passes in addition to those of the log.
+        parameters: its parameters, including defaults.
         needed: by topic, a field without which it does not fit a log.
-        truth: the topic by which its estimates are judged, which it must not read.
+        truth: topic against which its estimates are judged, and which it must not read.
     """
 
     name: str
@@ -222,16 +222,16 @@ Bound = Recursive | Batch
 @renamed(needs="requirements")
 @dataclass(frozen=True)
 class Estimator(Generic[ParametersType]):
-    """Describes an estimator: what it is, its parameters, and how it binds to the topics of a log.
+    """Registered estimator: its description, its parameters, and how it binds to the topics of a log.
 
     Attributes:
-        summary: what it is, in a line.
-        requirements: what it needs of a log, in a line.
-        parameters: the type of its parameters.
-        bind: (name, topics, parameters) -> one bound estimator for everything that it can estimate in a
-            log of these topics (each robot, say); none where the log does not fit.
-        variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
-        label: what it is called where it is given without one.
+        summary: one-line description.
+        requirements: what a log must contain, in one line.
+        parameters: type of its parameters.
+        bind: bind(name, topics, parameters) -> one bound estimator for everything that it can estimate
+            in a log with these topics (for each robot, say); empty if the log does not fit.
+        variant: the parameter that is set by the second part of a name such as `lrkf:s2kf-50`.
+        label: its name if it is given without one.
     """
 
     summary: str
@@ -245,12 +245,12 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Setting]) -> "AnyEstimator":  # noqa: ARG002
-        """Return what `settings` of `label` make of it: another where they name a foreign filter."""
+        """Return the estimator that `settings` of `label` select: another one for a foreign filter."""
         return self
 
-    # one of any model has these by what the name says: `_OfAnyModel`
+    # an estimator of any model overrides these two: `_OfAnyModel`
     def parameters_with(self, name: str, variant: Mapping[str, Setting]) -> type[Parameters]:  # noqa: ARG002
-        """Return the parameters that count under `name` with `variant`, as `smoother:iterated`."""
+        """Return the parameters of `name` with `variant`, such as those of `smoother:iterated`."""
         return self.parameters
 
     def parameters_by_model(
@@ -258,18 +258,18 @@ class Estimator(Generic[ParametersType]):
         name: str,  # noqa: ARG002
         variant: Mapping[str, Setting],  # noqa: ARG002
     ) -> dict[str, type[Parameters]]:
-        """Return by model the parameters under `name` with `variant`; none where it is of no model."""
+        """Return the parameters of `name` with `variant` by model; empty if no model is involved."""
         return {}
 
 
-# An estimator of any parameters, which a registry has by its name.
+# An estimator with any parameters, as registered under a name.
 AnyEstimator = Estimator[Any]  # type: ignore[explicit-any]
 
 
 def find_estimator(name: str) -> tuple[AnyEstimator, dict[str, Setting]]:
-    """Return the registered estimator of `name`, and the parameter that a `name:variant` sets.
+    """Look up the registered estimator of `name`, and the parameter that `name:variant` sets.
 
-    Raises BadInput where there is none, or it has no variants.
+    Raises BadInput if no such estimator is registered, or if it has no variants.
     """
     kind, _, variant = name.partition(":")
     estimator: AnyEstimator = load("estimators", kind, Estimator)
@@ -277,9 +277,9 @@ def find_estimator(name: str) -> tuple[AnyEstimator, dict[str, Setting]]:
 
 
 def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Setting]:
-    """Return the parameter that the variant of a name sets; nothing where the name has none.
+    """Return the parameter that the variant of a name sets; empty if the name has no variant.
 
-    Raises BadInput where what is named, an estimator or a method of this kind, has no variants.
+    Raises BadInput if the named estimator or method has no variants.
     """
     if not variant:
         return {}
@@ -291,15 +291,16 @@ def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) ->
 def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, Parameters]:
     """Make the estimator of a label, and its parameters.
 
-    `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
-    estimator can be replayed with several settings at once. A `kind` may be an `Estimator` too, which
-    needs no name. The other settings are its parameters.
+    `label` is the estimator's name, or any word if an entry `kind` of the settings gives the name; one
+    estimator can therefore be replayed with several settings in one pass. A `kind` may also be an
+    `Estimator`, which needs no name. The other settings are parameters.
 
-    Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+    Raises BadInput if the name or a parameter is unknown, or if the label cannot be part of a topic
+    name.
 
     Args:
         label: see above.
-        settings: by name, with `kind` perhaps among them.
+        settings: values by name, optionally with `kind`.
     """
     if not re.fullmatch(r"[\w:=-]+", label):
         raise BadInput(
@@ -311,14 +312,14 @@ def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
 
 
 def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, dict[str, Setting]]:
-    """Return the estimator of a label and the values of its parameters, which are not checked yet.
+    """Return the estimator of a label and the values of its parameters, which are not yet checked.
 
-    Raises BadInput where the name is unknown or sets what a setting sets otherwise, or a foreign filter
-    may not be run or does not answer.
+    Raises BadInput if the name is unknown, if it conflicts with a setting, or if a foreign filter may
+    not be run or does not answer.
     """
     values = {name: value for name, value in settings.items() if not name.startswith("/")}
     for name, value in settings.items():
-        if name.startswith("/"):  # a parameter of a topic, or all of its own
+        if name.startswith("/"):  # a parameter of a topic, or a table of all its parameters
             own = value if isinstance(value, Mapping) else None
             table = {name: own} if own is not None else nested(name, value)
             values["of_topics"] = merge(values.get("of_topics", {}), table)
@@ -335,7 +336,7 @@ def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
 
 @contextmanager
 def code_of(name: str) -> Iterator[None]:
-    """Name the estimator in what its code raises, and what does not compile, while this is entered."""
+    """Add the estimator's name to exceptions that its code raises and to compilation errors."""
     try:
         with foreign_code(f"estimator {name}"):
             yield
@@ -346,7 +347,7 @@ def code_of(name: str) -> Iterator[None]:
 def bound_to(
     estimator: AnyEstimator, label: str, topics: Mapping[str, Topic], parameters: Parameters
 ) -> list[Bound]:
-    """Bind an estimator to topics; raises BadInput where it would read a truth."""
+    """Bind an estimator to topics; raise BadInput if it would read a truth."""
     bound = estimator.bind(label, topics, parameters)
     truths = truths_among(topics)
     for each in bound:
@@ -368,15 +369,14 @@ def require_values(sources: Iterable[Source], bound: Bound) -> None:
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
-    An ensemble keeps what was bound to it last, which is bound with the same settings again.
+    The ensemble caches the estimators last bound to it, so binding with the same settings again is free.
 
-    Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
-    of them must be stated alike.
+    Raises BadInput if the estimator does not fit the log, or if the runs do not state its topics alike.
 
     Args:
-        label: of the estimator, see `configure`.
+        label: label of the estimator, see `configure`.
         sources: the runs.
-        settings: its parameters by name, with `kind` perhaps among them.
+        settings: its parameters by name, optionally with `kind`.
     """
     ensemble = ensemble_of(sources)
     key = "bound", label, *((name, type(value), value) for name, value in settings.items())

@@ -1,18 +1,18 @@
-"""Handles late (out-of-sequence) messages: drops them, waits for them, or goes back for them.
+"""Handling of late (out-of-sequence) messages: dropping them, waiting for them, or reprocessing.
 
-In the order of arrival (log time) the stamps at which things were measured (publish time) go back
-wherever a message was late. `taking_late` makes of an estimator one that is handed its messages as they
-arrive and does one of three things about it:
+In order of arrival (log time), measurement stamps (publish time) go back whenever a message was late.
+`taking_late` wraps an estimator so that it gets its messages in order of arrival, with one of three
+policies:
 
-    drop            what is older than the newest message that was taken is left out
-    wait:SECONDS    a message is held back until so long after its stamp; then as drop
-    rewind:SECONDS  the estimator goes back, if not further than that; what is older still is left out
+    drop            skip a message that is older than the newest one processed
+    wait:SECONDS    hold back every message until this time after its stamp; then as drop
+    rewind:SECONDS  go back to a late message and reprocess, by at most this time; skip older ones
 
-What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
-was waited for on `waited`, as a `schemas.WAITED`. For what is gone back for, the estimator does both
-itself, and says so on `rewound`, as a `schemas.REWOUND` (`Recursive.out_of_sequence`; for filters of
-models, `fuselog.replay.inference.run.out_of_sequence`, for those of libraries
-`fuselog.replay.foreign.native.out_of_sequence`).
+Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Late messages
+that newer ones waited for are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
+does the reprocessing itself and reports it on `rewound`, as `schemas.REWOUND`
+(`Recursive.out_of_sequence`; for filters of models, `fuselog.replay.inference.run.out_of_sequence`, for
+those of libraries `fuselog.replay.foreign.native.out_of_sequence`).
 """
 
 from collections.abc import Mapping
@@ -30,30 +30,30 @@ from fuselog.replay.engine.streams.blocks import Block, Events, Ragged, join, la
 from fuselog.replay.engine.streams.failures import reason_stream
 
 POLICIES = ("drop", "wait", "rewind")
-OLDER = "older than what was used before"  # of every message that is left out for being late
+OLDER = "older than what was used before"  # part of the reason for skipping a late message
 LONGEST_S = 1e9
 
 
 class Late(NamedTuple):
-    """Holds what is done about messages that come late, and how long is waited or how far gone back."""
+    """Policy for late messages, and how long to wait or how far to go back."""
 
     policy: str
     window_ns: int
 
     @property
     def back_ns(self) -> int:
-        """Compute how far the stamps go back that an estimator is handed."""
+        """Return by how much the stamps that an estimator is given may go back."""
         return self.window_ns if self.policy == "rewind" else 0
 
 
 def parse_late(text: str, *, arrival_order: bool) -> Late:
     """Parse `drop`, `wait:SECONDS` or `rewind:SECONDS`.
 
-    Raises BadInput where it has another form, or messages are not taken in the order of their arrival.
+    Raises BadInput if the text has another form, or if messages are not processed in order of arrival.
 
     Args:
         text: as given on the command line.
-        arrival_order: whether messages are taken in the order of arrival.
+        arrival_order: whether messages are processed in order of arrival.
     """
     policy, _, seconds = text.partition(":")
     if policy not in POLICIES:
@@ -79,13 +79,13 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
 
 
 def taking_late(bound: Bound, late: Late) -> Recursive:
-    """Make the estimator, handed its messages in the order of log time.
+    """Make an estimator that gets its messages in order of log time.
 
-    Raises BadInput where it is none that goes through its messages in time, or it cannot go back.
+    Raises BadInput if the estimator is not recursive, or cannot go back as the policy asks.
 
     Args:
         bound: the estimator that wants its messages in order of their stamps.
-        late: what is done with late ones.
+        late: what to do with late messages.
     """
     if not isinstance(bound, Recursive):
         raise BadInput(
@@ -108,13 +108,13 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
 
 
 class _State(NamedTuple):
-    """Holds what is carried from block to block.
+    """State carried from block to block.
 
     Attributes:
-        inner: the estimator's own.
+        inner: state of the wrapped estimator.
         waiting: messages that are held back.
-        newest_ns, arrived_ns: (runs,) the newest stamps that were taken, and that have arrived; None
-            before the first block.
+        newest_ns, arrived_ns: (runs,) the newest stamps processed, and the newest that have arrived;
+            None before the first block.
     """
 
     inner: Carried
@@ -132,7 +132,7 @@ def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_St
 
 
 def _finish(bound: Recursive, late: Late, state: _State) -> list[Ragged]:
-    """Return what was held back to the end, and the estimator's own last outputs."""
+    """Process the messages still held back, and return the last outputs of the estimator."""
     made: list[Ragged] = []
     if state.waiting:
         nothing = {
@@ -163,13 +163,13 @@ def _take(
 
 
 class _Arrivals(NamedTuple):
-    """Holds messages of all topics in the order in which they are taken, run by run.
+    """Messages of all topics in the order in which they are processed, run by run.
 
     Attributes:
         streams: the topics.
-        run, topic, row: (n,) whose they are: of which run, of which topic by number, and where in it.
-        stamp_ns, moment_ns: (n,) when they were measured, and when they are taken.
-        position: (n,) in the file.
+        run, topic, row: (n,) the run, the index of the topic, and the row in it.
+        stamp_ns, moment_ns: (n,) when they were measured, and when they are processed.
+        position: (n,) position in the file.
     """
 
     streams: dict[str, Ragged]
@@ -182,12 +182,12 @@ class _Arrivals(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """Count how many runs there are, empty ones included."""
+        """Return the number of runs, including empty ones."""
         return next(iter(self.streams.values())).runs
 
 
 def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragged]) -> _Arrivals:
-    """Join the next messages and those held back; at the same moment in the file's order."""
+    """Merge the next messages and those held back; equal times keep the order of the file."""
     if waiting:
         streams = {topic: join([waiting[topic], streams[topic]]) for topic in streams}
     columns = [
@@ -210,7 +210,7 @@ def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragg
 
 
 def _reached(streams: dict[str, Ragged]) -> Integers:
-    """Return when the last message of every run (runs,) arrived; zero where there is none."""
+    """Return when the last message of every run (runs,) arrived; zero if it has none."""
     reached = []
     for ragged in streams.values():
         last = np.maximum(ragged.offsets[1:], 1) - 1
@@ -223,9 +223,9 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
 def _find_behind(
     arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
 ) -> tuple[Integers, Integers]:
-    """Find the newest stamps (runs,) after those taken, and by how much (n,) each was behind them.
+    """Find the newest stamps (runs,) after the ready messages, and how far (n,) each was behind them.
 
-    Zero for a message that is not behind what was taken before it, and for one that is not ready.
+    Zero for a message that is not behind its predecessors, and for one that is not ready.
     """
     newest_ns = np.zeros(arrivals.runs, np.int64) if before_ns is None else before_ns.copy()
     behind_ns, rows = np.zeros(len(ready), np.int64), np.flatnonzero(ready)
@@ -239,7 +239,7 @@ def _find_behind(
 
 
 def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
-    """Return the chosen messages, every topic in the order in which they are taken."""
+    """Make a block of the chosen messages, each topic in the order of processing."""
     run, topic, row = (column[chosen] for column in (arrivals.run, arrivals.topic, arrivals.row))
     streams: dict[str, Ragged] = {}
     source, before = np.empty(len(run), np.int64), 0
@@ -259,7 +259,7 @@ def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
 
 
 def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> Ragged:
-    """Return the messages that were left out."""
+    """Make the stream of messages that are skipped because they are late."""
     by = f"more than {late.back_ns * 1e-9:g} s " if late.back_ns else ""
     reasons = [f"topic {topic}: it is {by}{OLDER}" for topic in arrivals.streams]
     stream = reason_stream(

@@ -1,9 +1,9 @@
-"""Monitors an estimator while it goes through the runs of an ensemble, whatever the estimator is.
+"""Monitoring of an estimator while it processes the runs of an ensemble, for any kind of estimator.
 
-A run that fails ends alone: one that cannot start, whose code raises, whose covariance is none, whose
-stamps go back, or that goes silent. It gets no further messages and says nothing from there on, and the
-others do not notice. Beside that, this counts for how much of each run there were estimates, and the
-time that the estimator took.
+A run fails on its own if it cannot start, if its code raises, if a covariance is invalid, if stamps go
+back, or if it stops giving estimates. A failed run gets no further messages and gives no further
+outputs, and the other runs are not affected. The monitor also counts for how much of each run there
+were estimates, and the time that the estimator took.
 """
 
 import time
@@ -33,7 +33,7 @@ Streams = dict[str, Ragged]
 Result = TypeVar("Result")
 
 GAUSSIAN, FAILURE = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.FAILURE.full_name
-# One message of these for every estimate, or for every element of one.
+# Schemas with one message for every estimate, or for every element of one.
 ESTIMATES = frozenset(
     schema.full_name
     for schema in (schemas.GAUSSIAN_ESTIMATE, schemas.ESTIMATE_SIZE, schemas.TRACK_ESTIMATE)
@@ -42,16 +42,16 @@ FOREVER = np.iinfo(np.int64).max
 
 
 class RunMonitor:
-    """Represents one bound estimator over the runs of an ensemble; see the module.
+    """Monitor of one bound estimator over the runs of an ensemble; see the module.
 
     Attributes:
-        name: the bound estimator's.
-        runs: how many there are.
-        seconds: how long the estimator worked, without what is done once, as compiling.
-        usage: what became of its measurements; None where that is not counted.
-        static: the streams that it begins with.
-        refused: what all runs of a part of an ensemble raised.
-        plane: the origin of the plane that its estimates are in, where the runs state one.
+        name: name of the bound estimator.
+        runs: number of runs.
+        seconds: working time of the estimator, without one-time work such as compiling.
+        usage: counts of how its measurements were used; None if they are not counted.
+        static: the streams that it starts from.
+        refused: the exception that all runs of a part of an ensemble raised.
+        plane: origin of the local tangent plane (ENU) of its estimates, if the runs state one.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class RunMonitor:
         self._order: Clock = order
         self._is_batch = is_batch
         self._is_part = is_part
-        # a run gets no message from here on
+        # a run gets no messages from this time on
         self._end_ns = np.full(runs, FOREVER)
         self._has_ends = False
         self._first_ns, self._last_ns = np.full(runs, FOREVER), np.full(runs, -1)
@@ -90,7 +90,7 @@ class RunMonitor:
         self._speaks = False
 
     def exclude(self, reasons: Mapping[int, str]) -> None:
-        """Take out runs that cannot start, for a reason each."""
+        """Exclude runs that cannot start, with a reason for each."""
         self._unable |= reasons
         for run in reasons:
             self._end(run, 0)
@@ -100,10 +100,11 @@ class RunMonitor:
         self._has_ends = True
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
-        """Return what `work` makes of the next streams of the runs that have not failed.
+        """Pass the next streams of the runs that have not failed to `work`, and return its result.
 
-        `work` is called again, from the same state, without a run that raises. Raises what it raises
-        where every run has, and there are no others, or it is no run's fault.
+        If `work` raises BadInput, it is called again from the same state without the runs that cause
+        it. The exception is raised if every run causes it and the ensemble has no other runs, or if no
+        run does.
         """
         self._note_span(streams)
         if self.usage is not None:
@@ -119,7 +120,7 @@ class RunMonitor:
             self.seconds += time.perf_counter() - began - (seconds_done_once() - compiled)
 
     def receive(self, outputs: Sequence[Ragged]) -> list[Ragged]:
-        """Take a block's outputs up to the first that is no estimate; failures are held back."""
+        """Return outputs up to the first invalid estimate of each run; keep failures for `finish`."""
         cuts = [self._unsound(each) for each in outputs]
         sound = [self._cut(each, cut) for each, cut in zip(outputs, cuts, strict=True)]
         if self.usage is not None:
@@ -145,7 +146,7 @@ class RunMonitor:
         return passed
 
     def finish(self) -> list[Ragged]:
-        """Return all failures of all runs: those found here beside the estimator's own."""
+        """Return the failures of all runs: those that the estimator reported and those found here."""
         if self.usage is not None:
             self.usage.shares.end()
         failures = {topic: join(parts) for topic, parts in self._failures.items()}
@@ -168,9 +169,9 @@ class RunMonitor:
         return list(failures.values())
 
     def coverage(self) -> list[Ragged]:
-        """Return by case how much of every run's span was estimated; none of a run without messages.
+        """Return, by case, how much of the span of every run with messages was estimated.
 
-        There is none for outputs that are no estimates of a state, such as fused scores.
+        Outputs that are not estimates of a state, such as fused scores, have no coverage.
         """
         rows = np.flatnonzero(self._last_ns >= 0)
         offsets = np.searchsorted(rows, np.arange(self.runs + 1))
@@ -192,7 +193,7 @@ class RunMonitor:
         ]
 
     def _starts(self) -> Integers:
-        """Return the stamps before any estimate: a batch's first estimate covers all from the start."""
+        """Return the stamps before any estimate; a batch's estimates cover a run from its start."""
         return self._first_ns if self._is_batch else np.full(self.runs, -1)
 
     def _note_span(self, streams: Streams) -> None:
@@ -209,7 +210,7 @@ class RunMonitor:
         }
 
     def _end_raising(self, work: Callable[[Streams], object], streams: Streams, error: BadInput) -> None:
-        """Find the runs that raise, by trying halves of them, and the stamp at which each does."""
+        """Find the runs that raise by bisecting the set of runs, and the stamp at which each does."""
 
         def raised(end_ns: Integers) -> BadInput | None:
             try:
@@ -243,7 +244,7 @@ class RunMonitor:
                 np.concatenate([each.of_run(run).times(self._order) for each in streams.values()])
             )
             good, bad = 0, len(stamps) - 1
-            while good < bad and not self._is_batch:  # bad ends at the first stamp that raises
+            while good < bad and not self._is_batch:  # `bad` ends at the first stamp that raises
                 middle = (good + bad) // 2
                 until = only([run])
                 until[run] = stamps[middle] + 1
@@ -252,9 +253,9 @@ class RunMonitor:
             self._end(run, 0 if self._is_batch else stamps[bad])
 
     def _unsound(self, estimates: Ragged) -> Integers | None:
-        """Find the first row (runs,) of every run that is no estimate, and end it there.
+        """Find the first invalid estimate (runs,) of every run and end the run there.
 
-        None for none.
+        Return None if all estimates are valid.
         """
         stream = estimates.stream
         if stream.schema.full_name != GAUSSIAN or not len(stream):
@@ -288,7 +289,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """Return an output without the rows from a run's first bad one on, or from the run's end on."""
+        """Remove the rows of an output from a run's first bad one on, or from the run's end on."""
         if first_bad is None and not self._has_ends:
             return output
         run = run_of_rows(output.offsets)
@@ -298,9 +299,9 @@ class RunMonitor:
         return output if kept.all() else _kept(output, kept)
 
     def _find_silence(self, failed: set[int]) -> None:
-        """Note a failure where messages came and no state was estimated, or not any more.
+        """Record a failure for runs with messages whose state was never estimated, or not up to the end.
 
-        What has failed already is left out.
+        Runs that have already failed are excluded.
         """
         coverages = [self._coverages[case] for case in self._states]
         if not coverages:
@@ -334,7 +335,7 @@ def _no_failures(topic: str, runs: int) -> Ragged:
 
 
 def _span_of(ragged: Ragged, clock: Clock) -> tuple[Integers, Integers]:
-    """Return the first and the last stamp of every run (runs,); FOREVER and -1 where it has none."""
+    """Return the first and last stamp of every run (runs,); FOREVER and -1 if it has no messages."""
     first, last = np.full(ragged.runs, FOREVER), np.full(ragged.runs, -1)
     runs, times = np.flatnonzero(np.diff(ragged.offsets)), ragged.stream.times(clock)
     begin = ragged.offsets[runs]

@@ -1,4 +1,4 @@
-"""Replays the runs of an ensemble in one time-ordered pass, through several estimators at once."""
+"""Replay of the runs of an ensemble in one time-ordered pass, through several estimators."""
 
 import sys
 from collections import defaultdict
@@ -31,25 +31,25 @@ from fuselog.replay.engine.streams.priors import start_of_runs
 from fuselog.replay.engine.streams.sources import Source
 
 BLOCK_MESSAGES = 1 << 16
-# Of a run, those that an initialization looks at.
+# Messages of a run that an initialization reads.
 FIRST_MESSAGES = 1 << 15
-# Of the product of two standard deviations: rounding is far below.
+# Fraction of the product of two standard deviations, far above rounding.
 ASYMMETRIC = 1e-6
-# A start of so many bytes is kept with an ensemble in memory, to be begun from again.
+# The largest start (in bytes) that is cached with an ensemble in memory.
 SMALL_BYTES = 1 << 16
-# The state of what can start in no run.
+# The state of an estimator that can start in no run.
 _REFUSED = object()
 
 
 @dataclass
 class Report:
-    """Reports on a replay beside its outputs.
+    """Report of a replay in addition to its outputs.
 
     Attributes:
-        seconds: how long each estimator worked, by label, without what is done once, as compiling.
+        seconds: working time of each estimator by label, without one-time work such as compiling.
         coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
         refused: by estimator, why no run of a part can be replayed.
-        usages: by estimator, what became of its measurements.
+        usages: by estimator, how its measurements were used.
     """
 
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
@@ -68,24 +68,24 @@ def replay(
     report: Report | None = None,
     is_part: bool = False,
 ) -> Iterator[list[Ragged]]:
-    """Replay an ensemble; yields the output streams of all estimators, block by block.
+    """Replay an ensemble and yield the output streams of all estimators, block by block.
 
     Args:
-        sources: the runs, holding the same topics; their schedules may differ.
+        sources: the runs, with the same topics; their time spans may differ.
         estimators: bound estimators with different names.
-        order: the clock to go by, publish time or (as it arrived) log time.
-        late: in the order of log time, what is done about messages whose publish times go back; else
-            log time is taken for the time at which they were measured.
-        block_messages: about how many messages of a run are in memory at once.
-        report: filled when all is done.
-        is_part: whether there are more runs than these. Then it is no bad input that an estimator can
-            follow none of them: they fail, and the report says so.
+        order: the clock to go by: publish time, or log time (order of arrival).
+        late: in order of log time, the policy for messages whose publish times go back; without it, log
+            time is taken as the time of measurement.
+        block_messages: approximate number of messages of a run in memory at a time.
+        report: filled after the last block.
+        is_part: whether there are more runs than these. It is then not an error if an estimator can
+            process none of them: they fail, and the report says so.
 
-    A run that an estimator cannot follow fails alone, see `fuselog.replay.engine.replaying.monitor`; the
-    failures come last.
-    Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
-    begins after the prior of an estimator (see `fuselog.pipeline.runs.initial_states`), or it cannot do
-    as `late` says.
+    A run that an estimator cannot process fails on its own, see
+    `fuselog.replay.engine.replaying.monitor`; the failures come last.
+    Raises BadInput if an estimator can process no run, if no run has a message for it, if the span of a
+    run begins after the estimator's prior (see `fuselog.pipeline.runs.initial_states`), or if the
+    estimator does not support `late`.
     """
     if late is not None:
         estimators = [taking_late(bound, late) for bound in estimators]
@@ -159,13 +159,13 @@ def _plane_of(source: Source) -> Origin | None:
 
 
 class _Start(NamedTuple):
-    """Holds what a bound estimator begins with.
+    """Start of a bound estimator.
 
     Attributes:
-        state: of a recursion, or what a batch is given; _REFUSED where it can start in no run.
-        unable: by run why it cannot start there.
-        why: the reason where it can start in no run.
-        streams: those of what it begins with.
+        state: state of a recursion, or input of a batch estimator; _REFUSED if it can start in no run.
+        unable: by run, why the estimator cannot start there.
+        why: the error if it can start in no run.
+        streams: output streams of the initialization.
     """
 
     state: Carried
@@ -181,7 +181,7 @@ def _kept_start(
     order: Clock,
     stamps: Clock,
 ) -> _Start:
-    """Return the start of an estimator, which an ensemble in memory keeps where it is small."""
+    """Return the start of an estimator; an ensemble in memory caches it if it is small."""
     key = "start", bound, order, stamps
     kept: _Start | None = ensemble.findings.get(key)
     if kept is not None:
@@ -193,7 +193,7 @@ def _kept_start(
 
 
 def _bytes_of(state: Carried) -> float:
-    """Count the bytes of a state that is made of arrays; of any other they are unknown: infinite."""
+    """Return the size in bytes of a state made of arrays; infinite for any other state."""
     if isinstance(state, np.ndarray):
         return state.nbytes
     if isinstance(state, tuple):
@@ -210,7 +210,7 @@ def _start(
     order: Clock,
     stamps: Clock,
 ) -> _Start:
-    """Begin an estimator; what can start in no run says why."""
+    """Start an estimator; if it can start in no run, the result has the reason."""
     streams: Sequence[Ragged] = ()
     try:
         found, streams = _initialized(ensemble, bound, static, order, stamps)
@@ -238,7 +238,7 @@ def _initialized(
     order: Clock,
     stamps: Clock,
 ) -> Initialized:
-    """Find what an estimator starts from in the first messages."""
+    """Run the initialization of an estimator on the first messages."""
     if not isinstance(bound, Recursive) or bound.initialization is None:
         return Initialized({}, [])
     topics = bound.initialization.topics
@@ -250,9 +250,10 @@ def _initialized(
 
 
 def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str, BadInput]:
-    """Return by estimator's label why it can start in no run.
+    """Return, by the label of an estimator, why it can start in no run.
 
-    Of what one estimator estimates (each robot, say), what cannot start fails alone.
+    If only some of the bound estimators of a label (one for each robot, say) cannot start, these fail
+    on their own.
     """
     errors_of: dict[str, list[BadInput | None]] = {}
     for bound, start in zip(estimators, starts, strict=True):
@@ -295,7 +296,7 @@ def _finish(
 def _refuse_old_priors(
     bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged], order: Clock
 ) -> None:
-    """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
+    """Raise BadInput if an estimator would start a span from the state at an earlier time."""
     for topic in (bound.priors.keys() & static.keys()) - bound.given.keys():
         for run, start_ns in ensemble.starts_ns.items():
             times_ns = static[topic].of_run(run).times(order)[:1]
@@ -310,7 +311,7 @@ def _refuse_old_priors(
 def _refuse_asymmetric_priors(
     bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged]
 ) -> None:
-    """Raise BadInput where a prior's covariance is none, whose triangles would give two answers."""
+    """Raise BadInput if a prior's covariance is not symmetric; its two triangles would disagree."""
     for topic in bound.priors.keys() & static.keys():
         prior = static[topic]
         run = prior.findings.once("asymmetric", partial(_first_asymmetric, prior))
@@ -321,7 +322,7 @@ def _refuse_asymmetric_priors(
 
 
 def _first_asymmetric(prior: Ragged) -> int | None:
-    """Return the first run of which a covariance is not symmetric; None where all are."""
+    """Return the first run with a covariance that is not symmetric; None if all are symmetric."""
     covariance = prior["covariance"]
     size = isqrt(covariance.shape[1])
     if not len(covariance) or size**2 != covariance.shape[1]:
@@ -336,7 +337,7 @@ def _first_asymmetric(prior: Ragged) -> int | None:
 def _required(
     ensemble: Ensemble[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
-    """Return the blocks of the ensemble; raises BadInput where no run has a message of the topics."""
+    """Yield the blocks of the ensemble; raise BadInput if no run has a message on the topics."""
     blocks = ensemble.blocks(topics, order, block_messages)
     first = next(blocks, None)
     if first is None and topics:
@@ -345,7 +346,7 @@ def _required(
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
-    """Join a replay's blocks into whole output streams by topic, each run's rows together."""
+    """Join the blocks of a replay into whole output streams by topic, each run's rows together."""
     parts: dict[str, list[Ragged]] = {}
     for block in outputs:
         for ragged in block:

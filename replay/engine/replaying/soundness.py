@@ -1,4 +1,4 @@
-"""Finds estimates that are none: not finite, without a covariance, or stamped before the last one."""
+"""Detection of invalid estimates: not finite, with an invalid covariance, or stamped before the last."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,9 @@ UNSOUND = (
     "the covariance is not symmetric",
 )
 NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK, NOT_SYMMETRIC = range(len(UNSOUND))
-# A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
+# Fraction of a variance: a covariance that is singular up to rounding, as of one particle, is valid.
 INDEFINITE = 1e-9
-# The square of a share of two deviations: rounding in single precision leaves less.
+# Squared fraction of two standard deviations: rounding in single precision is smaller.
 ASYMMETRIC = 1e-6
 
 
@@ -33,18 +33,18 @@ def find_unsound(
     found: Integers,
     factor: Floats,
 ) -> None:
-    """Fill the first row of a run that is no estimate, and which of `UNSOUND` it is.
+    """Find the first invalid estimate of a run, and which entry of `UNSOUND` describes it.
 
     Args:
-        run: which.
-        offsets: (runs + 1,) of the rows.
+        run: number of the run.
+        offsets: (runs + 1,) first row of each run.
         time_ns: (n,) stamps.
         before_ns: (runs,) the last stamp before these.
         mean: (n, d).
         covariance: (n, t * t) row-major.
-        rows: (runs,) filled.
-        found: (runs,) filled.
-        factor: (t, t) to work in.
+        rows: (runs,) row of the first invalid estimate, filled if there is one.
+        found: (runs,) index in `UNSOUND`, filled if there is an invalid estimate.
+        factor: (t, t), work space.
     """
     last_ns, size = before_ns[run], factor.shape[0]
     for row in range(offsets[run], offsets[run + 1]):
@@ -74,7 +74,7 @@ def find_unsound(
                         factor[i, i] = np.sqrt(entry) if entry > ROUNDING * variance else 0.0
                     elif factor[column, column] > 0.0:
                         factor[i, column] = entry / factor[column, column]
-                    else:  # nothing is left of this component: it cannot vary with another
+                    else:  # no variance is left, so the component cannot be correlated with another
                         both = variance * covariance[row, i * size + i]
                         is_wrong = entry * entry > INDEFINITE * both
                         factor[i, column] = 0.0

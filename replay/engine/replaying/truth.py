@@ -1,8 +1,8 @@
-"""Keeps the truth out of filters: what estimates are judged by is never what they are made of.
+"""Checks that filters do not read the truth by which their estimates are judged.
 
 A truth is a topic of `TruthState`, or one that a channel or an estimator names as its truth. Estimators
-are bound to logs by `estimator.bound_to`, which refuses one that reads a truth. A bound is no estimate
-and may; a replay that starts from the truth hands over a prior.
+are bound to logs by `estimator.bound_to`, which refuses one that reads a truth. A bound is not an
+estimate and may read it; a replay that starts from the truth passes a prior instead.
 """
 
 from collections.abc import Collection, Mapping
@@ -14,19 +14,19 @@ TRUTH = schemas.TRUTH_STATE.full_name
 
 
 def truths_among(topics: Mapping[str, Topic]) -> set[str]:
-    """Return the topics that are truths, or that a channel names as one."""
+    """Return the topics that are truths, or that a channel names as its truth."""
     named = {each.metadata.get("truth", "") for each in topics.values()}
     return {name for name, each in topics.items() if each.schema_name == TRUTH or name in named}
 
 
 def refuse_truths(label: str, read: Collection[str], truths: Collection[str], how: str = "") -> None:
-    """Raise BadInput where an estimator would read a truth.
+    """Raise BadInput if an estimator would read a truth.
 
     Args:
-        label: of the estimator.
+        label: label of the estimator.
         read: topics that it reads.
         truths: topics that are truths.
-        how: the setting by which it would, if there is one.
+        how: the setting that makes it read them, if there is one.
     """
     for topic in read:
         if topic in truths:
@@ -40,12 +40,12 @@ def refuse_truths(label: str, read: Collection[str], truths: Collection[str], ho
 def refuse_named_truths(
     label: str, renamed: Mapping[str, str], topics: Mapping[str, Topic], own: Collection[str]
 ) -> None:
-    """Raise BadInput where a setting `topics.ROLE` names a truth for a role that is not one.
+    """Raise BadInput if a setting `topics.ROLE` names a truth for a role that is not a truth.
 
     Args:
-        label: of the estimator.
+        label: label of the estimator.
         renamed: topics by role.
-        topics: of the log.
+        topics: topics of the log.
         own: the roles of truths.
     """
     truths = truths_among(topics)

@@ -1,7 +1,7 @@
-"""Counts what became of an estimator's measurements: used, gated, skipped, or without effect.
+"""Counts of how an estimator's measurements were used: used, gated, skipped, or without effect.
 
-It is counted from what goes in and comes out, for any estimator: messages by topic, innovations, and
-what the estimator says that it skipped.
+They are computed from inputs and outputs, for any estimator: messages by topic, innovations, and the
+messages that the estimator reports as skipped.
 """
 
 from collections import Counter
@@ -17,7 +17,7 @@ from fuselog.replay.engine.replaying.attribution import Attribution
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import sentences_of
 
-# What drives a motion is no measurement, and has no innovation.
+# Messages that drive a motion are not measurements and have no innovations.
 CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}
 INNOVATION, SKIPPED = schemas.INNOVATION.full_name, schemas.SKIPPED.full_name
 UNTAKEN = "the estimator does not take this topic"
@@ -27,16 +27,16 @@ PRIOR = schemas.GAUSSIAN_ESTIMATE.full_name
 
 
 class Row(NamedTuple):
-    """Holds a line of the table `coverage`.
+    """Row of the table `coverage`.
 
     Attributes:
         estimator: its label.
-        topic: the measurements; several where innovations do not name theirs.
-        messages: how many there were.
-        used, gated: how many gave an innovation that was taken, and one that was refused; None where
-            the estimator states no innovations.
-        skipped: how many of them the estimator reports as left out.
-        why: of those that were not used, in words.
+        topic: topic of the measurements; several topics if innovations cannot be assigned to one.
+        messages: number of messages.
+        used, gated: numbers of accepted and of rejected innovations; None if the estimator gives no
+            innovations.
+        skipped: number of messages that the estimator reports as skipped.
+        why: reasons for unused messages, in words.
     """
 
     estimator: str
@@ -49,12 +49,12 @@ class Row(NamedTuple):
 
     @property
     def unused(self) -> int:
-        """Count how many came to nothing, though they were not gated."""
+        """Return the number of messages without an innovation."""
         return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
 
     @property
     def sentence(self) -> str:
-        """Write a sentence on them; empty where all had an effect, or the estimator says why not."""
+        """Return a sentence on unused messages; empty if all were used or the reason is known."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -63,19 +63,19 @@ class Row(NamedTuple):
 
 @dataclass
 class Usage:
-    """Counts what became of the measurements of one bound estimator, over all runs.
+    """Counts of how the measurements of one bound estimator were used, over all runs.
 
     Attributes:
-        name: the bound estimator's.
-        given: messages by topic.
-        measured: the topics of measurements among these.
-        facts: by topic, how many messages a fact is about.
-        used, gated: innovations.
-        skipped: what was left out, by reason.
-        speaks: whether it gives innovations.
-        doubtful: a sentence on a topic that it begins with.
+        name: name of the bound estimator.
+        given: number of messages by topic.
+        measured: topics of measurements among these.
+        facts: by topic, the number of messages to which each description applies.
+        used, gated: numbers of accepted and rejected innovations.
+        skipped: number of skipped messages, by reason.
+        speaks: whether the estimator gives innovations.
+        doubtful: by topic that it starts from, a sentence on what is wrong with it.
         shares: the innovations by topic.
-        begins_ns: (runs,) the stamps of the priors, of several the first; None where there are none.
+        begins_ns: (runs,) the stamp of the first prior; None if there are no priors.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Usage:
     begins_ns: AnyArray | None = None
 
     def note_start(self, static: Mapping[str, Ragged]) -> None:
-        """Look at the streams that the estimator begins with."""
+        """Check and count the streams that the estimator starts from."""
         for topic, ragged in static.items():
             if ragged.stream.schema.full_name == PRIOR:
                 there = np.diff(ragged.offsets) > 0
@@ -105,7 +105,7 @@ class Usage:
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Report landmarks that are at two places."""
+        """Record landmarks that are stated at two positions."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.where(np.diff(number) == 0, np.linalg.norm(np.diff(place, axis=0), axis=1), 0.0)
@@ -118,7 +118,10 @@ class Usage:
     def note_given(
         self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged], order: Clock = "publish_time"
     ) -> None:
-        """Count a block of messages; `static` are the streams that the estimator began with."""
+        """Count a block of messages, `streams`, by the clock `order`.
+
+        `static` are the streams that the estimator started from.
+        """
         sensed = {
             topic: ragged
             for topic, ragged in streams.items()
@@ -145,7 +148,7 @@ class Usage:
                 )
 
     def note_outputs(self, outputs: Sequence[Ragged]) -> None:
-        """Count a block of what the estimator gave."""
+        """Count a block of the estimator's `outputs`."""
         for each in outputs:
             stream = each.stream
             if stream.schema.full_name == INNOVATION:
@@ -159,7 +162,7 @@ class Usage:
                 self.skipped.update(sentences_of(stream))
 
     def merge(self, other: "Usage") -> None:
-        """Take in what was counted over other runs."""
+        """Add the counts of other runs."""
         self.given.update(other.given)
         self.measured |= other.measured
         for topic, facts in other.facts.items():
@@ -172,7 +175,7 @@ class Usage:
         self.shares.merge(other.shares)
 
     def rows(self) -> Iterator[Row]:
-        """Count what became of measurements: by topic, or all where innovations are of several."""
+        """Yield how measurements were used, by topic, or together if they cannot be separated."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
@@ -193,7 +196,7 @@ class Usage:
                 f"{count} {fact}" if len(group) == 1 else f"{count} of {topic} {fact}"
                 for topic in group
                 for fact, count in self.facts[topic].items()
-                if count and (fact != EARLY or row.unused > 0)  # a tracker may use those too
+                if count and (fact != EARLY or row.unused > 0)  # a tracker may use these messages too
             ]
             if row.unused > 0 and not facts and not reasons:
                 reasons = [SILENT]
@@ -201,18 +204,18 @@ class Usage:
 
     @property
     def _is_by_topic(self) -> bool:
-        """Tell whether it is known of every topic what became of it, or there is nothing to know."""
+        """Test whether the outcome is known for every topic, or there is nothing to know."""
         named = all(_topic_in(why, self.measured) for why in self.skipped)
         return not self.measured or (named and (self.shares.is_known or not self.speaks))
 
 
 def _topic_in(why: str, topics: Iterable[str]) -> bool:
-    """Tell whether a reason is of one of these topics, which such reasons begin with."""
+    """Test whether a reason begins with one of these topics."""
     return any(why.startswith(f"topic {topic}:") for topic in topics)
 
 
 def _repeated(stream: Stream) -> AnyArray:
-    """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
+    """Find the messages that equal the one before them in all fields; NaN equals NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:
         same = np.diff(stream.publish_time_ns) == 0

@@ -1,4 +1,4 @@
-"""Lays streams of many runs end to end, reads them, and makes streams of what estimators return.
+"""Streams of many runs end to end: reading, merging in time order, and making output streams.
 
 Begin with `blocks`.
 """

@@ -1,4 +1,4 @@
-"""Lays the streams of many runs end to end in ragged columns, and merges their events in time order."""
+"""Streams of many runs in ragged columns, end to end, and their events merged in time order."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,35 +18,35 @@ Found = TypeVar("Found")
 
 
 class Findings(dict[Hashable, Columns]):
-    """Keeps what was worked out of columns, which never change: the last few things."""
+    """Cache of values computed from columns, which never change; the most recent entries are kept."""
 
     def __init__(self, most: int = 16) -> None:
         super().__init__()
         self._most = most
 
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return what `find` gives; it is called where the key is none of the last few."""
+        """Return the cached value of `key`, or the result of calling `find`, which is then cached."""
         try:
             known: Found = self[key]
             return known
         except KeyError:
             found = find()
         while len(self) >= self._most:
-            self.pop(list(self)[0], None)  # noqa: RUF015 other threads add to it meanwhile
+            self.pop(list(self)[0], None)  # noqa: RUF015 other threads may add entries
         kept: Found = self.setdefault(key, found)
         return kept
 
     def __reduce__(self) -> tuple[type["Findings"], tuple[int]]:
-        return Findings, (self._most,)  # another process finds it again
+        return Findings, (self._most,)  # another process computes the values again
 
 
 @dataclass(frozen=True)
 class Ragged:
-    """Holds one topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream.
+    """One topic of several runs; rows offsets[r]:offsets[r + 1] of the stream belong to run r.
 
     Attributes:
         stream: the rows of all runs, end to end.
-        offsets: (runs + 1,), where the runs begin, and the end of the last.
+        offsets: (runs + 1,), first row of each run, and the end of the last.
     """
 
     stream: Stream
@@ -54,11 +54,11 @@ class Ragged:
 
     @cached_property
     def findings(self) -> Findings:
-        """Keep what is found of these messages alone, such as the priors that they are."""
+        """Return the cache of values computed from these messages alone, such as priors."""
         return Findings()
 
     def __getitem__(self, name: str) -> AnyArray:
-        """Return the column of one field, all runs end to end."""
+        """Return the column of the field `name`, all runs end to end."""
         return self.stream.columns[name]
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class Ragged:
 
     @property
     def runs(self) -> int:
-        """Count how many runs there are, empty ones included."""
+        """Return the number of runs, including empty ones."""
         return len(self.offsets) - 1
 
     def of_run(self, run: int) -> Stream:
@@ -75,10 +75,11 @@ class Ragged:
 
 
 class Events(NamedTuple):
-    """Holds the messages of several topics in time order: run r owns offsets[r]:offsets[r + 1].
+    """Messages of several topics in time order; events offsets[r]:offsets[r + 1] belong to run r.
 
-    Event e is of the topic with index `topic[e]`, and message number `source[e]` of all topics laid end
-    to end. `is_last[e]` says that no later event of the run has its stamp: the moment for an estimate.
+    Event e is a message of the topic with index `topic[e]`, and message number `source[e]` of all
+    topics end to end. `is_last[e]` is true if no later event of the run has the same stamp: an estimate
+    is given then.
     """
 
     offsets: NDArray[np.int64]
@@ -92,14 +93,14 @@ CarriedType = TypeVar("CarriedType", bound=tuple[Columns, ...])
 
 
 class Block(NamedTuple):
-    """Holds what an estimator gets at once: a span of its topics, in all runs.
+    """Input of an estimator for one call: a span of its topics, in all runs.
 
     Attributes:
         streams: by topic.
-        events: the messages of all topics in the order in which they are taken.
-        arrival: (n, 2), of every event when it was taken and its place in the file, where that is not
-            its stamp's order alone; see `fuselog.replay.engine.replaying.late`.
-        findings: of a block that is replayed again; None of any other.
+        events: the messages of all topics in order of processing.
+        arrival: (n, 2), for every event the time at which it is processed and its position in the file,
+            if the order is not that of stamps alone; see `fuselog.replay.engine.replaying.late`.
+        findings: cache of a block that is replayed again; otherwise None.
     """
 
     streams: dict[str, Ragged]
@@ -108,11 +109,11 @@ class Block(NamedTuple):
     findings: Findings | None = None
 
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return what `find` finds of these messages, or an earlier replay has kept under `key`."""
+        """Return the cached value of `key`, or what `find` computes from these messages."""
         return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> AnyArray:
-        """Return one field of every event: the first of `names` that its topic has, else `missing`."""
+        """Return one field of every event: the first of `names` that its topic has, or `missing`."""
         parts = []
         for ragged in self.streams.values():
             found = [name for name in names if name in ragged.stream.columns]
@@ -121,20 +122,18 @@ class Block(NamedTuple):
 
 
 def copied(carried: CarriedType) -> CarriedType:
-    """Return a NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
+    """Copy a NamedTuple of arrays, which may contain other such NamedTuples."""
     columns: Columns = carried
     made: type[CarriedType] = type(carried)
     return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
 
 
 def of_runs(carried: CarriedType, runs: RowSlice) -> CarriedType:
-    """View the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
-
-    An entry may be such a NamedTuple itself.
+    """View the part of a NamedTuple of arrays (runs, ...) that belongs to some runs.
 
     Args:
         carried: a NamedTuple of arrays (runs, ...), or of such NamedTuples.
-        runs: which.
+        runs: slice of the runs.
     """
     columns: Columns = carried
     made: type[CarriedType] = type(carried)
@@ -144,11 +143,11 @@ def of_runs(carried: CarriedType, runs: RowSlice) -> CarriedType:
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the offsets that the chosen rows of ragged columns have, laid end to end.
+    """Compute the offsets of the chosen rows of ragged columns.
 
     Args:
-        chosen: (n,) which rows.
-        offsets: (runs + 1,) of all rows.
+        chosen: (n,) whether a row is chosen.
+        offsets: (runs + 1,) offsets of all rows.
     """
     if chosen.all():
         return offsets
@@ -156,15 +155,15 @@ def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArra
 
 
 def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the run of every row (n,) of ragged columns, from their offsets (runs + 1,)."""
+    """Return the run of every row (n,) of ragged columns, given their offsets (runs + 1,)."""
     return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
 def by_runs(parts: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order rows of several parts, laid end to end, so that each run's stand together.
+    """Order the rows of several parts, end to end, so that the rows of each run are together.
 
     Args:
-        parts: the offsets (runs + 1,) of each.
+        parts: offsets (runs + 1,) of each part.
 
     Returns:
         The order (n,) of the rows, and their offsets.
@@ -179,11 +178,11 @@ def filled_rows(
     """Find the filled rows of ragged columns.
 
     Args:
-        offsets: (runs + 1,), where the rows of each run begin.
-        end: (runs,), where its filled ones end.
+        offsets: (runs + 1,), first row of each run.
+        end: (runs,), end of its filled rows.
 
     Returns:
-        The filled rows (n,), or a slice of all, and the offsets (runs + 1,) that these have end to end.
+        The filled rows (n,), or a slice of all, and their offsets (runs + 1,).
     """
     if (end == offsets[1:]).all():
         return slice(None), offsets
@@ -193,7 +192,7 @@ def filled_rows(
 
 
 def is_in_order(runs: Ragged, order: Clock) -> bool:
-    """Tell whether every run's messages go by one of the clocks, and by their places in the file.
+    """Test whether every run's messages are sorted by a clock and by their positions in the file.
 
     Args:
         runs: the messages of a topic, in all runs.
@@ -203,13 +202,13 @@ def is_in_order(runs: Ragged, order: Clock) -> bool:
     ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
     if ordered.all():
         return True
-    begins = runs.offsets[1:-1]  # where another run begins, or none is left
+    begins = runs.offsets[1:-1]  # where another run begins, or the rows end
     ordered[begins[(begins > 0) & (begins < len(clock))] - 1] = True
     return bool(ordered.all())
 
 
 def gather(parts: Sequence[Stream]) -> Ragged:
-    """Lay the runs' streams of one topic end to end."""
+    """Concatenate the runs' streams of one topic."""
     counts = [len(part) for part in parts]
     offsets = np.zeros(len(parts) + 1, np.int64)
     np.cumsum(counts, out=offsets[1:])
@@ -218,7 +217,7 @@ def gather(parts: Sequence[Stream]) -> Ragged:
 
 
 def join(parts: Sequence[Ragged]) -> Ragged:
-    """Join blocks of one topic, each run's rows together."""
+    """Join blocks of one topic, with the rows of each run together."""
     if len(parts) == 1:
         return parts[0]
     order, offsets = by_runs([part.offsets for part in parts])
@@ -227,7 +226,7 @@ def join(parts: Sequence[Ragged]) -> Ragged:
 
 
 def side_by_side(parts: Sequence[Ragged]) -> Ragged:
-    """Lay the first runs of all parts end to end, then all second ones, and so on."""
+    """Concatenate the first runs of all parts, then all second runs, and so on."""
     counts = np.stack([np.diff(part.offsets) for part in parts], axis=1)
     places = np.arange(counts.size).reshape(counts.shape)
     run = np.concatenate([np.repeat(*of_part) for of_part in zip(places.T, counts.T, strict=True)])
@@ -237,7 +236,7 @@ def side_by_side(parts: Sequence[Ragged]) -> Ragged:
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
-    """Merge messages of the topics in time order, run by run; equal stamps keep the file's order.
+    """Merge messages of the topics in time order, run by run; equal stamps keep the order of the file.
 
     Args:
         streams: by topic, in all runs.
@@ -260,17 +259,17 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
 
 
 def _in_order(ragged: Ragged, order: Clock) -> Events:
-    """Return the messages of the only topic."""
+    """Make the events of a single topic."""
     times_ns, offsets, count = ragged.stream.times(order), ragged.offsets, len(ragged)
     is_last = last_of_equals(offsets, times_ns)
     return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
 
 
 def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell whether a row (n,) is the last of its run, or the next one differs in one of the columns.
+    """Test whether each row (n,) is the last of its run, or differs from the next row in some column.
 
     Args:
-        offsets: (runs + 1,), where the rows of each run begin.
+        offsets: (runs + 1,), first row of each run.
         columns: (n,) each.
     """
     is_last = np.zeros(len(columns[0]), bool)
@@ -288,14 +287,15 @@ def merge_run(
     events: Events,
     heads: NDArray[np.int64],
 ) -> None:
-    """Merge the sorted topics of one run in time order; equal stamps keep the file's order.
+    """Merge the sorted topics of one run in time order; equal stamps keep the order of the file.
 
     Args:
-        run: which.
-        bounds: (topics, runs + 1), where the messages of each topic begin in each run, and the last end.
-        times_ns, positions: (n,) of the messages of all topics end to end: stamp, and place in the file.
-        events: of all runs, filled for this one.
-        heads: (topics,), to work in.
+        run: number of the run.
+        bounds: (topics, runs + 1), first message of each topic in each run, and the end of the last.
+        times_ns, positions: (n,) stamp and position in the file of the messages of all topics, end to
+            end.
+        events: events of all runs, filled for this one.
+        heads: (topics,), work space.
     """
     for k in range(len(heads)):
         heads[k] = bounds[k, run]

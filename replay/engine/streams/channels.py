@@ -1,4 +1,4 @@
-"""Reads what the channels of a log state, and finds the topics that estimators bind to."""
+"""Numbers that the channels of a log state, and the search for topics that estimators bind to."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -19,13 +19,13 @@ def stated(
     needed: bool = True,
     stands_for: str = "",
 ) -> float:
-    """Return the first number of this name that one of the channels states; NaN where none needs to.
+    """Return the first number with this name that a channel states; NaN if it is missing and not needed.
 
-    A channel may state `sigma_m` as its square, `variance_m2`, and the other way round.
+    A channel may state `sigma_m` as its square, `variance_m2`, and vice versa.
 
-    Where it stands for a parameter, that is of the type `parameters`, and called `stands_for` there if
-    that is another name. Raises BadInput where none states it though it is needed, it is no number, or
-    the parameter does not take it.
+    If the number is the value of a parameter, `parameters` is the type that checks it, and `stands_for`
+    is the parameter's name if it differs. Raises BadInput if a needed number is missing, if it is not a
+    number, or if the parameter does not accept it.
     """
     for topic in topics:
         if name in topic.metadata:
@@ -40,12 +40,12 @@ def stated(
     return np.nan
 
 
-# Of a number, another name that channels have for a power of it, and which power that takes back.
+# For a number: the name under which channels state a power of it, and the exponent that inverts it.
 _POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
 
 
 class _Noise(Parameters):  # type: ignore[explicit-any]
-    """States what these are: positive numbers."""
+    """Validator of these numbers, which must be positive."""
 
     sigma_m: PositiveFloat = 1.0
     variance_m2: PositiveFloat = 1.0
@@ -67,34 +67,34 @@ def _number(
 
 
 def heading_variance(metadata: Mapping[str, str]) -> float:
-    """Return the variance (rad^2) that a channel of orientations states about up; NaN where it is none.
+    """Return the variance (rad^2) about the vertical axis that a channel states; NaN if not positive.
 
-    It states one number for all axes, or the covariance about x, y and z.
+    The channel states one number for all axes, or the variances about x, y and z.
     """
     numbers = [float(each) for each in metadata.get("covariance_rad2", "nan").split(",")]
     return numbers[-1] if numbers[-1] > 0.0 else np.nan
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
-    """Return a parameter; where it is None, what a channel states for it. Errors as `stated`.
+    """Return a parameter or, if it is None, what a channel states for it. Errors as in `stated`.
 
     Args:
         values: the parameters.
-        topics: asked in this order.
-        name: of the parameter.
+        topics: searched in this order.
+        name: name of the parameter.
     """
     value = getattr(values, name)
     return stated(topics, name, type(values)) if value is None else float(value)
 
 
 def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) -> dict[int, Topic]:
-    """Return the topics /STEM<N>/LEAF of a schema, by N in order.
+    """Return the topics /STEM<N>/LEAF of a schema, sorted by N.
 
     Args:
-        topics: of the log, by name.
-        stem: in front of the number.
-        leaf: behind it.
-        schema: that the topics have to have.
+        topics: topics of the log, by name.
+        stem: part of the name before the number.
+        leaf: part of the name after it.
+        schema: schema that the topics must have.
     """
     found = {}
     for topic in topics.values():
@@ -108,12 +108,12 @@ def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) 
 def bindings(
     topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, Topic]]]:
-    """Find where a log has all the topics asked for, with their schemas: prefix, and topics by name.
+    """Yield each prefix under which a log has all requested topics, and these topics by name.
 
-    Those that are optional may be absent.
+    Optional topics may be missing.
 
-    A name with a slash in front, such as `/landmarks`, is a topic for all; others, such as `odometry`,
-    are looked for under every prefix: `/robot1/odometry`, `/robot2/odometry`.
+    A name with a leading slash, such as `/landmarks`, is the same for all prefixes; other names, such
+    as `odometry`, are searched under every prefix: `/robot1/odometry`, `/robot2/odometry`.
     """
     own = [name for name in asked if not name.startswith("/") and name not in optional]
     end = f"/{own[0]}" if own else ""
@@ -130,10 +130,10 @@ def bindings(
 
 
 def resolved(name: str, prefix: str) -> str:
-    """Return a topic's full name under a prefix; one with a slash in front is the same for all.
+    """Return a topic's full name under a prefix; a name with a leading slash is not changed.
 
     Args:
-        name: as an estimator or model has it.
+        name: as an estimator or model states it.
         prefix: such as `/robot1`.
     """
     return name if name.startswith("/") or not name else f"{prefix}/{name}"

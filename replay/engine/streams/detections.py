@@ -1,6 +1,6 @@
-"""Places detections of scans in the plane: of which scan each is, and where its sensor was then.
+"""Positions of detections in the local tangent plane, from the scan of each and its sensor's position.
 
-A sensor that moves names the topic of its own position in the metadata of its scans, as ORIGIN.
+A moving sensor names the topic of its own position in the metadata of its scans, as ORIGIN.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def rows_of(scan: Stream, detected: Stream) -> Integers:
 
 
 def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
-    """Return where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
+    """Return the positions (n, 2) of a sensor at its scans: its last fix, or zero without fixes."""
     if fix is None:
         return np.zeros((len(scan), 2))
     last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
@@ -27,6 +27,6 @@ def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
 
 
 def detected_places(scan: Stream, detected: Stream, fix: Stream | None) -> Floats:
-    """Return where the detections are in the plane, (n, 2)."""
+    """Return the positions (n, 2) of the detections in the local tangent plane."""
     own = places_of_sensor(scan, fix)[rows_of(scan, detected)]
     return own + read_vectors(detected, "position_m", PLANE)

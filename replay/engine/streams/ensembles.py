@@ -1,4 +1,4 @@
-"""Holds runs that are replayed together, laid end to end by topic; what was found of them is kept."""
+"""Ensembles of runs that are replayed together, with their streams end to end by topic and cached."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -18,15 +18,15 @@ from fuselog.replay.engine.streams.blocks import (
 from fuselog.replay.engine.streams.sources import MemorySource, Source
 
 SourceType = TypeVar("SourceType", bound=Source)
-# Of a block of few messages it is kept what a few filters make of it: of more that takes much memory.
+# Blocks of few messages cache the findings of a few filters; larger blocks would take too much memory.
 FEW_MESSAGES, FEW_FILTERS = 1 << 13, 4
 
 
 class Ensemble(list[SourceType]):
-    """Represents runs that are replayed together: they hold the same topics.
+    """List of runs that are replayed together and have the same topics.
 
-    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept,
-    with what was found of them (`findings`); no run may be added to it or taken from it.
+    An ensemble is replayed many times, so topics that are in memory are concatenated once and cached,
+    together with what was computed from them (`findings`). Runs must not be added or removed.
     """
 
     def __init__(self, sources: Iterable[SourceType]) -> None:
@@ -40,12 +40,12 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def starts_ns(self) -> dict[int, int]:
-        """Find where the replayed spans begin, by run; of those that do not begin with their run."""
+        """Return by run where its replayed span starts, if that is not the start of the run."""
         starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
         return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
 
     def require_alike(self, topics: Iterable[str]) -> None:
-        """Raise BadInput where a run does not hold these topics as the first one does."""
+        """Raise BadInput if a run differs from the first in the schema or metadata of these topics."""
         first = self[0]
         for topic in topics:
             if topic in self._alike:
@@ -62,7 +62,7 @@ class Ensemble(list[SourceType]):
             self._alike.add(topic)
 
     def read(self, topics: Sequence[str]) -> dict[str, Ragged]:
-        """Return whole topics, in publish-time order."""
+        """Read whole topics in publish-time order."""
         if self._recordings:
             return self._laid_out(topics, "publish_time")
         runs = [source.read(topics) for source in self]
@@ -71,9 +71,9 @@ class Ensemble(list[SourceType]):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Ragged]]:
-        """Return the next block of every run, until all runs are at their end.
+        """Yield the next block of every run, until all runs have ended.
 
-        The runs need not be at the same time: each has its own state. Recordings are one block.
+        The runs need not be at the same time, because each has its own state. Recordings are one block.
         """
         if not topics:
             return
@@ -92,7 +92,7 @@ class Ensemble(list[SourceType]):
             }
 
     def block(self, streams: dict[str, Ragged], order: Clock) -> Block:
-        """Return messages with their order in time; of whole recordings as they were found before."""
+        """Merge messages in time order; the order of whole recordings is cached."""
 
         def merged(findings: Findings | None = None) -> Block:
             return Block(streams, merge_events(streams, order), findings=findings)
@@ -105,22 +105,22 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def _recordings(self) -> list[MemorySource]:
-        """Return the runs, where all are in memory."""
+        """Return the runs if all are in memory, otherwise an empty list."""
         found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
         return found if len(found) == len(self) else []
 
     @property
     def is_in_memory(self) -> bool:
-        """Tell whether all runs are recordings."""
+        """Test whether all runs are recordings in memory."""
         return bool(self._recordings)
 
     @cached_property
     def _are_whole(self) -> bool:
-        """Tell whether all runs are in memory, without spans."""
+        """Test whether all runs are in memory and are replayed as a whole."""
         return bool(self._recordings) and all(run.is_whole for run in self._recordings)
 
     def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
-        """Return topics of recordings, each run by one of the clocks."""
+        """Return topics of recordings, each run in the order of a clock."""
         for topic in topics:
             if (topic, order) not in self._kept:
                 together = gather([source.stream_of(topic) for source in self._recordings])
@@ -131,5 +131,5 @@ class Ensemble(list[SourceType]):
 
 
 def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:
-    """Return the ensemble of these runs, which may be one already."""
+    """Return the ensemble of these runs; `sources` may already be one."""
     return sources if isinstance(sources, Ensemble) else Ensemble(sources)

@@ -1,7 +1,7 @@
-"""States and reads which runs an estimator could not follow to the end, when and why.
+"""Failures of runs: which runs an estimator could not process to the end, when and why.
 
-A failure is a message whose number stands for a sentence; the channel's metadata lists the sentences as
-JSON. Streams that differ only in their lists are one stream when they are joined.
+A failure is a message whose number is an index in a list of sentences; the channel's metadata has the
+list as JSON. Streams whose lists differ are merged into one stream when they are joined.
 """
 
 import json
@@ -22,14 +22,14 @@ UNSTATED = "no reason given"
 
 
 class Failure(NamedTuple):
-    """Says when and why a run failed."""
+    """Time and reason of the failure of a run."""
 
     time_ns: int
     reason: str
 
 
 def reason_of(error: Exception) -> str:
-    """Return an exception's text: the sentence itself where it is one of ours."""
+    """Return the text of an exception; for one of ours, the message alone."""
     if isinstance(error, BadInput) and error.__cause__ is None:
         return str(error)
     raised = error.__cause__ if isinstance(error, BadInput) else error
@@ -37,11 +37,11 @@ def reason_of(error: Exception) -> str:
 
 
 def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
-    """Return one message for each failure, on `topic`.
+    """Make a stream with one message for each failure.
 
     Args:
-        topic: to be written.
-        failures: when and why.
+        topic: topic of the stream.
+        failures: time and reason of each.
     """
     if not failures:
         return empty_stream(topic, schemas.FAILURE, {REASONS: "[]"})
@@ -62,13 +62,13 @@ def reason_stream(
     reason: NDArray[np.int64],
     reasons: Iterable[str],
 ) -> Stream:
-    """Return messages (n,) of a schema whose only field, `reason`, counts in a list of sentences.
+    """Make a stream of messages (n,) whose only field, `reason`, is an index in a list of sentences.
 
     Args:
-        topic: to be written.
-        schema: with the field `reason`.
+        topic: topic of the stream.
+        schema: a schema with the field `reason`.
         time_ns: (n,) stamps.
-        reason: (n,) numbers in the list.
+        reason: (n,) indices in the list.
         reasons: the sentences.
     """
     return make_stream(
@@ -77,9 +77,9 @@ def reason_stream(
 
 
 def sentences_of(stream: Stream) -> list[str]:
-    """Return the reason of every message of a stream of `reason_stream`.
+    """Return the reason of every message of a stream made by `reason_stream`.
 
-    Raises BadInput where the channel's list is not one of sentences in JSON, as in logs before 0.1.0.
+    Raises BadInput if the channel's list is not a JSON list of sentences, as in logs from before 0.1.0.
     """
     reasons = _reasons(stream)
     return [
@@ -88,7 +88,7 @@ def sentences_of(stream: Stream) -> list[str]:
 
 
 def join_streams(parts: Sequence[Stream]) -> Stream:
-    """Join parts of one topic in the order given; lists of reasons that differ become one.
+    """Join parts of one topic in the given order; different lists of reasons are merged.
 
     Raises BadInput as `concatenate` and `sentences_of` do.
     """
@@ -101,7 +101,7 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
 
 
 def _renumbered(part: Stream, merged: list[str], metadata: Mapping[str, str]) -> Stream:
-    """Renumber a part by the merged list; what its own list lacks stays beyond it."""
+    """Renumber a part by the merged list; indices beyond its own list stay out of range."""
     places = np.array([*map(merged.index, _reasons(part)), len(merged)])
     numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
     columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}

@@ -1,6 +1,6 @@
-"""Converts geodetic fixes to positions in the log's plane: east, north and up from one origin.
+"""Conversion of geodetic fixes to positions in the log's local tangent plane (ENU).
 
-The origin is what the log's channels state, else a run's first fix.
+The origin is the one that the log's channels state, otherwise the first fix of the run.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,10 +21,10 @@ GEODETIC = schemas.GEODETIC_FIX.full_name
 
 
 def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:
-    """Return latitude and longitude in deg and altitude in m (3,) that channels state; else None.
+    """Return the origin that channels state (3,): latitude and longitude in deg, altitude in m; or None.
 
-    An altitude that is not stated is zero. Raises BadInput where channels state different origins, or
-    one states half of one.
+    An altitude that is not stated is zero. Raises BadInput if channels state different origins, or if a
+    channel states only half of one.
     """
     found: dict[str, tuple[float, ...]] = {}
     for topic in topics.values():
@@ -51,7 +51,7 @@ def _in_words(origin: Iterable[float]) -> str:
 
 
 def origins_of(fixes: Ragged) -> Floats:
-    """Return the first fix (runs, 3) of every run, in deg, deg and m; NaN where a run has none."""
+    """Return the first fix (runs, 3) of every run in deg, deg and m; NaN if a run has none."""
     has_one = np.diff(fixes.offsets) > 0
     rows = fixes.offsets[:-1][has_one]
     origins = np.full((fixes.runs, 3), np.nan)
@@ -62,14 +62,15 @@ def origins_of(fixes: Ragged) -> Floats:
 
 
 def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
-    """Return a topic of geodetic fixes as one of positions (n, 3) about the origins (runs, 3).
+    """Convert geodetic fixes to positions (n, 3) relative to origins (runs, 3).
 
-    What a fix lacks (its altitude, say) is NaN. Covariances (n, 9) are turned from the axes of the fix
-    to those of the origin; a log may have them diagonal or full, of east and north alone or with up.
+    A missing value, such as the altitude, becomes NaN. Covariances (n, 9) are rotated from the axes of
+    the fix to those of the origin; a log may state them diagonal or full, for east and north only or
+    including up.
 
     Args:
-        fixes: latitudes, longitudes and altitudes, in all runs.
-        origins: (runs, 3) latitudes, longitudes and altitudes, see `origins_of`.
+        fixes: latitudes, longitudes and altitudes of all runs.
+        origins: (runs, 3) latitudes and longitudes in deg, altitudes in m, see `origins_of`.
     """
     stream = fixes.stream
     origin = origins[run_of_rows(fixes.offsets)]
@@ -87,10 +88,7 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
 
 
 def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
-    """Turn the fixes' covariances (n, 9) to other axes (n, 3, 3) than their own.
-
-    NaN where they lack them.
-    """
+    """Rotate the fixes' covariances (n, 9) from their own axes to `axes` (n, 3, 3); NaN if missing."""
     given = stream.columns.get("covariance_m2", np.empty((len(stream), 0)))
     size = {0: 0, 2: 2, 3: 3, 4: 2, 9: 3}.get(given.shape[1])
     if size is None:

@@ -1,4 +1,4 @@
-"""Asks the checks of a log about a source: a file, a recording, or either with alterations."""
+"""Checks of a source with the linter for logs: a file, a recording, or either with alterations."""
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_se
 
 @without_warnings_of_numbers()
 def lint_source(source: LogSource | MemorySource, *, portions: int | None = None) -> list[Finding]:
-    """Return what is wrong with a source as it is written; see `lint` for `portions`.
+    """Check a source as it was recorded, and return the findings; see `lint` for `portions`.
 
     Raises BadInput if the log is damaged.
     """
@@ -31,7 +31,7 @@ def lint_source(source: LogSource | MemorySource, *, portions: int | None = None
 
 
 def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
-    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
+    """Yield a sentence on the worst finding of a log and where to see the others, if there are any."""
     if found:
         others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
         sure = "hint" if found[0].severity == "hint" else "implausible"
@@ -39,7 +39,7 @@ def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
 
 
 def of_first_messages(sources: Sequence[LogSource | MemorySource]) -> list[str]:
-    """Return what the first portion of each source says of its own faults, for a report."""
+    """Check the first portion of each source, and return the findings as sentences for a report."""
     many = len(sources) > 1
     return [
         f"{source.name}: {each.sentence}" if many else each.sentence

@@ -1,4 +1,4 @@
-"""Reads vectors that sensors measure, and their covariances, by the components that streams state."""
+"""Measured vectors and their covariances, read by the components that streams state."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,7 +16,7 @@ from fuselog.replay.engine.vectors.components import Components, match_component
 Floats = NDArray[np.float64]
 PLANE: Components = {"x_m": "linear", "y_m": "linear"}
 SPACE: Components = {**PLANE, "z_m": "linear"}
-# What the numbers of a field are where the channel does not say, by how many there are.
+# Components of a field if the channel does not state them, by their number.
 _IMPLIED = {
     ("position_m", 2): "x_m,y_m",
     ("position_m", 3): "x_m,y_m,z_m",
@@ -26,12 +26,12 @@ _IMPLIED = {
 
 
 class Vectors(NamedTuple):
-    """Holds what is wanted of the vectors of a topic.
+    """Specification of the vectors to read from a topic.
 
     Attributes:
-        fields: by field, the components, or how many numbers where the schema says what they are.
-        covariance: the field that holds the covariance of the first, row-major; "" where none does.
-        sigma: the parameter that stands where the log lacks a covariance.
+        fields: by field, the components, or the number of components if the schema defines them.
+        covariance: field with the covariance of the first field, row-major; "" if there is none.
+        sigma: parameter that is used if the log lacks a covariance.
     """
 
     fields: Mapping[str, Components | int]
@@ -39,16 +39,16 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Say why messages of `topic` were not used; "" where no covariance could be missing."""
+        """Return why messages of `topic` were not used; "" if no covariance can be missing."""
         mend = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
 
 
 class MeasuredVectors(NamedTuple):
-    """Holds measured vectors (n, d), their covariances (n, d, d), and what is missing (n,) of these.
+    """Measured vectors (n, d), their covariances (n, d, d), and which covariances are missing (n,).
 
-    A covariance that the log lacks (NaN, or a variance of zero) is that of the given sigma, and missing
-    where none is given. Components of the vector that are NaN need none.
+    A covariance that the log lacks (NaN, or a variance of zero) is replaced by that of the given sigma;
+    without a sigma it is missing. Components of the vector that are NaN need no covariance.
     """
 
     value: Floats
@@ -57,14 +57,14 @@ class MeasuredVectors(NamedTuple):
 
 
 def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
-    """Return the wanted components (n, d) of a vector field, in the order wanted.
+    """Read the wanted components (n, d) of a vector field, in the wanted order.
 
-    The channel's metadata names them; positions of two or three numbers need no names. Raises BadInput
-    where a component is missing, or the vectors have another width than the channel states.
+    The channel's metadata names the components; positions of two or three numbers need no names. Raises
+    BadInput if a component is missing, or if the vectors have another width than the channel states.
 
     Args:
         stream: the messages.
-        field: the vector's.
+        field: field of the vector.
         wanted: components by name, with their kinds.
     """
     if not len(stream):
@@ -76,18 +76,18 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
 def read_fixes(
     stream: Stream, field: str, covariance: str, wanted: Components, sigma: float | None
 ) -> MeasuredVectors:
-    """Read wanted components of a vector field and its covariance, row-major or diagonal in another.
+    """Read wanted components of a vector field, and their covariance from another field.
 
-    `sigma` of every component stands where the covariance is unknown. A position in the plane serves
-    where one in space is wanted: its height is NaN. Raises BadInput as `read_vectors`, and where the
-    covariance has another width than the vector.
+    The covariance may be full (row-major) or diagonal. A horizontal position is accepted if a 3D
+    position is wanted; its height is NaN. Raises BadInput as `read_vectors` does, and if the covariance
+    has another width than the vector.
 
     Args:
         stream: the messages.
-        field: the vector's.
-        covariance: the field of its covariance.
+        field: field of the vector.
+        covariance: field of its covariance.
         wanted: components by name, with their kinds.
-        sigma: of every component where a message states no covariance; None for unknown.
+        sigma: standard deviation of every component if a message states no covariance; None if unknown.
     """
     stream = _in_space(stream, field, covariance, wanted)
     value = read_vectors(stream, field, wanted)
@@ -108,7 +108,7 @@ def read_fixes(
 
 
 def unknown(covariance: Floats) -> NDArray[np.bool_]:
-    """Find which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
+    """Find invalid covariances (n, d, d): NaN, or with a variance that is not positive."""
     smallest = over_columns(np.minimum, np.diagonal(covariance, axis1=1, axis2=2))
     entries = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
     is_none: Booleans = ~(smallest > 0.0) | np.isnan(over_columns(np.add, entries))
@@ -116,14 +116,14 @@ def unknown(covariance: Floats) -> NDArray[np.bool_]:
 
 
 def matrices(stream: Stream, field: str, covariance: str) -> Floats:
-    """Read the covariances (n, d, d) of a vector field of d numbers, stated whole or as diagonals.
+    """Read the covariances (n, d, d) of a vector field of d numbers, stored in full or as diagonals.
 
-    Raises BadInput where they have another width.
+    Raises BadInput if they have another width.
 
     Args:
         stream: the messages.
-        field: the vector's.
-        covariance: the field of its covariance.
+        field: field of the vector.
+        covariance: field of its covariance.
     """
     size, width = stream[field].shape[1], stream[covariance].shape[1]
     if width == size**2:
@@ -137,12 +137,12 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
 
 
 def covariances_of(stream: Stream, wanted: Components) -> Floats:
-    """Compute the covariances (n, t, t) of the wanted components of states, in the tangent space.
+    """Read the covariances (n, t, t) of the wanted components of states, in the tangent space.
 
-    Raises BadInput where the channel lacks one of the components.
+    Raises BadInput if the channel lacks one of the components.
 
     Args:
-        stream: of states.
+        stream: stream of states.
         wanted: components by name, with their kinds.
     """
     at = match_tangent(stream.metadata, wanted, f"topic {stream.topic}")
@@ -152,7 +152,7 @@ def covariances_of(stream: Stream, wanted: Components) -> Floats:
 
 
 def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -> Stream:
-    """Return positions in the plane as such in space, of unknown height, where that is wanted."""
+    """Convert horizontal positions to 3D positions of unknown height, if these are wanted."""
     is_plane = field == "position_m" and len(stream) and stream[field].shape[1] == 2
     if not is_plane or "z_m" not in wanted or "components" in stream.metadata:
         return stream
@@ -166,14 +166,17 @@ def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -
 def numbers_of(
     stream: Stream, vectors: Vectors | None, parameters: object
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Lay the fields after the sensor's clock side by side (n, width); which (n,) lack a covariance.
+    """Combine the fields after the sensor's clock in a table (n, width), and find missing covariances.
 
-    Raises BadInput where vectors are not what is wanted.
+    Raises BadInput if vectors do not have the wanted form.
 
     Args:
         stream: the messages.
-        vectors: how vector fields are read; None for as they are.
-        parameters: the estimator's.
+        vectors: how to read vector fields; None to read them as they are.
+        parameters: the estimator's parameters.
+
+    Returns:
+        The table, and whether each row (n,) lacks a covariance.
     """
     fields = {} if vectors is None else vectors.fields
     columns = {entry.name: stream[entry.name] for entry in stream.schema}
@@ -194,12 +197,12 @@ def numbers_of(
 
 
 def check_width(stream: Stream, field: str, width: int) -> None:
-    """Raise BadInput where a vector field does not have so many numbers.
+    """Raise BadInput if a vector field does not have `width` numbers.
 
     Args:
         stream: the messages.
-        field: the vector's.
-        width: how many numbers it has to have.
+        field: field of the vector.
+        width: required number of components.
     """
     if len(stream) and stream[field].shape[1] != width:
         raise BadInput(
@@ -208,7 +211,7 @@ def check_width(stream: Stream, field: str, width: int) -> None:
 
 
 def _stated(stream: Stream, field: str) -> Mapping[str, str]:
-    """Read the channel's names and kinds, or those that the field implies; checked against the width."""
+    """Return names and kinds as the channel states or the field implies them; check their number."""
     width = stream[field].shape[1]
     stated = stream.metadata
     if "components" not in stated:

@@ -1,8 +1,8 @@
-"""Takes positions from one tangent plane into another: east, north and up of another origin.
+"""Transformation of positions between local tangent planes (ENU) with different origins.
 
-The two planes are turned and shifted against each other as the earth is round. What lacks a height is
-taken to be as high above the ellipsoid as the origin of its plane: where it is 100 m higher, and the
-other origin 1 km away, it comes out 2 cm wrong.
+The two planes are rotated and shifted against each other because the earth is curved. A position
+without a height is assumed to be as high above the ellipsoid as the origin of its plane; if it is 100 m
+higher and the other origin is 1 km away, the result is 2 cm off.
 """
 
 from collections.abc import Mapping
@@ -21,10 +21,10 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.components import in_body_axes, stated_components
 from fuselog.replay.engine.vectors.tangent import manifold_blocks, tangent_components
 
-# Components of one vector in the log's frame, which turn together; the first is the position.
+# Components of one vector in the log's frame, which rotate together; the first vector is the position.
 VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]
 HEADING = "heading_rad"
-# Fields that are vectors in the axes of the plane, and their covariances; positions shift as well.
+# Fields that are vectors in the axes of the plane, and their covariances; positions are also shifted.
 _FIELDS = {
     schemas.POSITION_FIX.full_name: ("position_m", "covariance_m2"),
     schemas.VELOCITY_FIX.full_name: ("velocity_mps", "covariance_m2ps2"),
@@ -36,7 +36,7 @@ _STATES = {schemas.TRUTH_STATE.full_name: "state", schemas.GAUSSIAN_ESTIMATE.ful
 
 
 class Movement(NamedTuple):
-    """Holds the transform p -> scale rotation p + translation_m from one frame to another."""
+    """Transform p -> scale rotation p + translation_m from one frame to another."""
 
     rotation: Floats = np.eye(3)
     translation_m: Floats = np.zeros(3)
@@ -44,19 +44,19 @@ class Movement(NamedTuple):
 
     @property
     def yaw_rad(self) -> float:
-        """Compute how far it turns about the vertical."""
+        """Return the rotation about the vertical axis, in rad."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
     @property
     def quaternion(self) -> Floats:
-        """Return its rotation (4,): w, x, y, z."""
-        from scipy.spatial.transform import Rotation  # which takes long to import
+        """Return the rotation as a quaternion (4,): w, x, y, z."""
+        from scipy.spatial.transform import Rotation  # slow to import
 
         return np.asarray(Rotation.from_matrix(self.rotation).as_quat(scalar_first=True))
 
 
 def between(origin: Origin, other: Origin) -> Movement:
-    """Return the transform from the plane of an origin into that of another one."""
+    """Compute the transform from the local tangent plane of one origin to that of another."""
     axes, others = (tangent_axes(*each[:2]) for each in (origin, other))
     return Movement(others @ axes.T, np.array(into_tangent_plane(origin, other), float))
 
@@ -64,15 +64,15 @@ def between(origin: Origin, other: Origin) -> Movement:
 def moved_states(
     components: Mapping[str, str], mean: Floats, movement: Movement
 ) -> tuple[Floats, Floats]:
-    """Move states (n, d) into another frame, with the Jacobian (t, t) of this in the tangent space.
+    """Transform states (n, d) into another frame, and compute the Jacobian (t, t) in the tangent space.
 
-    Positions and velocities turn, headings and orientations as well; the latter have their covariance in
-    the body's frame, where it stays. All other components are taken to be of the body.
+    Positions, velocities, headings and orientations are rotated. The covariance of an orientation is in
+    the body's frame and does not change. All other components are assumed to be in the body's frame.
 
     Args:
-        components: those of the state by name, with their kinds.
+        components: components of the state by name, with their kinds.
         mean: (n, d).
-        movement: from the frame of the states to the other one.
+        movement: transform from the frame of the states to the other one.
 
     Returns:
         The states (n, d), and the Jacobian (t, t).
@@ -100,10 +100,10 @@ def moved_states(
 
 
 def into_plane_of(stream: Stream, origin: Origin) -> Stream:
-    """Return a stream that states the origin of its plane, in the plane of another one.
+    """Transform a stream from the local tangent plane whose origin it states to that of another origin.
 
-    Latitudes and longitudes stay: what is stated of them is the plane that they are taken into. Raises
-    BadInput where it is not known how such messages are taken into another plane.
+    Latitudes and longitudes do not change; only the stated origin does. Raises BadInput if such
+    messages cannot be transformed.
     """
     own = stated_in(stream.topic, stream.metadata)
     if own is None or own == origin:
@@ -132,7 +132,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
 
 
 def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
-    """Return the fields of messages that are vectors or directions in the axes of the plane."""
+    """Transform the fields of messages that are vectors or directions in the axes of the plane."""
     field, covariance = _FIELDS[stream.schema.full_name]
     if not len(stream):  # vectors have no width here
         return {}
@@ -156,14 +156,14 @@ def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
 
 
 def _below(place_m: Floats, movement: Movement) -> Floats:
-    """Return what flat places (n, 2) lack in another plane, since the earth falls off below theirs."""
+    """Compute the correction of 2D positions (n, 2) for the earth's curvature below their plane."""
     fall_m = np.sum(place_m**2, axis=1) / (2.0 * SEMI_MAJOR_M)
     moved_m: Floats = -fall_m[:, None] * movement.rotation[:2, 2]
     return moved_m
 
 
 def _turned(covariance: Floats, jacobian: Floats) -> Floats:
-    """Return covariances (n, d d) in other axes; what is unknown stays so."""
+    """Rotate covariances (n, d d) to other axes; unknown entries stay NaN."""
     size, unknown = len(jacobian), np.isnan(covariance)
     known = np.where(unknown, 0.0, covariance).reshape(-1, size, size)
     turned = (jacobian @ known @ jacobian.T).reshape(len(covariance), size * size)

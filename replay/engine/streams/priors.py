@@ -1,4 +1,4 @@
-"""Reads priors by component names; a run without a usable prior fails alone."""
+"""Priors, read by component names; a run without a usable prior fails on its own."""
 
 from collections.abc import Mapping
 from functools import lru_cache, partial
@@ -27,13 +27,13 @@ NOT_POSITIVE_DEFINITE = "the prior's covariance is not positive definite"
 
 
 class Priors(NamedTuple):
-    """Holds the first Gaussian of every run, its components in the order in which they were wanted.
+    """First Gaussian of every run, with its components in the wanted order.
 
     Attributes:
         time_ns: (runs,) stamps.
         mean: (runs, d).
         covariance: (runs, t, t) in the tangent space.
-        reasons: (runs,) why a prior cannot be used, "" where it can; then its numbers are NaN.
+        reasons: (runs,) why a prior cannot be used, "" if it can; an unusable prior is NaN.
     """
 
     time_ns: NDArray[np.int64]
@@ -43,14 +43,14 @@ class Priors(NamedTuple):
 
 
 def priors_of(prior: Ragged, components: Components) -> Priors:
-    """Return the priors of all runs; see `Priors`.
+    """Read the priors of all runs; see `Priors`.
 
-    Raises BadInput where the channel does not state the components (see `match_components`), or the
+    Raises BadInput if the channel does not state the components (see `match_components`), or if the
     vectors have other widths than it states.
 
     Args:
         prior: Gaussian estimates of all runs.
-        components: wanted, by name, with their kinds.
+        components: wanted components by name, with their kinds.
     """
     stream, runs = in_body_axes(prior.stream), prior.runs
     where = f"topic {stream.topic}"
@@ -84,7 +84,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
 
 class _Layout(NamedTuple):
-    """Describes how many components a channel states, tangent space too, and where the wanted stand."""
+    """Number of components that a channel states, in both spaces, and indices of the wanted ones."""
 
     stated: int
     tangent: int
@@ -94,10 +94,7 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
-    """Make the layout of a channel that states these names and kinds.
-
-    Raises BadInput as `priors_of`.
-    """
+    """Make the layout of a channel that states these names and kinds; errors as in `priors_of`."""
     metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
     stated = stated_components(metadata, components, where)
     return _Layout(
@@ -109,12 +106,12 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Return priors that cannot be used, all for one reason.
+    """Make priors that cannot be used, all for one reason.
 
     Args:
-        runs: how many.
-        components: wanted, by name, with their kinds.
-        reason: why, as a sentence.
+        runs: number of runs.
+        components: wanted components by name, with their kinds.
+        reason: the reason, as a sentence.
     """
     size = len(tangent_components(list(components), list(components.values())))
     return Priors(
@@ -128,15 +125,15 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 def start_of_runs(
     static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
-    """Return what an estimator starts from, and why some runs cannot start.
+    """Return what an estimator starts from, and the reasons why some runs cannot start.
 
     Args:
         static: topics of all runs.
-        priors: which of them are priors, and the components that are wanted of each.
+        priors: which of them are priors, and the components wanted from each.
 
-    Returns the topics, where a prior is now one message for every run, of the wanted components in their
-    order, NaN where the run cannot start; and the reasons by run, which may be all of them.
-    Raises BadInput where a topic is no such prior, see `priors_of`.
+    In the returned topics, a prior has one message for every run with the wanted components in their
+    order, NaN if the run cannot start. The reasons are by run; all runs may have one.
+    Raises BadInput if a topic is not such a prior, see `priors_of`.
     """
     found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
@@ -147,7 +144,7 @@ def start_of_runs(
 
 
 def _start_of(topic: str, prior: Ragged, components: Components) -> tuple[Ragged, dict[int, str]]:
-    """Return one message for every run, and why runs cannot start."""
+    """Return a prior with one message for every run, and the reasons why runs cannot start."""
     read = priors_of(prior, components)
     stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
     reasons = {run: reason for run, reason in enumerate(read.reasons) if reason}
@@ -157,9 +154,9 @@ def _start_of(topic: str, prior: Ragged, components: Components) -> tuple[Ragged
 def gaussians(
     prior: Ragged,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what an estimator starts from a prior of `start_of_runs`.
+    """Return copies of the numbers in a prior that `start_of_runs` made.
 
-    Stamps (runs,), means (runs, d), covariances (runs, t, t), to be changed at will.
+    Stamps (runs,), means (runs, d) and covariances (runs, t, t).
     """
     size = isqrt(prior["covariance"].shape[1])
     covariance = prior["covariance"].reshape(-1, size, size)

@@ -1,4 +1,4 @@
-"""Makes streams of what estimators return: states, innovations, skipped messages, failures."""
+"""Output streams of estimators: states, innovations, skipped messages, failures."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from fuselog.replay.engine.vectors.components import Components
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-ALL_WELL = -1  # of a run; what is not negative counts in a list of reasons
+ALL_WELL = -1  # the state of a run; a number that is not negative is an index in a list of reasons
 
 
 def named(components: Mapping[str, str]) -> dict[str, str]:
-    """Return components and their kinds as a channel states them."""
+    """Return component names and kinds in the form of channel metadata."""
     return {"components": ",".join(components), "kinds": ",".join(components.values())}
 
 
@@ -33,15 +33,13 @@ def state_stream(
     mean: Floats,
     covariance: Floats,
 ) -> Stream:
-    """Return means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
-
-    `truth` is the topic that they are compared with; None where there is nothing to compare.
+    """Make a stream of means (n, d), with angles wrapped, and tangent-space covariances (n, t, t).
 
     Args:
-        topic: to be written.
+        topic: topic of the stream.
         time_ns: (n,) stamps.
         components: by name, with their kinds.
-        truth: the topic of the truth, "" for none.
+        truth: topic of the truth, "" for none; None to leave it out of the metadata.
         mean: (n, d).
         covariance: (n, t, t).
     """
@@ -51,7 +49,7 @@ def state_stream(
 
 
 def wrapped(mean: Floats, components: Components) -> Floats:
-    """Return means (n, d) with their angles wrapped to [-pi, pi).
+    """Wrap the angles of means (n, d) to [-pi, pi).
 
     Args:
         mean: (n, d).
@@ -60,7 +58,7 @@ def wrapped(mean: Floats, components: Components) -> Floats:
     given = mean
     for index in (index for index, kind in enumerate(components.values()) if kind == "angle"):
         beyond = ~(np.abs(mean[:, index]) < np.pi)
-        if beyond.any():  # those in range stay as they are, to the last bit
+        if beyond.any():  # angles in range are not changed, to the last bit
             mean = mean.copy() if mean is given else mean
             mean[beyond, index] = wrap_angle(mean[beyond, index])
     return mean
@@ -69,14 +67,14 @@ def wrapped(mean: Floats, components: Components) -> Floats:
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Return means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`.
+    """Make a stream of means (n, d) and covariances (n, t, t); NaN ends its run, see `monitor`.
 
     Args:
-        topic: to be written.
+        topic: topic of the stream.
         time_ns: (n,) stamps.
         mean: (n, d).
         covariance: (n, t, t).
-        metadata: of the channel.
+        metadata: metadata of the channel.
     """
     columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": rows_of(covariance)}
     schema = schemas.GAUSSIAN_ESTIMATE
@@ -93,15 +91,15 @@ def states_in(
     mean: Floats,
     covariance: Floats,
 ) -> Ragged:
-    """Make the states in some rows, in order, of columns whose run r owns offsets[r]:offsets[r + 1].
+    """Make a stream of the states in some rows of columns; run r has the rows offsets[r]:offsets[r + 1].
 
     Args:
-        rows: (k,), the rows to take, in order.
-        topic: the name of the stream.
+        rows: (k,), the rows to use, in order.
+        topic: topic of the stream.
         time_ns: (n,), the stamps.
-        offsets: (runs + 1,), where the runs begin in the columns.
-        components: those of the state by name, with their kinds.
-        truth: the topic of the truth; None where there is none.
+        offsets: (runs + 1,), first row of each run.
+        components: components of the state by name, with their kinds.
+        truth: topic of the truth; None if there is none.
         mean: (n, d).
         covariance: (n, t, t).
 
@@ -113,14 +111,14 @@ def states_in(
 
 
 class InnovationColumns(NamedTuple):
-    """Holds innovations as their stream has them.
+    """Columns of a stream of innovations.
 
     Attributes:
         time_ns: (n,) stamps.
-        target_id, accepted: (n,) what each was about, and whether a gate let it in.
+        target_id, accepted: (n,) the target of each, and whether a gate accepted it.
         innovation, covariance: (n, m), (n, m, m).
         squared: (n,), the NIS.
-        log_likelihood: (n,); None where it is not known.
+        log_likelihood: (n,); None if it is not known.
     """
 
     time_ns: Integers
@@ -135,7 +133,7 @@ class InnovationColumns(NamedTuple):
 def innovation_stream(
     topic: str, components: Mapping[str, str], truth: str, columns: InnovationColumns
 ) -> Stream:
-    """Make the stream of innovations, of the components that are measured together."""
+    """Make a stream of innovations of components that are measured together."""
     unknown, likelihood = np.full(len(columns.time_ns), np.nan), columns.log_likelihood
     return make_stream(
         topic,
@@ -152,20 +150,20 @@ def innovation_stream(
 
 
 def rows_of(covariance: Floats) -> Floats:
-    """Return matrices (n, m, m) as rows (n, m m)."""
+    """Reshape matrices (n, m, m) to rows (n, m m)."""
     return covariance.reshape(len(covariance), covariance.shape[1] * covariance.shape[2])
 
 
 def failures_of(
     topic: str, before: Integers, after: Integers, time_ns: Integers, reasons: Sequence[str]
 ) -> Ragged:
-    """Return the runs that failed in a block, on `topic`/failure; one message each, at its own time.
+    """Make the stream `topic`/failure of the runs that failed in a block, one message each.
 
     Args:
-        topic: the estimator's, /estimates/NAME and its case.
-        before: ALL_WELL or an index of `reasons` for every run up to the block, (runs,).
-        after: the same with the block.
-        time_ns: when, (runs,).
+        topic: topic prefix of the estimator, /estimates/NAME and its case.
+        before: (runs,) ALL_WELL or an index in `reasons`, before the block.
+        after: (runs,) the same after the block.
+        time_ns: (runs,) time of each failure.
         reasons: a sentence for each index.
     """
     failed = np.flatnonzero((after >= 0) & (before == ALL_WELL))
@@ -174,12 +172,12 @@ def failures_of(
 
 
 def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> Ragged:
-    """Return the failures of some of the runs, by their numbers, on `topic`/failure.
+    """Make the stream `topic`/failure of some failed runs.
 
     Args:
-        topic: of the estimator.
-        failures: by run.
-        runs: how many there are.
+        topic: topic prefix of the estimator.
+        failures: by number of the run.
+        runs: number of runs.
     """
     failed = sorted(failures)
     stream = failure_stream(f"{topic}/failure", [failures[run] for run in failed])

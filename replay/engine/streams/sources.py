@@ -1,4 +1,4 @@
-"""Reads the runs of a replay: from log files, or from recordings in memory; one run or many."""
+"""Sources of a replay: runs in log files, or recordings in memory."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,15 +26,15 @@ from fuselog.replay.engine.streams.blocks import gather, is_in_order
 
 
 class Source(Protocol):
-    """Represents one run, as replay and evaluation see it."""
+    """One run, as replay and evaluation use it."""
 
     @property
     def name(self) -> str:
-        """Return what to call the run in a message."""
+        """Return the name of the run in messages."""
 
     @property
     def run(self) -> RunMetadata | None:
-        """Return what the run was."""
+        """Return the metadata of the run."""
 
     @property
     def epoch_ns(self) -> int:
@@ -42,14 +42,14 @@ class Source(Protocol):
 
     @property
     def start_ns(self) -> int | None:
-        """Find where the replayed span begins, by the clock of the replay; None where the run begins."""
+        """Return the start of the replayed span by the replay's clock; None for the run's start."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Return what it holds."""
+        """Return the topics of the run."""
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return whole topics, in publish-time order."""
+        """Read whole topics in publish-time order."""
 
     def empty(self, topic: str) -> Stream:
         """Return `topic` without its messages."""
@@ -57,18 +57,18 @@ class Source(Protocol):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Return topics in blocks, one after another; see `fuselog.recorders.log.read_blocks`."""
+        """Yield topics in blocks, one after another; see `fuselog.recorders.log.read_blocks`."""
 
     def whole(self) -> "Source":
-        """Return the run without a span."""
+        """Return the whole run, without a span."""
 
     @property
     def rejections(self) -> Rejections:
-        """Return what was left out of all that was read, being impossible."""
+        """Return the impossible messages that were left out of everything read so far."""
 
 
 def is_sensed(source: Source, topic: str) -> bool:
-    """Tell whether `topic` of the run `source` is its own, and columns: no estimates, no images."""
+    """Test whether `topic` of `source` has columns that were recorded: no estimates, no images."""
     if topic.startswith("/estimates/"):
         return False
     try:
@@ -80,18 +80,18 @@ def is_sensed(source: Source, topic: str) -> bool:
 
 @dataclass(frozen=True, repr=False)
 class _Readable(Mapping[str, Stream]):
-    """Maps topics to whole streams, as a person reads a source; raises `UnknownName` for others.
+    """Mapping from topics to whole streams; other names raise `UnknownName`.
 
     Attributes:
-        rejections: what was left out of all that was read, being impossible.
-        is_raw: whether nothing is left out.
+        rejections: impossible messages that were left out of everything read so far.
+        is_raw: whether impossible messages are kept.
     """
 
     rejections: Rejections = field(default_factory=Rejections, kw_only=True, compare=False)
     is_raw: bool = field(default=False, kw_only=True)
 
     def as_written(self) -> Self:
-        """Return the source with all of its messages, impossible ones as well."""
+        """Return the source with all of its messages, including impossible ones."""
         return replace(self, is_raw=True)
 
     def __getitem__(self: Source, topic: str) -> Stream:
@@ -122,11 +122,11 @@ class _Readable(Mapping[str, Stream]):
 
 @dataclass(frozen=True, repr=False)
 class LogSource(_Readable):
-    """Represents a log file, or a span of it, read lazily; it maps its topics to their streams.
+    """Log file, or a span of one, that is read lazily; a mapping from topics to streams.
 
     Attributes:
         log: the opened file.
-        start_ns, end_ns: the span, its end left out; None where it does not begin or end.
+        start_ns, end_ns: the span, without its end; None if the run's own start or end applies.
     """
 
     log: Log
@@ -135,39 +135,39 @@ class LogSource(_Readable):
 
     @property
     def name(self) -> str:
-        """Compute the log's path."""
+        """Return the path of the log."""
         return str(self.log.path)
 
     @property
     def run(self) -> RunMetadata | None:
-        """Compute the log's run metadata."""
+        """Return the run metadata of the log."""
         return self.log.run
 
     @cached_property
     def epoch_ns(self) -> int:
-        """Return the run's time zero; where the log does not say, its first publish stamp."""
+        """Return the run's time zero; if the log does not state it, the first publish stamp."""
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
-        """Return what times in s count from: the log's epoch, without one the first of `clock`.
+        """Return the time from which seconds count: the log's epoch, or else the first stamp of `clock`.
 
-        A first stamp that is years from those of most messages does not count.
+        A first stamp that is years from those of most messages is ignored.
         """
         if self.log.run:
             return self.log.run.epoch_ns
         return (self.main_span or self.extent(clock))[0]
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Find the first and the last stamp in ns by `clock`; zeros where there are none."""
+        """Return the first and last stamp in ns by `clock`; zeros if there are no messages."""
         return read_span(self.log, clock)
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Compute the log's topics."""
+        """Return the topics of the log."""
         return self.log.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return all of `topics` in publish-time order, whatever the source's span."""
+        """Read all of `topics` in publish-time order, regardless of the span."""
         return self._possible(read_streams(self.log, topics), Rejections())
 
     def empty(self, topic: str) -> Stream:
@@ -191,7 +191,7 @@ class LogSource(_Readable):
             yield {topic: stream for topic, stream in kept.items() if len(stream)}
 
     def _possible(self, streams: Mapping[str, Stream], before: Rejections) -> dict[str, Stream]:
-        """Leave out impossible messages, and note them with those `before` these; not of estimates."""
+        """Remove impossible messages, except from estimates, and add them to the counts in `before`."""
         kept = dict(streams)
         for topic, stream in streams.items() if not self.is_raw else ():
             if topic.startswith("/estimates/"):
@@ -204,7 +204,7 @@ class LogSource(_Readable):
 
     @cached_property
     def main_span(self) -> tuple[int, int] | None:
-        """Find the first and last stamp of most messages if others are years from them."""
+        """Return the first and last stamp of most messages if others are years from them."""
         topics = [topic for topic in self.topics if is_sensed(self, topic)]
         if not topics:
             return None
@@ -217,13 +217,13 @@ class LogSource(_Readable):
 
 @dataclass(frozen=True, repr=False)
 class MemorySource(_Readable):
-    """Represents a recording in memory: read and replayed as if it had been written and read back.
+    """Recording in memory, read and replayed like the log that it would be written to.
 
     Attributes:
         streams: by topic.
-        run: how it was recorded.
-        name: what messages call it.
-        start_ns, end_ns: the span, its end left out; None where it does not begin or end.
+        run: metadata of the recording.
+        name: name in messages.
+        start_ns, end_ns: the span, without its end; None if the run's own start or end applies.
     """
 
     streams: Mapping[str, Stream]
@@ -238,25 +238,25 @@ class MemorySource(_Readable):
         return self.run.epoch_ns
 
     def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
-        """Return what times in seconds count from: the epoch, whatever the `clock`."""
+        """Return the time from which seconds count: the epoch, for any `clock`."""
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return the first and the last stamp in ns by `clock`; zeros where there are none."""
+        """Return the first and last stamp in ns by `clock`; zeros if there are no messages."""
         times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
         first_ns = min((int(each.min()) for each in times), default=0)
         return first_ns, max((int(each.max()) for each in times), default=0)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """Return the recording's topics."""
+        """Return the topics of the recording."""
         return {
             topic: Topic(topic, stream.schema.full_name, "protobuf", (), stream.metadata, len(stream))
             for topic, stream in self.streams.items()
         }
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return all of `topics` in publish-time order."""
+        """Read all of `topics` in publish-time order."""
         return {topic: self.in_order(topic, "publish_time") for topic in topics}
 
     def empty(self, topic: str) -> Stream:
@@ -269,7 +269,7 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics` by `order` in one block, whatever `block_messages` asks for."""
+        """Yield the span of `topics` by `order` as one block, regardless of `block_messages`."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
@@ -281,11 +281,11 @@ class MemorySource(_Readable):
 
     @property
     def is_whole(self) -> bool:
-        """Tell whether there is no span."""
+        """Test whether the source has no span."""
         return self.start_ns is None and self.end_ns is None
 
     def _within(self, stream: Stream, order: Clock) -> Stream:
-        """Return the messages of the source's span, of a stream in order."""
+        """Return the messages of an ordered stream that are in the source's span."""
         if self.is_whole:
             return stream
         times_ns = stream.times(order)
@@ -294,16 +294,16 @@ class MemorySource(_Readable):
         return stream.take(slice(int(start), int(end)))
 
     def in_order(self, topic: str, order: Clock) -> Stream:
-        """Return `topic` by the clock `order`; equal stamps as in the file."""
+        """Return `topic` in the order of the clock `order`; equal stamps keep the order of the file."""
         stream = self.stream_of(topic)
         if is_in_order(gather([stream]), order):
             return stream
         return stream.take(np.lexsort((stream.position, stream.times(order))))
 
     def stream_of(self, topic: str) -> Stream:
-        """Return `topic` as it was recorded; raises BadInput where it is not there.
+        """Return `topic` as it was recorded, without impossible messages.
 
-        Impossible messages are left out.
+        Raises BadInput if there is no such topic.
         """
         if topic not in self.streams:
             raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
@@ -316,16 +316,16 @@ class MemorySource(_Readable):
 
     @cached_property
     def main_span(self) -> tuple[int, int] | None:
-        """Find the first and last stamp of most messages if others are years from them."""
+        """Return the first and last stamp of most messages if others are years from them."""
         return main_span(each.publish_time_ns for each in self.streams.values())
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
-    """Make a source of a recording with a log's positions: merged by log time, ties in order.
+    """Make a source of a recording with positions as in a log: sorted by log time, ties in given order.
 
     Args:
         recording: streams in memory.
-        run: what is known of it.
+        run: metadata of the run.
     """
     streams = recording.streams
     ranks = np.empty(sum(map(len, streams)), np.int64)

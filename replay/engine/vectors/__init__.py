@@ -1,4 +1,4 @@
-"""Describes vectors by the names of their components, their tangent spaces and covariances.
+"""Vectors described by the names of their components, their tangent spaces and covariances.
 
 Begin with `tangent`.
 """

@@ -1,4 +1,4 @@
-"""Matches a vector's components by the names that its channel states; their order never matters."""
+"""Matching of a vector's components by the names that its channel states, in any order."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,25 +13,25 @@ from fuselog.recorders.models.states import state_metadata
 from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
 
 Components = Mapping[str, Kind]
-# In the metadata of Gaussian estimates: the axes of the rotation vectors that their covariances are of.
+# In the metadata of Gaussian estimates: the axes of the rotation errors in their covariances.
 ROTATION_AXES = "rotation_axes"
 
 
 def components_of(names: Sequence[str]) -> Components:
-    """Return names with their kinds: an angle is a component in rad that wraps, others are linear."""
+    """Return names with their kinds: a component in rad is an angle, which wraps; others are linear."""
     return stated_components(state_metadata(names), {}, "components")
 
 
 def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Find where the wanted components stand among those that a channel states.
+    """Find the indices of the wanted components among those that a channel states.
 
     Args:
-        stated: the channel's metadata: names as `components`, with or without their `kinds`.
-        wanted: names and kinds, in the order in which they are wanted.
-        where: what to call the channel in a sentence, such as `topic /prior`.
+        stated: metadata of the channel: names as `components`, with or without their `kinds`.
+        wanted: names and kinds, in the wanted order.
+        where: name of the channel in messages, such as `topic /prior`.
 
-    Raises BadInput where the channel names its components badly, lacks one that is wanted, or states
-    that one is of another kind.
+    Raises BadInput if the channel's names or kinds are invalid, or if a wanted component is missing or
+    of another kind.
     """
     kinds = stated_components(stated, wanted, where)
     names = list(kinds)
@@ -48,10 +48,10 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
 
 
 def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Find which rows and columns of a stated covariance are the wanted components', in order.
+    """Find the rows and columns of a stated covariance that belong to the wanted components, in order.
 
     A covariance is in the tangent space: one row for an axis, three for a quaternion, see
-    `fuselog.replay.engine.vectors.tangent`. Args and errors as `match_components`.
+    `fuselog.replay.engine.vectors.tangent`. Args and errors are those of `match_components`.
     """
     columns = match_components(stated, wanted, where)
     rows_of: list[range] = []
@@ -67,15 +67,15 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
 
 
 def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
-    """Return names and kinds as a channel states them, in its order; empty where it names none.
+    """Return names and kinds as a channel states them, in its order; empty if it names none.
 
-    A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
-    where a name stands twice, or the kinds are none or not one for each name.
+    If a channel states no kinds, a component has the wanted kind, or "linear" if it is not wanted.
+    Raises BadInput if a name occurs twice, or if the kinds are unknown or not one for each name.
 
     Args:
-        stated: the channel's metadata.
-        wanted: whose kinds hold where none are stated.
-        where: the topic, for errors.
+        stated: metadata of the channel.
+        wanted: components whose kinds are used if the channel states none.
+        where: name of the topic in messages.
     """
     names = [name for name in stated.get("components", "").split(",") if name]
     listed = stated.get("kinds", "")
@@ -89,10 +89,10 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
 
 
 def in_body_axes(stream: Stream) -> Stream:
-    """Return Gaussian estimates whose covariances are of rotations about the axes of the body.
+    """Convert Gaussian estimates so that rotation errors in their covariances are about body axes.
 
-    A channel may state that they are about those of the world, as in ROS: `rotation_axes` = "world".
-    Raises BadInput if it states other axes, or no kinds.
+    A channel may state that they are about world axes, as in ROS: `rotation_axes` = "world". Raises
+    BadInput if it states other axes, or no kinds.
     """
     axes = stream.metadata.get(ROTATION_AXES, "body")
     if axes == "body":
@@ -104,7 +104,7 @@ def in_body_axes(stream: Stream) -> Stream:
     size = sum(TANGENT_WIDTHS[kind] for kind, _ in manifold_blocks(kinds))
     turn, row = np.tile(np.eye(size), (len(stream), 1, 1)), 0
     for kind, columns in manifold_blocks(kinds):
-        if kind == "quaternion":  # its rows are the world's axes in those of the body
+        if kind == "quaternion":  # its rows are the world axes in body coordinates
             back = conjugate(stream["mean"].reshape(len(stream), len(kinds))[:, None, columns])
             turn[:, row : row + 3, row : row + 3] = rotate(back, np.eye(3)).swapaxes(1, 2)
         row += TANGENT_WIDTHS[kind]

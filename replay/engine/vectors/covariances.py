@@ -1,4 +1,4 @@
-"""Tests covariances for definiteness, and normalises errors by them (NEES, NIS).
+"""Tests of covariances for definiteness, and errors normalised by covariances (NEES, NIS).
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A share of a variance below this is rounding.
+# A fraction of a variance below this is rounding.
 ROUNDING = 1e-14
 
 
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
     """Compute NEES or NIS e' P^-1 e of errors (..., n); leading axes broadcast.
 
-    A component of infinite variance counts nothing. NaN where there are no components, where an error or
-    a covariance is NaN, or where a covariance is not positive definite.
+    A component of infinite variance contributes nothing. The result is NaN if there are no components,
+    if an error or a covariance is NaN, or if a covariance is not positive definite.
 
     Args:
-        error: (..., n).
+        error: (..., n), in the units of the components.
         covariance: (..., n, n).
 
     >>> errors = np.array([[1.0, 2.0], [0.0, 1.0]])
@@ -28,7 +28,7 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     """
     size = error.shape[-1]
     error = np.where(np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1)), 0.0, error)
-    # |L^-1 e|^2 by the Cholesky factors L of all P at once
+    # |L^-1 e|^2 with the Cholesky factors L of all P
     factor, whitened = _factors(covariance), np.empty_like(error)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for row in range(size):
@@ -38,9 +38,10 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
-    """Compute the log-likelihood of Gaussian errors (..., n) with NEES or NIS `squared` (...).
+    """Compute the log-likelihood of Gaussian errors (..., n) from their NEES or NIS `squared` (...).
 
-    A component that is NaN is missing. NaN if the covariance of the others is not positive definite.
+    A component that is NaN is missing. The result is NaN if the covariance of the others is not
+    positive definite.
 
     Args:
         squared: (...).
@@ -62,16 +63,16 @@ def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
 
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
-    """Tell whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
+    """Test whether covariances (..., n, n) are positive definite; see `normalized_error_squared`."""
     pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
     are_definite: NDArray[np.bool_] = np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
     return are_definite
 
 
 def _factors(covariance: Array) -> Array:
-    """Return the lower Cholesky factors (..., n, n); NaN from where there is none on.
+    """Compute lower Cholesky factors (..., n, n); NaN from the first pivot that is not positive on.
 
-    A component of infinite variance is one that is independent of all others.
+    A component of infinite variance is treated as independent of all others.
     """
     size = covariance.shape[-1]
     finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))

@@ -1,9 +1,10 @@
-"""Compares and interpolates angles, axes and orientations in their tangent space.
+"""Comparison and interpolation of angles, axes and orientations in their tangent space.
 
-Every component of a state has a kind. The two of an axis, and the four of a quaternion, stand side by
-side and are equal to their negatives; their error is the rotation from truth to estimate in the body's
-frame, an angle or a rotation vector, as are the covariances of estimates. Kurz, Gilitschenski, Julier,
-Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3 and 7.
+Every component of a state has a kind. The two components of an axis and the four of a quaternion are
+adjacent; an axis or a quaternion equals its negative. Its error is the rotation from truth to estimate
+in the body's frame, an angle or a rotation vector, and the covariances of estimates are those of this
+error. Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3
+and 7.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,14 +21,14 @@ from fuselog.recorders.models.planar import wrap_angle
 Floats = NDArray[np.float64]
 Number = TypeVar("Number")
 Kind = Literal["linear", "angle", "axis", "quaternion"]
-# How many components a thing of a kind has.
+# Number of components of each kind.
 WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 2, "quaternion": 4}
-# How many components its error has.
+# Number of components of the error of each kind.
 TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternion": 3}
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
-    """Tell whether these are kinds, with all components of every axis and quaternion side by side."""
+    """Test whether these are kinds, with all components of every axis and quaternion adjacent."""
     index = 0
     while index < len(kinds):
         width = WIDTHS.get(kinds[index])
@@ -38,7 +39,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
 
 
 def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, "slice[int, int, int]"]]:
-    """Yield kind and columns of every number, angle, axis and quaternion."""
+    """Yield the kind and columns of every number, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):
         width = WIDTHS[kinds[index]]
@@ -47,14 +48,15 @@ def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, "slice[int, int
 
 
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Return names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
+    """Return names and kinds of error components: `heading_w`, ... become `heading_x_rad`, ...
 
-    A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
-    of kind "rotation". Of names without a stem, as `qw, qx, qy, qz`, these are `rotation_x_rad`, ...
+    A linear component or an angle keeps its name; an axis has one "angle", a quaternion three
+    components of kind "rotation". If the names have no common stem, as `qw, qx, qy, qz`, the result is
+    `rotation_x_rad`, ...
 
     Args:
         components: names.
-        kinds: one for each.
+        kinds: one for each name.
     """
     return list(_tangent_components(tuple(components), tuple(kinds)))
 
@@ -68,7 +70,7 @@ def _tangent_components(
         name = components[columns.start]
         stem = name.rpartition("_")[0] or _common(components[columns])
         if (f"{stem}_x_rad", "rotation") in found or (f"{stem}_rad", "angle") in found:
-            stem = name  # of several that have no stem
+            stem = name  # there are several without a stem
         if kind == "quaternion":
             found += [(f"{stem}_{axis}_rad", "rotation") for axis in "xyz"]
         else:
@@ -77,7 +79,7 @@ def _tangent_components(
 
 
 def _common(names: Sequence[str]) -> str:
-    """Find what names of a vector's components begin with, if more than a letter; else `rotation`."""
+    """Return the common prefix of a vector's component names; `rotation` if it is a letter or less."""
     stem = names[0]
     while not all(name.startswith(stem) for name in names):
         stem = stem[:-1]
@@ -87,7 +89,7 @@ def _common(names: Sequence[str]) -> str:
 def named_now(
     given: Mapping[str, Number], components: Sequence[str], kinds: Sequence[str]
 ) -> dict[str, Number]:
-    """Return what is given by errors' components, whose names may be those of the release before.
+    """Rename error components from the names of the previous release to the current ones.
 
     >>> named_now({"qw_x_rad": 0.1}, ("qw", "qx", "qy", "qz"), ("quaternion",) * 4)
     {'rotation_x_rad': 0.1}
@@ -122,7 +124,7 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 
 
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
-    """Interpolate states (n, components) the shortest way from left to right, at weights (n,).
+    """Interpolate between states (n, components) along the shortest way, with weights (n,).
 
     Args:
         left: (n, components).
@@ -144,13 +146,13 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """Return the truth's state (n, d) at any stamps; see `states_at`.
+    """Interpolate the true state (n, d) at any stamps; see `states_at`.
 
     Args:
-        truth: the stream, whose `state` is (m, d).
-        time_ns: (n,).
+        truth: stream whose `state` is (m, d).
+        time_ns: (n,), stamps in ns.
         kinds: one for each component.
-        gap_limit_s: the longest gap that is bridged.
+        gap_limit_s: the longest gap in s to interpolate over.
     """
     return states_at(truth.publish_time_ns, truth["state"], time_ns, kinds, gap_limit_s)
 
@@ -162,16 +164,16 @@ def states_at(
     kinds: Sequence[str],
     gap_limit_s: float,
 ) -> Floats:
-    """Return states (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
+    """Interpolate states (m, d) at times (m,) to states (n, d) at stamps (n,), along the shortest way.
 
-    NaN over gaps above the limit; a stamp that there is a state of exactly needs no neighbour.
+    The result is NaN in gaps longer than the limit, except at a stamp that has a state of its own.
 
     Args:
-        times: (m,), in order.
+        times: (m,), in ns and in order.
         state: (m, d).
-        time_ns: (n,).
+        time_ns: (n,), stamps in ns.
         kinds: one for each component.
-        gap_limit_s: the longest gap that is bridged.
+        gap_limit_s: the longest gap in s to interpolate over.
     """
     if len(times) == 0:
         return np.full((len(time_ns), len(kinds)), np.nan)
@@ -186,9 +188,9 @@ def states_at(
 
 
 def rotation_vector(x: Floats) -> Floats:
-    """Make the shortest rotations of unit complex numbers (n, 2), as angles, or of quaternions (n, 4).
+    """Convert unit complex numbers (n, 2) to angles, or unit quaternions (n, 4) to rotation vectors.
 
-    In rad; x and -x are the same, so that the angle of an axis lies in [-pi/2, pi/2].
+    In rad. x and -x are the same rotation, so the angle of an axis is in [-pi/2, pi/2].
     """
     folded = x * np.where(x[:, :1] < 0.0, -1.0, 1.0)
     length = np.linalg.norm(folded[:, 1:], axis=1, keepdims=True)
@@ -199,7 +201,7 @@ def rotation_vector(x: Floats) -> Floats:
 
 
 def _slerp(left: Floats, right: Floats, weight: Floats) -> Floats:
-    """Go along the great circle, from left to the nearer one of right and -right."""
+    """Interpolate along the great circle from left to the nearer of right and -right."""
     turn = rotation_vector(compose(conjugate(left), right))
     angle = (1.0 if left.shape[1] == 2 else 0.5) * weight[:, None] * turn
     length = np.linalg.norm(angle, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Writes what programs that read a log are given, and reads what they write.
+"""Input files of programs that read a log, and the files that they write.
 
 Begin with `estimates`.
 """

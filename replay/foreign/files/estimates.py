@@ -1,4 +1,4 @@
-"""Reads the estimates that a program wrote: MCAP, TUM, or CSV with covariances; told by the content."""
+"""Estimates that a program wrote: MCAP, TUM, or CSV with covariances, recognised by content."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +19,12 @@ KEPT = (schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name)
 
 
 def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
-    """Return the estimates of a file by topic, under a label; raises BadInput where there are none.
+    """Read the estimates in a file by topic, under a label; raise BadInput if there are none.
 
     Args:
         path: the file.
-        label: of the estimator.
-        truth: what they are estimates of; None where the log has none.
+        label: label of the estimator.
+        truth: topic of the estimated quantities; None if the log has none.
     """
     with path.open("rb") as file:
         start = file.read(4096)
@@ -49,7 +49,7 @@ def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Str
 
 
 def _of_log(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
-    """Return estimates and innovations of a log; what follows a label of its own stays."""
+    """Read estimates and innovations from a log; a topic keeps the part of its name after its label."""
     log = open_log(path)
     chosen = [name for name, topic in log.topics.items() if topic.schema_name in KEPT]
     if not any(log.topics[name].schema_name == KEPT[0] for name in chosen):
@@ -70,10 +70,10 @@ def _of_log(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
 
 
 def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
-    """Read estimates of a table.
+    """Read estimates from a table.
 
-    Columns: `time_ns` (or `time_s`), a component each, and of the covariance `cov_A_B` for components A
-    and B of the tangent space, in either order; those that are not there are zero.
+    Columns: `time_ns` (or `time_s`), one for each component, and `cov_A_B` for covariances of
+    components A and B of the tangent space, in either order; missing ones are zero.
     """
     try:
         table = pd.read_csv(path, skipinitialspace=True)
@@ -120,7 +120,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
 
 
 def _components(names: list[str], truth: Topic | None) -> Components:
-    """Return components with their kinds, as the truth has them; linear without one."""
+    """Return components with their kinds in the truth; linear without a truth."""
     if truth is None:
         return dict.fromkeys(names, "linear")
     stated = stated_components(truth.metadata, {}, f"topic {truth.name}")

@@ -1,4 +1,4 @@
-"""Writes streams as tables that any program reads: a CSV file of each topic."""
+"""Tables that any program can read: a CSV file for each topic."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from fuselog.recorders.log import Stream
 def write_tables(folder: Path, streams: Sequence[Stream]) -> None:
     """Write each topic to its file, such as `robot1-odometry.csv`: `time_ns`, then the fields.
 
-    A vector has a column for each number, `position_m_0` and on. What a channel states is in
+    A vector has a column for each number, `position_m_0` and so on. The metadata of the channel is in
     `robot1-odometry.json`.
     """
     folder.mkdir()

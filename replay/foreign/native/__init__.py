@@ -1,4 +1,4 @@
-"""Calls filters behind `fuselog_filter.h`: loads their library, and calls it by address.
+"""Filters behind `fuselog_filter.h`: loading of their library, and calls by address.
 
 Begin with `following`.
 """

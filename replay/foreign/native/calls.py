@@ -1,4 +1,4 @@
-"""Has kernels call C functions by address: no Python is between a message and the filter."""
+"""Calls of C functions by address from kernels, without Python between a message and the filter."""
 
 import ctypes
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ _C: dict[str, Any] = {
 
 
 class Call:
-    """Calls a C function at an address: `call(address, *arguments)`, in a kernel as in Python.
+    """C function that is called by address: `call(address, *arguments)`, in a kernel as in Python.
 
-    A pointer is an array, or an address; what returns nothing gives 0.
+    A pointer is an array or an address; a function that returns nothing gives 0.
     """
 
     def __init__(self, name: str, *kinds: str, returns: str = "i32") -> None:
@@ -31,7 +31,7 @@ class Call:
         self._prototype = ctypes.CFUNCTYPE(_C[returns], *(_C[kind] for kind in kinds))
 
     def __call__(self, address: int, *arguments: Any) -> int:
-        """Call it from Python."""
+        """Call the function from Python."""
         given = (
             each.ctypes.data
             if isinstance(each, np.ndarray)
@@ -41,11 +41,11 @@ class Call:
         return int(self._prototype(int(address))(*given) or 0)
 
     def kernel_identity(self) -> str:
-        """Return what is part of a kernel's key."""
+        """Return the part of a kernel's key that identifies the call."""
         return f"call of {self.__name__}: {' '.join(self._kinds)} -> {self._returns}"
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Number:  # noqa: ARG002
-        """Write a call; see `fuselog.recorders.compiling.kernels.expressions`."""
+        """Emit a call in LLVM; see `fuselog.recorders.compiling.kernels.expressions`."""
         address, *others = arguments
         given = ", ".join(
             f"{_LLVM[kind]} {_passed(emitter, each, kind)}"
@@ -61,7 +61,7 @@ class Call:
 
 
 def _passed(emitter: Emitter, value: Any, kind: str) -> str:
-    """Return an argument as C takes it."""
+    """Convert an argument to the form that C takes."""
     if isinstance(value, Array):
         if kind != "pointer" or value.dtype != "<f8":
             raise TypeError("C is given arrays of real numbers where it wants a pointer")

@@ -1,4 +1,4 @@
-"""Hands messages to the filters of a library: one loop, which calls its functions by address."""
+"""Processing of messages by the filters of a library: one loop that calls its functions by address."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -29,9 +29,9 @@ from fuselog.replay.inference.run.recursion import (
     filled,
 )
 
-# What fails whatever the filter is; a status s of the filter's own counts on from there.
+# Codes of failures that any filter can have; a status s of the filter's own has the code OWN + s.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8
-NOBODY = -1  # calls for no estimate
+NOBODY = -1  # the caller if no message wants an estimate
 FAILURES = {
     0: "a variance of the filter's covariance is negative",
     1: "the filter's estimate or covariance is not finite",
@@ -43,15 +43,15 @@ FAILURES = {
 
 
 class Filters(NamedTuple):
-    """Holds the filters of all runs; first axis = run.
+    """Filters of all runs; the first axis is the run.
 
     Attributes:
-        handle: (runs,) addresses; 0 for none.
-        time_ns: (runs,) of the prior, then of the last message.
-        begun: (runs,) 0 before the start.
-        failure: (runs,) ALL_WELL, or what failed; see `reason_of_code`.
+        handle: (runs,) addresses; 0 if there is no filter.
+        time_ns: (runs,) stamp of the prior, then of the last message.
+        begun: (runs,) 0 before the start, then 1.
+        failure: (runs,) ALL_WELL, or a code; see `reason_of_code`.
         mean, covariance: (runs, n), (runs, t, t) the priors.
-        has_prior: (runs,) 0 where the filter starts by itself.
+        has_prior: (runs,) 0 if the filter starts by itself.
     """
 
     handle: Integers
@@ -65,7 +65,7 @@ class Filters(NamedTuple):
 
 @varying(1)
 class Static(NamedTuple):
-    """Holds messages that are taken before the start: run r owns offsets[r]:offsets[r + 1]."""
+    """Messages that are processed before the start: rows offsets[r]:offsets[r + 1] belong to run r."""
 
     offsets: Integers
     time_ns: Integers
@@ -74,7 +74,7 @@ class Static(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Holds what the filters of all runs are given, and by which functions."""
+    """Input of the filters of all runs, and the functions to call."""
 
     addresses: Addresses
     static: Static
@@ -84,7 +84,7 @@ class Given(NamedTuple):
 def follow(
     run: int, given: Given, carried: Filters, made: Results, work: tuple[Innovation, Innovation]
 ) -> None:
-    """Hand one run's messages to its filter in order, and note what it says, until the run fails."""
+    """Pass one run's messages to its filter in order and store its results, until the run fails."""
     events = given.events
     for event in range(events.offsets[run], events.offsets[run + 1]):
         caller = event if events.wants_estimate[event] else NOBODY
@@ -100,9 +100,9 @@ def advance(
     made: Results,
     work: tuple[Innovation, Innovation],
 ) -> None:
-    """Have a filter that has not failed take a message, and note its innovation.
+    """Pass a message to a filter that has not failed, and store its innovation.
 
-    `caller` is the message that calls for the estimate after it, NOBODY if none does.
+    `caller` is the message that wants the estimate after it, NOBODY if none does.
     """
     if carried.failure[run] == ALL_WELL:
         addresses, static, events = given
@@ -123,14 +123,14 @@ def advance(
 
 
 def outcome(status: int) -> int:
-    """Return WELL or what failed, of what a function of the filter returned."""
+    """Convert the return value of a filter's function to WELL or a code of what failed."""
     if status < REJECTED:
         return -10 - UNDEFINED
     return max(status, WELL)
 
 
 def begin(run: int, addresses: Addresses, static: Static, time_ns: int, carried: Filters) -> int:
-    """Have the filter take what is static, and start; returns WELL or what failed."""
+    """Pass static messages to the filter and start it; return WELL or a code of what failed."""
     handle = carried.handle[run]
     for row in range(static.offsets[run], static.offsets[run + 1]):
         status = TAKE(addresses.take, handle, static.source[row], static.time_ns[row], static.data[row])
@@ -154,7 +154,7 @@ def take(
     innovations: InnovationRows,
     work: tuple[Innovation, Innovation],
 ) -> int:
-    """Have the filter take a message, and note its innovation; returns WELL or what failed."""
+    """Pass a message to the filter and store its innovation; return WELL or a code of what failed."""
     handle, time_ns = carried.handle[run], events.time_ns[event]
     if events.source[event] < 0:
         return outcome(PREDICT(addresses.predict, handle, time_ns))
@@ -192,7 +192,7 @@ def take(
 
 
 def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made: Results) -> int:
-    """Note the filter's estimate; returns WELL or what failed."""
+    """Store the filter's estimate; return WELL or a code of what failed."""
     estimates, events = made.estimates, given.events
     row, state = estimates.end[run], given.addresses.state
     status = STATE(state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
@@ -215,7 +215,7 @@ def _loop() -> OverRuns:
 
 
 def reason_of_code(code: int, description: Description) -> str:
-    """Return the sentence of a failure."""
+    """Return the sentence for the code of a failure."""
     if code in FAILURES:
         return FAILURES[code]
     number = code - OWN
@@ -224,7 +224,7 @@ def reason_of_code(code: int, description: Description) -> str:
 
 
 class Followed(NamedTuple):
-    """Holds what filters said: estimates, when they were issued, innovations, and the runs' offsets."""
+    """Results of filters: estimates, when they were issued, innovations, and the offsets of the runs."""
 
     issued_ns: Integers
     estimates: EstimateRows
@@ -234,7 +234,7 @@ class Followed(NamedTuple):
 
 
 def offsets_of(description: Description, events: FilterEvents) -> tuple[Integers, Integers]:
-    """Return where the estimates, and the innovations, of every run begin: (runs + 1,) each."""
+    """Return the first rows of the estimates and of the innovations of every run: (runs + 1,) each."""
     due, recorded = (
         np.concatenate([[0], np.cumsum(chosen)])[events.offsets]
         for chosen in (events.wants_estimate, events.source >= 0)
@@ -250,23 +250,23 @@ def follow_all(
     carried: Filters,
     made: Results,
 ) -> None:
-    """Hand the messages of all runs to their filters, which are changed, and fill results."""
+    """Pass the messages of all runs to their filters, which change, and fill the results."""
     given = Given(addresses_of(library, description), static, events)
     _loop()(len(carried.handle), given, carried, made, scratch=work_of(description))
 
 
 def addresses_of(library: Library, description: Description) -> Addresses:
-    """Return what is called of a library; no innovations where its description has none."""
+    """Return the functions of a library to call; without innovations if its description has none."""
     addresses = library.addresses
     return addresses if description.innovation else addresses._replace(innovation=0)
 
 
 def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
-    """Cut results down to what was filled in.
+    """Cut results to the rows that were filled.
 
     Args:
-        made: of all runs.
-        due, recorded: (runs + 1,), where the rows for estimates and innovations of each run begin.
+        made: results of all runs.
+        due, recorded: (runs + 1,), first rows of the estimates and innovations of each run.
     """
     issued_ns = made.issued_ns[filled_rows(due, made.estimates.end)[0]]
     return Followed(issued_ns, *filled(made.estimates, due), *filled(made.innovations, recorded))
@@ -281,7 +281,7 @@ def copies_of(library: Library, filters: Filters) -> Filters:
 
 
 def work_of(description: Description) -> Callable[[], tuple[Innovation, Innovation]]:
-    """Return what makes the kernels' working memory."""
+    """Return a function that allocates the kernels' work space."""
     return partial(_work, max(len(description.innovation), 1))
 
 
@@ -300,14 +300,14 @@ def filters_of(
     runs: int,
     description: Description,
 ) -> Filters:
-    """Make the filters of all runs; a run whose prior is NaN takes no part.
+    """Make the filters of all runs; a run whose prior is NaN does not take part.
 
     Args:
-        library: which makes them.
-        parameters, seed: what each is given.
+        library: the library of the filters.
+        parameters, seed: parameters and seed of each filter.
         prior: stamps (runs,), means (runs, n), covariances (runs, t, t), or None.
-        runs: how many.
-        description: what the library says of itself.
+        runs: number of runs.
+        description: description of the library.
     """
     n, t = len(description.state), description.tangent
     time_ns, mean, covariance = prior or (
@@ -317,7 +317,7 @@ def filters_of(
     )
     handles = np.array([library.create(parameters, seed) for _ in range(runs)], np.int64)
     failure = np.where(handles == 0, NOT_CREATED, ALL_WELL)
-    failure[~np.isfinite(mean.sum(axis=1))] = ALL_WELL - 1  # its prior's own reason is told
+    failure[~np.isfinite(mean.sum(axis=1))] = ALL_WELL - 1  # the reason has been reported for the prior
     return Filters(
         handles,
         time_ns.copy(),

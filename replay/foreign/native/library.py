@@ -1,6 +1,6 @@
-"""Loads shared libraries of `fuselog_filter.h`.
+"""Shared libraries of `fuselog_filter.h`.
 
-It imports next to nothing, so that a process that only asks a library what it is begins at once.
+This module imports very little, so that a process that only reads a library's description starts fast.
 """
 
 import ctypes
@@ -13,13 +13,13 @@ from fuselog.recorders.errors import BadInput
 
 VERSION = 1
 HEADER = Path(__file__).with_name("fuselog_filter.h")
-WELL, NOTHING, REJECTED = 0, -1, -2  # see the header
-# What glibc says of a file that is there when it is of another CPU.
+WELL, NOTHING, REJECTED = 0, -1, -2  # status codes, see the header
+# Message of glibc for an existing file that was compiled for another CPU.
 NOT_OPENED = "cannot open shared object file: No such file or directory"
 
 
 class Addresses(NamedTuple):
-    """Holds where the functions are that a kernel calls; `innovation` is 0 where there is none."""
+    """Addresses of the functions that a kernel calls; `innovation` is 0 if there is none."""
 
     start: int
     take: int
@@ -31,16 +31,16 @@ class Addresses(NamedTuple):
 
 
 class Library:
-    """Represents a loaded library.
+    """Loaded library.
 
     Attributes:
         path: the file.
-        description: its JSON.
-        addresses: of what a kernel calls.
+        description: its description, JSON.
+        addresses: addresses of the functions that a kernel calls.
     """
 
     def __init__(self, path: Path) -> None:
-        """Load a library; raises BadInput where the file is none, or of another version."""
+        """Load a library; raise BadInput if the file is not one, or has another version."""
         self.path = path
         if not path.is_file():
             raise BadInput(f"{path}: no such file; give the path of a shared library")
@@ -85,21 +85,21 @@ class Library:
         return function
 
     def create(self, parameters: Iterable[float], seed: int) -> int:
-        """Make a filter; 0 where that fails."""
-        values = (*parameters, 0.0)  # never empty, so that they have an address
+        """Make a filter and return its address; 0 if that fails."""
+        values = (*parameters, 0.0)  # never empty, so that the array has an address
         return self._create((ctypes.c_double * len(values))(*values), seed) or 0
 
     def copy(self, handle: int) -> int:
-        """Copy a filter; 0 where that fails, or there is none."""
+        """Copy a filter and return its address; 0 if that fails, or if there is no filter."""
         return (self._copy(handle) or 0) if handle else 0
 
     def destroy(self, handle: int) -> None:
-        """End a filter, if it is one."""
+        """Destroy a filter, if the address is not 0."""
         if handle:
             self._destroy(handle)
 
     def destroy_all(self, handles: Iterable[int]) -> None:
-        """End filters."""
+        """Destroy filters."""
         for handle in handles:
             self.destroy(handle)
 

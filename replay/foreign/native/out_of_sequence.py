@@ -1,9 +1,10 @@
-"""Hands messages to the filters of a library as they arrive: late ones take their places by stamp.
+"""Reprocessing of out-of-sequence messages by the filters of a library.
 
-Every run has two filters. The settled one has taken, in order, the messages before which none can come
-any more, the newest one all that have arrived. At a late message the newest one becomes a copy of the
-settled one, and takes again what the window has. The estimates are those of the newest, the innovations
-those of the settled one: so both are what processing in order gives.
+Messages are passed as they arrive, and every run has two filters. The settled one has processed, in
+order, the messages before which no others can come any more; the newest one has processed all that have
+arrived. When a message is late, the newest filter becomes a copy of the settled one and processes the
+messages in the window again. Estimates are those of the newest filter, innovations those of the settled
+one, so both equal those of processing in order.
 """
 
 from bisect import bisect
@@ -40,12 +41,12 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 
 @varying(1)
 class Arrived(NamedTuple):
-    """Holds what has arrived, in order, and how late a message may be.
+    """Messages that have arrived, in order, and how late a message may be.
 
     Attributes:
-        order: (n,) the messages that have arrived, by stamp and place in the file; those of run r from
-            where its events begin.
-        estimating: (n,) 1 for messages at whose stamps there are estimates.
+        order: (n,) the messages that have arrived, sorted by stamp and position in the file; those of
+            run r begin where its events begin.
+        estimating: (n,) 1 for messages whose stamps have estimates.
         window_ns: (1,).
     """
 
@@ -63,7 +64,7 @@ def follow_as_arrived(
     made: Results,
     work: tuple[Innovation, Innovation],
 ) -> None:
-    """Hand one run's messages to its filters as they arrive, until the run fails; see the module."""
+    """Pass one run's messages to its filters as they arrive, until the run fails; see the module."""
     events, order = given.events, arrived.order
     begin, end = events.offsets[run], events.offsets[run + 1]
     taken = begin
@@ -90,13 +91,13 @@ def follow_as_arrived(
 
 
 def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int:
-    """Put a message where it belongs, by stamp and place in the file; returns its row.
+    """Insert a message in the order by stamp and position in the file, and return its row.
 
     Args:
-        begin: the first row of its run.
-        event: the message's, all rows before it being in order.
-        events: stamps and places of all.
-        order: (n,), by row the event that stands there, changed in place.
+        begin: first row of its run.
+        event: index of the message; all rows before it are in order.
+        events: stamps and positions of all messages.
+        order: (n,), the event in each row, changed in place.
     """
     time_ns, position = events.time_ns[event], events.arrival[event, 1]
     row = event
@@ -111,7 +112,7 @@ def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int
 
 
 def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
-    """Make the newest filter a copy of the settled one."""
+    """Replace the newest filter by a copy of the settled one."""
     DESTROY(given.addresses.destroy, newest.handle[run])
     newest.handle[run] = COPY(given.addresses.copy, settled.handle[run])
     newest.time_ns[run], newest.begun[run] = settled.time_ns[run], settled.begun[run]
@@ -120,7 +121,7 @@ def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
 
 
 def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
-    """Find the last row of the newest stamp at which there are estimates; row `last` is the newest."""
+    """Find the last row of the newest stamp that has estimates; row `last` is the newest."""
     row, order = last, arrived.order
     while row > 0 and arrived.estimating[order[row]] == 0:
         row -= 1
@@ -144,7 +145,7 @@ def follow_all_as_arrived(
     carried: Filters,
     made: Results,
 ) -> None:
-    """Hand the messages of all runs to their filters as they arrive; see `following.follow_all`."""
+    """Pass the messages of all runs to their filters as they arrive; see `following.follow_all`."""
     estimates = np.array([each.estimates for each in description.topics])
     arrived = Arrived(
         np.zeros(len(events.time_ns), np.int64),
@@ -159,7 +160,7 @@ def follow_all_as_arrived(
 
 
 def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
-    """List the late messages of blocks, and behind how many that came before each of them belongs."""
+    """List the late messages in blocks, with the number of earlier arrivals reprocessed for each."""
     newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
     made = []
     for events in blocks:

@@ -1,4 +1,4 @@
-"""Runs filters in processes of their own: watched, ended where they must be, and replaced.
+"""Processes for filters: started, watched, ended if necessary, and replaced.
 
 Begin with `isolation`; `streaming` has the programs that answer messages.
 """

@@ -1,4 +1,4 @@
-"""Runs filters in processes of their own: a crash, a loop or a leak ends one run, with its reason."""
+"""Isolation of filters in processes: a crash, an endless loop or a memory leak ends only one run."""
 
 import atexit
 import json
@@ -31,28 +31,28 @@ from fuselog.replay.foreign.results import begun, results
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
-LOOKS_S = 0.02  # how often a process is looked at
-STARTS_S = 60.0  # how long one may take to begin: it imports and compiles
+LOOKS_S = 0.02  # interval at which a process is checked
+STARTS_S = 60.0  # time for a process to start, since it imports and compiles
 
 
 class Ended(Exception):
-    """Says why a process ended, or was ended, before it was done."""
+    """Reason why a process ended, or was ended, before it was done."""
 
 
 class Limits(NamedTuple):
-    """Holds how long one message may take, and how much memory a process."""
+    """Limits of the time for one message and of the memory of a process."""
 
     time_s: float
     memory_mb: float
 
     @classmethod
     def of(cls, parameters: ForeignParameters) -> "Limits":
-        """Return those of an estimator."""
+        """Return the limits in the parameters of an estimator."""
         return cls(parameters.time_limit_s, parameters.memory_limit_mb)
 
 
 class Watch:
-    """Watches a process at work: whether it goes on, and what memory it takes."""
+    """Watch on a working process: its progress and its memory."""
 
     def __init__(self, process: psutil.Process, limits: Limits) -> None:
         self._process, self._limits = process, limits
@@ -60,7 +60,7 @@ class Watch:
         self._since = time.monotonic()
 
     def look(self, progress: object, allowed_s: float | None = None) -> None:
-        """Look at it; raises Ended where it is beyond a limit. `progress` differs where it went on."""
+        """Check the process; raise Ended if it exceeds a limit. `progress` differs if it advanced."""
         now, limit_s = time.monotonic(), allowed_s or self._limits.time_s
         if progress != self._seen:
             self._seen, self._since = progress, now
@@ -79,8 +79,8 @@ def _memory(process: psutil.Process) -> int:
 
 
 def end(process: "subprocess.Popen[bytes]") -> None:
-    """End a process and all that it started."""
-    if process.poll() is None:  # else its number may be another's
+    """End a process and all processes that it started."""
+    if process.poll() is None:  # otherwise its ID may belong to another process
         with suppress(psutil.Error):
             kill_family(psutil.Process(process.pid))
         process.wait()
@@ -91,14 +91,14 @@ def end(process: "subprocess.Popen[bytes]") -> None:
                 with suppress(OSError):
                     stream.close()
 
-    # what it started before it ended by itself may hold its output open, which nobody waits for
+    # a process that it started may hold its output open; this is not waited for
     closing = threading.Thread(target=close, daemon=True)
     closing.start()
     closing.join(LOOKS_S)
 
 
 def how_ended(code: int) -> str:
-    """Say how a process ended."""
+    """Describe how a process with this exit code ended."""
     if code < 0:
         with suppress(ValueError):
             return f"crashed ({signal.Signals(-code).name})"
@@ -106,7 +106,7 @@ def how_ended(code: int) -> str:
 
 
 class Worker:
-    """Represents a process that takes runs through filters of libraries, one after another."""
+    """Process that processes runs with filters of libraries, one after another."""
 
     def __init__(self) -> None:
         self._process = start_module("fuselog.replay.foreign.processes.worker", stdout=subprocess.PIPE)
@@ -123,22 +123,22 @@ class Worker:
         self._answers.put(b"")
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, whatever it is doing."""
         self.is_over = True
         end(self._process)
 
     @property
     def is_alive(self) -> bool:
-        """Tell whether it waits for work."""
+        """Test whether the process is running."""
         return self._process.poll() is None
 
     @property
     def code(self) -> int | None:
-        """Return its exit code; None while there is none."""
+        """Return the exit code; None while the process runs."""
         return self._process.returncode
 
     def ask(self, task: dict[str, Any], limits: Limits, progress: Callable[[], int] = lambda: 0) -> Any:
-        """Have a task done; raises Ended where the process does not do it, BadInput what it raises."""
+        """Have a task done; raise Ended if the process ends first, and BadInput if it refuses it."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(task).encode() + b"\n")
@@ -162,7 +162,7 @@ class Worker:
 
 
 def state_of(library: str) -> list[int]:
-    """Return when a library was last changed, and its size: a process that has an older one ends."""
+    """Return modification time and size of a library; a process that has loaded an older one ends."""
     try:
         state = Path(library).stat()
     except OSError:
@@ -171,7 +171,7 @@ def state_of(library: str) -> list[int]:
 
 
 class Ran(NamedTuple):
-    """Holds what one run's filter said, and why the run failed, if it did."""
+    """Results of one run's filter, and why the run failed, if it did."""
 
     followed: Followed
     failure: Failure | None
@@ -180,9 +180,9 @@ class Ran(NamedTuple):
 def follow_apart(
     worker: Worker, library: str, given: RunGiven, description: Description, limits: Limits
 ) -> Ran | None:
-    """Take one run through its filter in a process; what it says before it crashes counts.
+    """Process one run with its filter in a process; results before a crash are kept.
 
-    None where the process had ended before, for want of work.
+    Return None if the process had already ended because it was idle.
     """
     due, recorded = offsets_of(description, given.events)
     with scratch_folder("fuselog-filter") as folder:
@@ -208,7 +208,7 @@ def follow_apart(
 
 
 def follow_here(library: Library, given: RunGiven, description: Description) -> Ran:
-    """Take one run through its filter in this process."""
+    """Process one run with its filter in this process."""
     due, recorded = offsets_of(description, given.events)
     made = begun(results(due, recorded, sizes_of(description)), due, recorded)
     failed = follow_given(library, given, description, made)
@@ -217,7 +217,7 @@ def follow_here(library: Library, given: RunGiven, description: Description) -> 
 
 
 def failure_at(event: int, given: RunGiven, description: Description, why: str) -> Failure:
-    """Return a failure at a message, which is named."""
+    """Return a failure at a message, with the message in its reason."""
     events = given.events
     if not 0 <= event < len(events.time_ns):
         first_ns = int(events.time_ns[0]) if len(events.time_ns) else 0
@@ -228,9 +228,9 @@ def failure_at(event: int, given: RunGiven, description: Description, why: str) 
 
 
 class Workers:
-    """Represents the processes that work on some runs; those that survive are kept for the next.
+    """Processes that work on a set of runs; those that survive are kept for later.
 
-    A process that is given nothing for a while ends by itself, see `worker`.
+    A process without work for some time ends by itself, see `worker`.
     """
 
     def __init__(self) -> None:
@@ -239,7 +239,7 @@ class Workers:
 
     @contextmanager
     def one(self) -> Iterator[Worker]:
-        """Take a process out for a run."""
+        """Provide a process for a run."""
         if self._is_over:
             raise Ended("was stopped")
         worker = _kept_or_new()
@@ -252,7 +252,7 @@ class Workers:
                 _KEPT.put(worker)
 
     def end(self) -> None:
-        """End those that still work; there are no more."""
+        """End the processes that still work, and provide no more."""
         self._is_over = True
         for worker in list(self._working):
             worker.end()
@@ -262,7 +262,7 @@ _KEPT: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
 
 def _kept_or_new() -> Worker:
-    """Return a process that waits for work."""
+    """Return an idle process, or start a new one."""
     with suppress(queue.Empty):
         while True:
             worker = _KEPT.get_nowait()
@@ -282,7 +282,7 @@ def _end_kept() -> None:
 def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Take runs through filters in processes, as many at once as there are cores; None stays None."""
+    """Process runs with filters in as many parallel processes as there are cores; None stays None."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
     workers = Workers()
 
@@ -301,7 +301,7 @@ def follow_runs_apart(
 def in_threads(
     work: Callable[[Given], Found], items: Sequence[Given], count: int, stop: Callable[[], None]
 ) -> list[Found]:
-    """Do work on all items, some at once; `stop` ends what they wait for, in the end or when stopped."""
+    """Work on all items in threads, and return the results; `stop` ends what the threads wait for."""
     with ThreadPoolExecutor(count) as threads:
         try:
             return [each.result() for each in [threads.submit(work, item) for item in items]]
@@ -311,7 +311,7 @@ def in_threads(
 
 
 def describe_apart(library: str) -> str:
-    """Ask a library for its description, in a process."""
+    """Ask a library for its description in a process."""
     while True:
         worker = _kept_or_new()
         try:

@@ -1,7 +1,7 @@
-"""Ends the programs that we started where we are killed, and they do not look whether we live.
+"""Guard process that ends the programs that we started if we are killed and they do not notice it.
 
-A process of ours waits for the end of its standard input, which only we hold: that end comes however we
-end. Then it kills what it was told of.
+It waits for the end of its standard input, which only we hold open, so that it ends however we end.
+Then it kills the processes that it was told about.
 """
 
 import atexit
@@ -18,7 +18,7 @@ from fuselog.recorders.processes import start_module
 
 
 def family(process: psutil.Process) -> list[psutil.Process]:
-    """Return a process and all that it started."""
+    """Return a process and all processes that it started."""
     try:
         return [process, *process.children(recursive=True)]
     except psutil.Error:
@@ -26,27 +26,27 @@ def family(process: psutil.Process) -> list[psutil.Process]:
 
 
 def kill_family(process: psutil.Process) -> None:
-    """Kill a process and all that it started."""
+    """Kill a process and all processes that it started."""
     for each in family(process):
         with suppress(psutil.Error):
             each.kill()
 
 
 class _Guard:
-    """Represents the process that outlives us for a moment; one for each of our processes."""
+    """Process that outlives ours for a moment; each of our processes has one."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._of: int | None = None  # a fork has none of its own yet
+        self._of: int | None = None  # a forked process does not have its own yet
         self._process: subprocess.Popen[bytes] | None = None
 
     def tell(self, pid: int) -> None:
-        """Have a program ended when we are; one that has ended by itself is none's concern."""
+        """Register a program to be ended when we end; one that has already ended is ignored."""
         with suppress(psutil.Error):
             line = f"{pid} {psutil.Process(pid).create_time()}\n"
             with self._lock:
                 if self._process is None or self._of != os.getpid() or self._process.poll() is not None:
-                    alone: dict[str, Any] = {"start_new_session": True}  # Ctrl-C is not for it
+                    alone: dict[str, Any] = {"start_new_session": True}  # so that it does not get Ctrl-C
                     if sys.platform == "win32":
                         alone = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
                     self._process = start_module(__name__, stdout=subprocess.DEVNULL, **alone)
@@ -57,7 +57,7 @@ class _Guard:
                     self._process.stdin.flush()
 
     def end(self) -> None:
-        """End the guard where we end as usual: what it was told of has ended."""
+        """End the guard when we end normally; the registered programs have ended."""
         with self._lock:
             if self._process is not None and self._of == os.getpid():
                 with suppress(OSError):
@@ -70,7 +70,7 @@ atexit.register(GUARD.end)
 
 
 def main() -> None:
-    """Note processes, by number and time of creation; at the end of input kill those that still run."""
+    """Read process IDs and creation times, and kill those still running at the end of the input."""
     noted = [line.split() for line in sys.stdin]
     for pid, created in noted:
         with suppress(psutil.Error):

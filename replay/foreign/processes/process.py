@@ -1,4 +1,4 @@
-"""Starts programs of others, and keeps the last that they say on standard error."""
+"""Start of foreign programs, and the last lines of their standard error."""
 
 import subprocess
 import threading
@@ -12,14 +12,14 @@ from fuselog.recorders.processes import users_environment
 from fuselog.replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
 from fuselog.replay.foreign.processes.orphans import GUARD
 
-TAIL_BYTES = 300  # of what a program says on standard error
+TAIL_BYTES = 300  # kept of a program's standard error
 
 
 class Program:
-    """Represents a program that was started, with its standard streams."""
+    """Started program with its standard streams."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        """Start a program; raises BadInput where it cannot be started."""
+        """Start a program; raise BadInput if it cannot be started."""
         try:
             self.process = subprocess.Popen(
                 words,
@@ -44,18 +44,18 @@ class Program:
                 self.tail = (self.tail + piece)[-TAIL_BYTES:]
 
     def how_ended(self) -> str:
-        """Say how it ended, and its last words."""
+        """Describe how it ended, with the last line of its standard error."""
         code = self.process.wait()
         self._reader.join(1.0)
         lines = self.tail.decode(errors="replace").strip().splitlines()
         return how_ended(code) + (f": {printable(lines[-1])}" if lines and code else "")
 
     def end(self) -> None:
-        """End it and all that it started."""
+        """End it and all processes that it started."""
         end(self.process)
 
     def wait(self, limits: Limits) -> None:
-        """Wait until it has ended well; raises Ended where it does not. What it prints goes nowhere."""
+        """Wait until it has ended; raise Ended if it fails. Its output is discarded."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         threading.Thread(target=self._drop, daemon=True).start()

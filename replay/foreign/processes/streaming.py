@@ -1,7 +1,7 @@
-"""Runs a filter as a program that takes messages on standard input and answers on standard output.
+"""Protocol for a filter in a program that reads messages from standard input and writes answers.
 
-Every frame is its length, 4 bytes, and so many bytes: a letter for what it is, and numbers, all of them
-little-endian. The program begins with its description, and answers every frame but the first, in order:
+Each frame has a length of 4 bytes and that many bytes: a letter for its kind, and little-endian
+numbers. The program begins with its description, and answers every frame except the first, in order:
 
     D  program: the description, JSON, with the version of this protocol
     C  create: seed u64, parameters f64 each
@@ -9,10 +9,10 @@ little-endian. The program begins with its description, and answers every frame 
     T  take: number u32, topic i32, time i64, 1 or 0 whether an estimate is wanted, fields f64 each
     P  predict: number u32, time i64; an estimate is wanted
     R  program: number u32 of the frame that it answers, status i32, flags u8; mean and covariance with
-       flag 1; innovation and its covariance with flag 2, and 4 where a gate kept it out
+       flag 1; innovation and its covariance with flag 2, and 4 if a gate rejected the measurement
 
-A status from 1 on counts in the description's failures; one below zero, and other flags, are errors. The
-end of standard input is the end; an answer that nobody asked for is an error.
+A status above zero is an index in the description's failures, counted from one; a negative status and
+other flags are errors. The end of standard input is the end; an answer without a frame is an error.
 """
 
 import queue
@@ -51,22 +51,22 @@ from fuselog.replay.foreign.processes.process import Program
 from fuselog.replay.foreign.processes.tasks import RunGiven, sizes_of
 from fuselog.replay.foreign.results import Results, begun, fill_squares, results
 
-MOST_BYTES = 16 << 20  # of a frame
+MOST_BYTES = 16 << 20  # largest frame
 _REPLY, _HEAD = struct.Struct("<IiB"), struct.Struct("<I")
 PROTOCOL = 2
-ENDS_S = 1.0  # how long a program may take to end by itself
+ENDS_S = 1.0  # time for a program to end by itself
 ESTIMATE, INNOVATION, REJECTED = 1, 2, 4  # flags
 
 
 class _Frame(NamedTuple):
-    """Holds a frame of the program's, or why there are no more."""
+    """Frame from the program, or the reason why there are no more."""
 
     body: bytes
     fault: str = ""
 
 
 class Stream(Program):
-    """Represents a program that answers frames."""
+    """Program that answers frames."""
 
     def __init__(self, words: Sequence[str], limits: Limits) -> None:
         super().__init__(words)
@@ -76,9 +76,10 @@ class Stream(Program):
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        """Cut what it writes into frames, as it comes.
+        """Split the program's output into frames as it comes.
 
-        By the file and not by its number, which is another program's after `end` has closed the file.
+        It reads from the file object and not from the file descriptor, which may belong to another
+        program after `end` has closed the file.
         """
         assert self.process.stdout is not None
         buffer = bytearray()
@@ -99,7 +100,7 @@ class Stream(Program):
         self._frames.put(_Frame(b"", "ended within a frame" if buffer else ""))
 
     def write(self, frames: Iterator[bytes]) -> None:
-        """Write frames, while answers are read."""
+        """Write frames in a thread while answers are read."""
 
         def work() -> None:
             assert self.process.stdin is not None
@@ -111,7 +112,7 @@ class Stream(Program):
         threading.Thread(target=work, daemon=True).start()
 
     def next(self, letter: bytes, allowed_s: float | None = None) -> bytes:
-        """Return what the next frame has behind its letter; raises Ended where there is none."""
+        """Return the body of the next frame, which must have this letter; raise Ended without one."""
         while True:
             try:
                 frame = self._frames.get(timeout=LOOKS_S)
@@ -128,7 +129,7 @@ class Stream(Program):
             return frame.body[1:]
 
     def check_end(self) -> None:
-        """Raise Ended where it says more than it was asked before it ends, or is ended."""
+        """Raise Ended if the program sends more than it was asked for before it ends."""
         with suppress(queue.Empty):
             frame = self._frames.get(timeout=ENDS_S)
             if frame.body or frame.fault:
@@ -136,7 +137,7 @@ class Stream(Program):
 
 
 def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Description:
-    """Ask a program for its description; raises BadInput where it gives none, or of another protocol."""
+    """Ask a program for its description; raise BadInput without one, or if its protocol differs."""
     stream = Stream(words, limits)
     try:
         found = read_description(stream.next(b"D"), where)
@@ -155,7 +156,7 @@ def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Descrip
 
 
 def frames_of(given: RunGiven, description: Description) -> Iterator[bytes]:
-    """Write what a filter is given of a run as frames."""
+    """Yield the input of a filter for a run as frames."""
     static, events = given.static, given.events
     widths = [each.width for each in description.topics]
     yield struct.pack("<cQ", b"C", given.seed) + np.array(given.parameters, "<f8").tobytes()
@@ -188,8 +189,8 @@ def follow_stream(
     limits: Limits,
     started: list[Program],
 ) -> Ran:
-    """Take one run through a program, which joins `started`; what it said before it fails stays."""
-    if given.prior is not None:  # what is older says nothing
+    """Process one run with a program, which is added to `started`; results before a failure are kept."""
+    if given.prior is not None:  # older messages are not used
         given = given.from_time(given.prior[0])
     due, recorded = offsets_of(description, given.events)
     made = begun(results(due, recorded, sizes_of(description)), due, recorded)
@@ -223,7 +224,7 @@ def follow_stream(
 
 
 class _Failed(Exception):
-    """Says why the filter itself failed."""
+    """Reason why the filter itself failed."""
 
 
 def _reply(
@@ -231,8 +232,8 @@ def _reply(
 ) -> tuple[np.ndarray | None, tuple[np.ndarray, bool] | None]:
     """Read the reply to a frame: mean and covariance, innovation and covariance, whether it was used.
 
-    Raises Ended where it is the reply to another frame or too long or short, _Failed where it says that
-    the filter failed.
+    Raises Ended if the reply is to another frame or has a wrong length, _Failed if it says that the
+    filter failed.
     """
     n, t, m = sizes_of(description)
     number, status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (due, 0, 0xFF)
@@ -261,7 +262,7 @@ def _note(
     state: np.ndarray | None,
     innovation: tuple[np.ndarray, bool] | None,
 ) -> None:
-    """Note what a filter said of a message."""
+    """Store a filter's results for a message."""
     events, time_ns = given.events, given.events.time_ns[event]
     if state is not None and events.wants_estimate[event]:
         row, estimates = made.estimates.end[0], made.estimates
@@ -284,7 +285,7 @@ def _note(
 def follow_runs_streaming(
     words: Sequence[str], runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Take runs through programs, as many at once as there are cores; None stays None."""
+    """Process runs with programs, as many in parallel as there are cores; None stays None."""
     started: list[Program] = []
 
     def one(given: RunGiven | None) -> Ran | None:

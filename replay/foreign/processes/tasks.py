@@ -1,4 +1,4 @@
-"""Hands a process what it needs of a run in files, and reads what it gives: both sides."""
+"""Tasks for worker processes: the input of a run and its results in files, for both processes."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,20 +23,21 @@ from fuselog.replay.foreign.results import Results, Sizes, begun, in_file, resul
 from fuselog.replay.inference.run.recursion import FilterEvents
 from fuselog.replay.inference.run.timing import select_events
 
-LOADING = -1  # the progress of a process that has not begun
-IN_ORDER = -1  # the window of a run whose messages come in the order of their stamps
+LOADING = -1  # progress of a process that has not begun
+IN_ORDER = -1  # window of a run whose messages come in order of their stamps
 
 
 class RunGiven(NamedTuple):
-    """Holds what a filter is given of one run.
+    """Input of a filter for one run.
 
     Attributes:
-        static: what it takes before the start.
+        static: messages that it gets before the start.
         events: its messages.
-        prior: stamp, mean (n,) and covariance (t, t); None where the log has none.
-        parameters: in the description's order.
-        seed: of random numbers.
-        window_ns: how late messages may be, which come as they arrived; IN_ORDER for none.
+        prior: stamp, mean (n,) and covariance (t, t); None if the log has none.
+        parameters: in the order of the description.
+        seed: seed of random numbers.
+        window_ns: how late messages may be that come in order of arrival; IN_ORDER if they are in order
+            of stamps.
     """
 
     static: Static
@@ -47,11 +48,11 @@ class RunGiven(NamedTuple):
     window_ns: int = IN_ORDER
 
     def from_time(self, time_ns: int) -> "RunGiven":
-        """Return the same without messages that are older."""
+        """Return the input without messages older than `time_ns`."""
         return self._replace(events=select_events(self.events, self.events.time_ns >= time_ns))
 
     def save(self, path: Path) -> None:
-        """Write it to a file."""
+        """Write the input to a file."""
         prior = {} if self.prior is None else dict(zip(_PRIOR, self.prior, strict=True))
         static = {f"static_{name}": each for name, each in self.static._asdict().items()}
         numbers = {"parameters": self.parameters, "seed": self.seed, "window_ns": self.window_ns}
@@ -78,19 +79,19 @@ _PRIOR = ("prior_ns", "prior_mean", "prior_covariance")
 
 
 def sizes_of(description: Description) -> Sizes:
-    """Return the numbers of components."""
+    """Return the numbers of components of states and innovations."""
     return Sizes(len(description.state), description.tangent, len(description.innovation))
 
 
 def mapped(folder: Path, due: np.ndarray, recorded: np.ndarray, description: Description) -> Results:
-    """Return the results of a task, which both processes see."""
+    """Map the results of a task, which both processes see."""
     return results(due, recorded, sizes_of(description), in_file(folder / "results"))
 
 
 def follow_given(
     library: Library, given: RunGiven, description: Description, made: Results
 ) -> tuple[int, int] | None:
-    """Take a run through a filter, which fills results; returns what failed and when, if anything."""
+    """Process a run with a filter and fill the results; return what failed and when, or None."""
     prior = None
     if given.prior is not None:
         time_ns, mean, covariance = given.prior
@@ -100,7 +101,7 @@ def follow_given(
     if given.window_ns != IN_ORDER:
         follow = partial(follow_all_as_arrived, given.window_ns)
     nobody = of_runs(carried, slice(0))
-    follow(library, description, given.static, given.events, nobody, made)  # which compiles
+    follow(library, description, given.static, given.events, nobody, made)  # only compiles
     made.progress[0] = 0
     follow(library, description, given.static, given.events, carried, made)
     library.destroy_all(carried.handle.tolist())
@@ -109,7 +110,7 @@ def follow_given(
 
 
 def follow_task(library: Library, folder: Path) -> dict[str, Any]:
-    """Take the run that a folder has through the library's filter; the answer says how it ended."""
+    """Process the run in a folder with the library's filter; return how it ended."""
     description = read_description(library.description, str(library.path))
     given = RunGiven.load(folder / "given.npz")
     due, recorded = offsets_of(description, given.events)

@@ -1,7 +1,7 @@
-"""Runs a library's filters in a process of its own: what they break breaks this process alone.
+"""Worker process for a library's filters, so that a crash of theirs ends only this process.
 
-It is started by `isolation`, takes tasks as lines of JSON, and ends when its standard input does. The
-library finds nothing to read there, and what it prints goes nowhere.
+`isolation` starts it; it gets tasks as lines of JSON, and ends when its standard input does. The
+library finds nothing to read on standard input, and its output is discarded.
 """
 
 import json
@@ -14,12 +14,12 @@ from typing import Any
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.foreign.native.library import Library
 
-IDLE_S = 5.0  # after so long without work it ends
-IDLE = 86  # the exit code then
+IDLE_S = 5.0  # time without work after which it ends
+IDLE = 86  # exit code in this case
 
 
 def main() -> None:
-    """Do tasks until there are no more."""
+    """Process tasks until there are no more."""
     own_input, own_output = os.dup(0), os.dup(1)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):
@@ -30,7 +30,7 @@ def main() -> None:
         def listen() -> None:
             for line in given:
                 tasks.put(line)
-            os._exit(0)  # whoever started this is gone, or wants no more
+            os._exit(0)  # the process that started this one has ended or needs it no longer
 
         threading.Thread(target=listen, daemon=True).start()
         while True:
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def _library(task: dict[str, Any]) -> Library:
-    """Return the library of a task; one that has changed since is for another process to load."""
+    """Load the library of a task; end the process if the library has changed since it was loaded."""
     path, state = task["library"], task["state"]
     if path in _LOADED and _LOADED[path][0] != state:
         os._exit(IDLE)
@@ -64,10 +64,9 @@ def _describe(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
-    """Take one run through its filter; see `isolation.follow_apart`."""
-    from fuselog.replay.foreign.processes.tasks import (
-        follow_task,
-    )  # NumPy and the compiler, which describing needs not
+    """Process one run with its filter; see `isolation.follow_apart`."""
+    # imported here, because describing a library needs neither NumPy nor the compiler
+    from fuselog.replay.foreign.processes.tasks import follow_task
 
     return follow_task(_library(task), Path(task["folder"]))
 

@@ -1,14 +1,15 @@
-"""Bounds the errors over an ensemble of true trajectories (posterior Cramer-Rao), step by step.
+"""Posterior Cramer-Rao bound of the errors over an ensemble of true trajectories, step by step.
 
-With transition F, noise Q and the information H' R^-1 H of every step at the true states, and means over
-the trajectories, of products, not products of means,
+With transition F, noise Q and the information H' R^-1 H of every step at the true states, and with
+means over the trajectories of these products (not products of means),
 
     J_(k+1) = D22 - D21 (J_k + D11)^-1 D12,  D11 = E F'Q^-1F,  D12 = -E F'Q^-1,  D22 = E Q^-1 + E H'R^-1H
 
-bounds filters; what later steps say of step k, L_k = D11 - D12 (D22 + L_(k+1))^-1 D21, gives with it the
-blocks J_k + L_k of the joint information, which bounds smoothers. Where Q is singular, or runs have
-schedules of their own, there is no such mean: then the bounds along each trajectory are averaged, and
-that is said. Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
+bounds filters. The information from later steps on step k, L_k = D11 - D12 (D22 + L_(k+1))^-1 D21,
+gives with it the blocks J_k + L_k of the joint information, which bounds smoothers. If Q is singular,
+or if runs have different stamps, there is no such mean: the bounds along the trajectories are then
+averaged, and the result says so. Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5),
+1998.
 """
 
 from dataclasses import dataclass, field
@@ -30,11 +31,11 @@ UNALIKE = "the runs have other stamps"
 LONG = "there are too many steps"
 # A noise whose correlation matrix has a smaller eigenvalue counts as singular.
 LEAST_EIGENVALUE = 1e-10
-MOST_BYTES = 1 << 28  # of the sums
+MOST_BYTES = 1 << 28  # largest size of the sums
 
 
 class Products(NamedTuple):
-    """Holds F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
+    """F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
 
     before: Floats
     across: Floats
@@ -44,15 +45,15 @@ class Products(NamedTuple):
 
 @dataclass
 class Bounds:
-    """Sums what the bound is made of over the runs of one stream of steps.
+    """Sums over the runs of one stream of steps, from which the bound is computed.
 
     Attributes:
         components: names and kinds of the tangent space.
-        is_smoother: whether smoothers are bounded.
-        sums: of the products by step, rows of 4 t^2.
-        stamps: (steps,) since the epoch, of the first run.
-        steps: of every run, by its number, how many there were.
-        reason: why there is no mean over the ensemble; empty where there is.
+        is_smoother: whether the bound is one of smoothers.
+        sums: sums of the products by step, rows of 4 t^2.
+        stamps: (steps,) ns since the epoch.
+        steps: number of steps of every run, by its number.
+        reason: why there is no mean over the ensemble; empty if there is one.
     """
 
     components: list[tuple[str, str]] = field(default_factory=list)
@@ -64,11 +65,11 @@ class Bounds:
 
     @property
     def size(self) -> int:
-        """Return how many components the tangent space has."""
+        """Return the number of components of the tangent space."""
         return len(self.components)
 
     def add(self, output: Output) -> "Bounds":
-        """Take in a block of steps."""
+        """Add a block of steps."""
         rows = output.rows
         names, kinds = (rows.stream.metadata[name].split(",") for name in ("components", "kinds"))
         self.components = tangent_components(names, kinds)
@@ -90,7 +91,7 @@ class Bounds:
         return self
 
     def _steps_of(self, output: Output) -> Integers:
-        """Return the steps' numbers in their runs; says where a run's stamps are not those of others."""
+        """Return the numbers of the steps in their runs; set `reason` if the stamps of runs differ."""
         rows, numbers = output.rows, []
         for run in range(rows.runs):
             begin, end = rows.offsets[run], rows.offsets[run + 1]
@@ -105,7 +106,7 @@ class Bounds:
         return np.concatenate(numbers)
 
     def merge(self, other: "Bounds") -> "Bounds":
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         self.reason = self.reason or other.reason
         shared = min(len(self.stamps), len(other.stamps))
         if not np.array_equal(self.stamps[:shared], other.stamps[:shared]):
@@ -123,7 +124,7 @@ class Bounds:
 
     @property
     def complaint(self) -> str:
-        """Say why there is no mean over the ensemble; empty where there is."""
+        """Return why there is no mean over the ensemble; empty if there is one."""
         if self.reason or self.sums is None:
             return self.reason
         if self.sums.width > 1:
@@ -131,7 +132,7 @@ class Bounds:
         return UNALIKE if len(set(self.steps.values())) > 1 else ""
 
     def covariances(self) -> Floats | None:
-        """Return the bounds (steps, t, t) after the prior's; None where the ensemble has none."""
+        """Compute the bounds (steps, t, t) after the prior; None if the ensemble has none."""
         if self.complaint or self.sums is None:
             return None
         _, count, sums = self.sums.filled()
@@ -145,7 +146,7 @@ class Bounds:
 
 
 def products_of(rows: Ragged, size: int) -> Products | None:
-    """Compute the products of every step; None where a noise is singular, or a measurement is exact."""
+    """Compute the products of every step; None if a noise is singular, or a measurement is exact."""
     transition, noise, information = (
         rows[name].reshape(-1, size, size) for name in ("transition", "noise", "information")
     )
@@ -161,7 +162,7 @@ def products_of(rows: Ragged, size: int) -> Products | None:
 
 
 def filter_information(mean: Products) -> Floats:
-    """Compute J (steps, t, t): the recursion from the first step, which comes from nothing."""
+    """Compute J (steps, t, t) by the recursion from the first step, which starts without information."""
     found = mean.after + mean.measured
     for step in range(1, len(found)):
         left = mean.across[step].T @ np.linalg.solve(
@@ -172,7 +173,7 @@ def filter_information(mean: Products) -> Floats:
 
 
 def later_information(mean: Products) -> Floats:
-    """Compute L (steps, t, t): what all later steps say of each."""
+    """Compute L (steps, t, t), the information from all later steps on each step."""
     found = np.zeros_like(mean.after)
     for step in range(len(found) - 2, -1, -1):
         after = mean.after[step + 1] + mean.measured[step + 1] + found[step + 1]
@@ -187,10 +188,11 @@ def _add(state: Bounds, output: Output) -> Bounds:
 
 
 def root_mean_squares(state: Bounds) -> dict[str, float]:
-    """Compute what no RMSE over all steps gets below, under the names that RMSE have.
+    """Compute the lower bounds of RMSE over all steps, under the names of the RMSE.
 
-    Only where that is of the ensemble, which `over_ensemble` says by 1; else there is the average along
-    the trajectories, as of errors (`metrics.ACCURACY`).
+    They are returned only if the bound is that of the ensemble, and `over_ensemble` is then 1.
+    Otherwise the average along the trajectories is computed in the same way as errors are
+    (`metrics.ACCURACY`).
     """
     if not state.components:
         return {}

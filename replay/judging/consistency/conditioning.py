@@ -1,9 +1,9 @@
-"""Judges what rounding has left of covariances, from samples of those that a replay gives.
+"""Loss of precision in covariances by rounding, judged from samples of those that a replay outputs.
 
-Each pivot of a Cholesky factorisation is taken as a share of its variance, so that units are of no
-account: it is how much of the variance the components before do not tell. The largest is one, and one
-below 1e-12 has four of a double's sixteen digits left (Higham, Accuracy and Stability of Numerical
-Algorithms, 2nd edition, theorem 10.7).
+Each pivot of a Cholesky factorisation is divided by its variance, so that units do not matter: the
+quotient is the fraction of the variance that the preceding components do not explain. It is at most
+one, and below 1e-12 only four of a double's sixteen digits are left (Higham, Accuracy and Stability of
+Numerical Algorithms, 2nd edition, theorem 10.7).
 """
 
 import math
@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 
 from fuselog.replay.engine.streams.blocks import Ragged
 
-LOST = 1e-12  # a pivot below has lost its digits
-# Of a block so many are looked at, evenly: one of EACH, but at least FEWEST.
+LOST = 1e-12  # a smaller pivot has lost its digits
+# One of EACH covariances of a block is sampled, evenly, but at least FEWEST and at most MOST.
 EACH, FEWEST, MOST = 64, 8, 256
 
 
 class Conditioning(NamedTuple):
-    """States what samples of a topic's covariances are like.
+    """Conditioning of samples of a topic's covariances.
 
     Attributes:
-        sampled: how many were looked at.
-        lost: in how many a pivot has lost its digits.
-        failed: how many are not positive definite, beyond rounding.
-        least: the least pivot.
-        run: where that has lost its digits: of which run, by its number in the ensemble.
-        elapsed_s: and when, since the run's epoch.
+        sampled: number of samples.
+        lost: number of samples in which a pivot has lost its digits.
+        failed: number of samples that are not positive definite, beyond rounding.
+        least: the smallest pivot.
+        run: number in the ensemble of the run with the smallest pivot, if its digits are lost.
+        elapsed_s: time of this pivot since the run's epoch.
     """
 
     sampled: int = 0
@@ -40,7 +40,7 @@ class Conditioning(NamedTuple):
     elapsed_s: float = 0.0
 
     def plus(self, other: "Conditioning") -> "Conditioning":
-        """Return both together."""
+        """Return the combination with `other`."""
         worst = other if other.least < self.least else self
         return worst._replace(
             sampled=self.sampled + other.sampled,
@@ -50,12 +50,12 @@ class Conditioning(NamedTuple):
 
 
 def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int = 0) -> Conditioning:
-    """Look at samples of the covariances of a block.
+    """Compute the conditioning of samples of the covariances of a block.
 
     Args:
         rows: Gaussian estimates, or innovations.
-        epochs_ns: (runs,) times zero.
-        first_run: the number of the first run.
+        epochs_ns: (runs,) epochs of the runs.
+        first_run: number of the first run.
     """
     count = len(rows)
     if not count:
@@ -82,15 +82,15 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
 
 @lru_cache(maxsize=64)
 def _sampled(count: int) -> NDArray[np.int64]:
-    """Return the rows that are looked at, of so many."""
+    """Return the rows to sample, out of `count`."""
     most = min(count, max(FEWEST, min(count // EACH, MOST)))
     return np.arange(most) * (count - 1) // max(1, most - 1)
 
 
 def _least_of_all(covariances: NDArray[np.float64]) -> float:
-    """Return the least pivot of covariances (count, n, n), or NaN where one has no factor.
+    """Compute the smallest pivot of covariances (count, n, n); NaN if one of them has no factor.
 
-    Every replay pays for it, and nearly always nothing is lost: it is in few calls of NumPy.
+    Every replay runs this and precision is rarely lost, so it uses few calls of NumPy.
     """
     count, size, _ = covariances.shape
     try:
@@ -99,14 +99,14 @@ def _least_of_all(covariances: NDArray[np.float64]) -> float:
         return math.nan
     diagonals = factors.reshape(count, -1)[:, :: size + 1]
     pivots = diagonals * diagonals / covariances.reshape(count, -1)[:, :: size + 1]
-    return float(pivots.item(pivots.argmin()))  # which is that of a NaN, where there is one
+    return float(pivots.item(pivots.argmin()))  # argmin returns a NaN if there is one
 
 
 def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least pivot (count,) of covariances (count, n, n), as shares of variances.
+    """Compute the smallest pivots (count,) of covariances (count, n, n), divided by the variances.
 
-    A component without variance is known, and one that is not finite is none: both are left out. Where
-    a pivot is not positive there is no factor, and it is the least one.
+    Components without variance and components that are not finite are left out. The factorisation ends
+    at a pivot that is not positive, which is then the smallest.
     """
     variances = np.einsum("rii->ri", covariances)
     is_in = np.isfinite(variances) & (variances != 0.0)
@@ -118,7 +118,10 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _least_pivot(left: NDArray[np.float64]) -> float:
-    """Find that of one matrix (n, n), which is spent; it ends at a pivot that is not positive."""
+    """Compute the smallest pivot of one matrix (n, n) up to the first that is not positive.
+
+    The matrix is overwritten.
+    """
     least = 1.0
     for place in range(len(left)):
         pivot = float(left[place, place])

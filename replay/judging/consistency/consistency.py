@@ -1,4 +1,4 @@
-"""Compares errors with the covariance promised: by component, ellipses, dilution of precision.
+"""Errors compared with the stated covariance: by component, error ellipses, dilution of precision.
 
 NEES itself is `fuselog.replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
 Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
@@ -10,25 +10,25 @@ from numpy.typing import ArrayLike, NDArray
 from fuselog.replay.engine import chi2
 
 Array = NDArray[np.float64]
-CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
+CONSISTENT = 0.999  # fraction of a consistent filter's logs in which NIS or NEES is within its interval
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:
-    """Return each component's own normalized squared error, (..., n)."""
+    """Compute the normalised squared error of each component, (..., n)."""
     return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)
 
 
 def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
-    """Compute the area of error ellipses of covariances (..., 2, 2) that hold this probability.
+    """Compute the area of the error ellipses of covariances (..., 2, 2) that contain this probability.
 
-    Zero where rounding makes the determinant of a singular one negative.
+    The area is zero if rounding makes the determinant of a singular covariance negative.
     """
     squared = np.maximum(np.linalg.det(covariance), 0.0)
     return np.pi * chi2.ppf(probability, 2) * np.sqrt(squared)
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
-    """Compute GDOP: position error by range and noise of both angles; Belfadel et al. 2014, eq (32).
+    """Compute GDOP from position error, range and noise of both angles; Belfadel et al. 2014, eq (32).
 
     Args:
         position_error_m: (...,).

@@ -1,4 +1,4 @@
-"""Finds from when on a filter's innovations are too large for good, as those of one that diverges."""
+"""Detection of the time from which a filter's innovations stay too large because the filter diverges."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ import numpy as np
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine import chi2
 
-IMPROBABLE = 1e-4  # of the sum of NIS over a window
-WINDOW = 30  # innovations, over which NIS is averaged
-USUALLY_WELL = 0.8  # of the windows before, in which NIS is as expected
+IMPROBABLE = 1e-4  # probability of the sum of NIS over a window
+WINDOW = 30  # number of innovations over which NIS is averaged
+USUALLY_WELL = 0.8  # fraction of the earlier windows in which NIS must be as expected
 
 
 class Divergence(NamedTuple):
-    """Holds where a filter begins to diverge.
+    """Point at which a filter begins to diverge.
 
     Attributes:
-        row: the innovation after which it does.
-        time_ns: its stamp.
-        nis_per_component: the mean from there on.
+        row: the innovation after which it diverges.
+        time_ns: the stamp of this innovation.
+        nis_per_component: the mean NIS per component from there on.
     """
 
     row: int
@@ -27,10 +27,10 @@ class Divergence(NamedTuple):
 
 
 def find_divergence(innovations: Stream) -> Divergence | None:
-    """Find from when on NIS is too large for good in one run, where it was as expected before.
+    """Find the time from which NIS stays too large in a run in which it was as expected before.
 
     Args:
-        innovations: all of one estimator, in order of time.
+        innovations: all innovations of one estimator, in order of time.
     """
     nis = innovations["normalised_innovation_squared"]
     degrees = np.isfinite(innovations["innovation"]).sum(axis=1)

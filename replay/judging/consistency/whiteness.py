@@ -1,9 +1,9 @@
-"""Tests whether innovations are white: normalised, uncorrelated in time, of mean square one.
+"""Tests whether innovations are white: normalised, uncorrelated in time, with a mean square of one.
 
-A measurement noise that is stated too small correlates successive innovations negatively, a process
-noise that is too small positively: Mehra, "On the identification of variances and adaptive Kalman
-filtering", IEEE TAC 1970. Ljung and Box, "On a measure of lack of fit in time series models", Biometrika
-1978.
+If the stated measurement noise is too small, successive innovations are negatively correlated; if the
+process noise is too small, positively: Mehra, "On the identification of variances and adaptive Kalman
+filtering", IEEE TAC 1970. Ljung and Box, "On a measure of lack of fit in time series models",
+Biometrika 1978.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ LAGS = 20
 
 
 class Whiteness(NamedTuple):
-    """Holds what a series of normalised innovations tells.
+    """Statistics of a series of normalised innovations.
 
     Attributes:
-        size: how many there are.
+        size: number of innovations.
         mean_square: one if the covariances are right; the mean is not removed.
         correlation: (lags,) the autocorrelation at lags 1, 2, ...; the mean is removed.
-        ljung_box: Q = n (n + 2) sum correlation^2 / (n - lag), chi-square of as many degrees as lags.
-        probability: that a white series has a larger Q.
+        ljung_box: Q = n (n + 2) sum correlation^2 / (n - lag), chi-square with one degree of freedom
+            per lag.
+        probability: probability that a white series has a larger Q.
     """
 
     size: int
@@ -38,15 +39,15 @@ class Whiteness(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """Return what the magnitude of an autocorrelation of a white series exceeds once in twenty."""
+        """Return the 95 % bound of the magnitude of an autocorrelation of a white series."""
         return float(1.96 / np.sqrt(self.size))
 
 
 def whitened(innovations: Stream) -> Floats:
-    """Return normalised innovations e = L^-1 v (n, m) of an innovation stream, where S = L L'.
+    """Compute normalised innovations e = L^-1 v (n, m) of an innovation stream, with S = L L'.
 
-    A component is made independent of those before it; one that is missing is NaN, and left out of the
-    others. A covariance that is none makes a row of NaN.
+    Each component is made independent of those before it. A missing component is NaN and does not
+    affect the others; an invalid covariance makes a row of NaN.
     """
     difference = innovations["innovation"]
     n, m = difference.shape
@@ -67,13 +68,13 @@ def whitened(innovations: Stream) -> Floats:
 
 
 def whiteness(series: Sequence[Floats], lags: int = LAGS) -> Whiteness:
-    """Measure the whiteness of normalised innovations of one component.
+    """Compute the whiteness of normalised innovations of one component.
 
-    Fewer than `lags` + 2 tell nothing: all but their count is NaN.
+    With fewer than `lags` + 2 innovations, everything except their number is NaN.
 
     Args:
-        series: of one run or several, (n,) each; what is not finite is left out.
-        lags: up to which the correlation is looked at.
+        series: one array (n,) per run; values that are not finite are left out.
+        lags: the largest lag of the autocorrelation.
     """
     known = [each[np.isfinite(each)] for each in series]
     count = sum(map(len, known))

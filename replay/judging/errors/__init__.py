@@ -1,1 +1,1 @@
-"""Computes errors of estimates against the truth at their stamps; begin with `evaluation`."""
+"""Errors of estimates against the truth at their stamps; begin with `evaluation`."""

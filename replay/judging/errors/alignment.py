@@ -1,8 +1,9 @@
-"""Aligns estimates with truth by the least-squares transform of their positions.
+"""Alignment of estimates with truth by the least-squares transform of their positions.
 
 Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
-Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical alone: Zhang,
-Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry", IROS 2018.
+Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical axis only:
+Zhang, Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry",
+IROS 2018.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,27 +25,27 @@ from fuselog.replay.judging.errors.planes import ALIGNED
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]
 
-# Of the two largest extents of a path, squared: rounding alone makes straight lines as wide as this.
+# Smallest ratio of a path's two largest extents, squared; rounding makes straight lines narrower.
 LEAST_WIDTH = 1e-10
-# The cosine of an angle that is none but for rounding: 1e-6 rad.
+# The cosine of 1e-6 rad, an angle that is zero up to rounding.
 LEAST_COSINE = 1 - 1e-12
 
 
 class Alignment(Movement):
-    """Holds p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
+    """Transform p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
-    """Return the transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
+    """Compute the transform that brings positions (n, 3) of an estimate closest to the truth's (n, 3).
 
     Args:
-        estimate_m: positions of the estimate.
-        truth_m: where they truly are.
-        align: "none"; "yaw" turns about the vertical and shifts; "se2" does so too, but leaves the
-            height as it is; "se3" turns and shifts; "sim3" scales as well.
-        where: what to call the estimate in a message.
+        estimate_m: positions of the estimate in m.
+        truth_m: true positions in m.
+        align: "none"; "yaw" rotates about the vertical axis and shifts; "se2" does the same but does
+            not change the height; "se3" rotates and shifts; "sim3" also scales.
+        where: name of the estimate in messages.
 
-    Raises BadInput where the positions do not tell the rotation: too few, or all in one line.
+    Raises BadInput if the positions do not determine the rotation: too few, or all in one line.
     """
     if align == "none":
         return Alignment()
@@ -71,7 +72,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
             "give another alignment"
         )
     scale = 1.0
-    if align == "sim3":  # (42): trace(D S) is the sum of the truth along the turned estimate
+    if align == "sim3":  # (42): trace(D S) is the sum of the truth along the rotated estimate
         scale = float(np.sum(of_truth * (of_estimate @ rotation.T)) / np.sum(of_estimate**2))
     translation_m = truth_mean - scale * rotation @ estimate_mean  # (41)
     if align == "se2":
@@ -80,19 +81,19 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
 
 
 def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> float:
-    """Compute how well positions determine the rotation: half its 95 % interval, about the worst axis.
+    """Compute half the 95 % interval of the rotation determined by positions, about the worst axis.
 
-    With errors of variance s^2 per axis the information on a turn about a unit vector u is
-    sum |u x p|^2 / s^2 over the centred positions p, so that its variance is s^2 over the squared
-    distances from the axis (Sturm et al. 2012 and evo give none). Neighbouring errors are alike, so that
-    only as many positions count as are independent: n over the errors' correlation time (Bayley and
-    Hammersley, "The effective number of independent observations in an autocorrelated time series",
-    Supplement to JRSS 8(2), 1946).
+    With errors of variance s^2 per axis, the information on a rotation about a unit vector u is sum |u
+    x p|^2 / s^2 over the centred positions p, so its variance is s^2 divided by the sum of squared
+    distances from the axis (Sturm et al. 2012 and evo give none). Neighbouring errors are correlated,
+    so only the number of independent positions counts: n divided by the errors' correlation time
+    (Bayley and Hammersley, "The effective number of independent observations in an autocorrelated time
+    series", Supplement to JRSS 8(2), 1946).
 
     Args:
-        estimate_m: (n, 3), aligned positions.
-        truth_m: (n, 3), where they truly are.
-        align: how they were aligned; "none" determines everything.
+        estimate_m: (n, 3), aligned positions in m.
+        truth_m: (n, 3), true positions in m.
+        align: how they were aligned; with "none" the result is zero.
 
     Returns:
         The error in rad; infinite if all positions are on the axis.
@@ -104,7 +105,7 @@ def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> flo
     around = float(np.sum(centred[:, :2] ** 2))
     if align not in ("yaw", "se2"):
         squares = np.linalg.eigvalsh(centred.T @ centred)
-        around = float(squares[0] + squares[1])  # about the axis along which the path is longest
+        around = float(squares[0] + squares[1])  # about the axis of the path's largest extent
     variance = float(np.mean(error[:, axes] ** 2))
     with np.errstate(divide="ignore"):
         sigma_rad = np.sqrt(variance * _correlation_time(error[:, axes]) / np.float64(around))
@@ -112,7 +113,7 @@ def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> flo
 
 
 def _correlation_time(error: Floats) -> float:
-    """Compute over how many rows errors (n, m) are alike: 1 plus twice the sum of correlations."""
+    """Compute the correlation time of errors (n, m) in rows: 1 plus twice the sum of correlations."""
     total = float(np.sum(error**2))
     found = 1.0
     for lag in range(1, len(error) // 2):
@@ -124,7 +125,7 @@ def _correlation_time(error: Floats) -> float:
 
 
 def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
-    """Return the trajectory in the truth's frame."""
+    """Transform the trajectory into the truth's frame."""
     turned = alignment.scale * trajectory.position_m @ alignment.rotation.T
     rotation = trajectory.rotation
     return replace(
@@ -135,12 +136,13 @@ def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
 
 
 def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
-    """Return Gaussian estimates in the truth's frame with their covariances: NEES is of aligned errors.
+    """Transform Gaussian estimates and their covariances into the truth's frame.
 
-    Positions and velocities turn, headings and orientations as well; the latter have their covariance in
-    the body's frame, where it stays. All other components are taken to be of the body.
+    NEES is then that of aligned errors. Positions, velocities, headings and orientations are rotated;
+    the covariance of an orientation is in the body's frame and does not change. All other components
+    are assumed to be in the body's frame.
 
-    Raises BadInput where a planar state would be turned out of its plane.
+    Raises BadInput if a planar state would be rotated out of its plane.
     """
     estimates = in_body_axes(estimates)
     components = stated_components(estimates.metadata, {}, f"topic {estimates.topic}")
@@ -162,14 +164,14 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
 
 @dataclass(frozen=True, repr=False)
 class AlignedEstimates(LogSource):
-    """Represents a log whose estimates of some topics are in the truth's frame."""
+    """Log in which the estimates on some topics are transformed into the truth's frame."""
 
     alignments: Mapping[str, Alignment] = field(default_factory=dict)
 
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield blocks of the log, estimates aligned."""
+        """Yield blocks of the log with aligned estimates."""
         for block in super().blocks(topics, order, block_messages):
             yield {
                 topic: aligned_estimates(stream, self.alignments[topic])

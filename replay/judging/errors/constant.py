@@ -1,7 +1,7 @@
-"""Tells an error that stays: truth and estimate have other origins, or are of other points of a body.
+"""Detection of constant errors: truth and estimate have different origins or different body points.
 
-With errors e_k of positions, covariances P_k and headings h_k, a constant d is sought for which e_k - d
-is small, and a lever l for which e_k - R(h_k) l is. What is kept are sums, which merge.
+From errors e_k of positions, covariances P_k and headings h_k, a constant d is estimated for which e_k
+- d is small, and a lever l for which e_k - R(h_k) l is. Only mergeable sums are stored.
 """
 
 from dataclasses import dataclass, field
@@ -11,20 +11,23 @@ import numpy as np
 
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
 
-SHARE = 0.5  # of the mean squared error, from which on a constant makes the most of it
-HALVED = 0.5  # NEES without the constant, as a share of NEES with it
-EXPLAINED, TENTH = 5.0, 0.1  # and what it is then: so much of each component, or a tenth
-DRIFTS = 0.5  # share of the rest that a line in time takes away: the error grows, and is not constant
+SHARE = 0.5  # fraction of the mean squared error above which a constant dominates it
+HALVED = 0.5  # largest NEES without the constant, as a fraction of NEES with it
+EXPLAINED, TENTH = (
+    5.0,
+    0.1,
+)  # largest NEES then: per component, or as a fraction
+DRIFTS = 0.5  # fraction of the rest that a line in time explains: above it, the error grows
 
 
 class Constant(NamedTuple):
-    """Describes an error that stays.
+    """Constant error.
 
     Attributes:
-        turns: whether it turns with the body: ahead, to the left and up, in place of x, y and z.
-        offset_m: (2,) or (3,) what it is.
-        share: of the mean squared error that it makes.
-        nees, rest: NEES of the positions, with it and without.
+        turns: whether it rotates with the body: forward, left and up instead of x, y and z.
+        offset_m: (2,) or (3,) the error.
+        share: fraction of the mean squared error that it explains.
+        nees, rest: NEES of the positions, with it and without it.
     """
 
     turns: bool
@@ -36,15 +39,15 @@ class Constant(NamedTuple):
 
 @dataclass
 class FrameSums:
-    """Sums errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
+    """Sums of errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
 
     Attributes:
         count: n.
-        error, weighted: (axes,) of e and W e.
-        weight: (axes, axes) of W.
-        squared, nees: of e' e and e' W e.
-        time, time_squared: of t and t^2.
-        timed: (axes,) of t e.
+        error, weighted: (axes,) sums of e and W e.
+        weight: (axes, axes) sum of W.
+        squared, nees: sums of e' e and e' W e.
+        time, time_squared: sums of t and t^2.
+        timed: (axes,) sum of t e.
     """
 
     count: int = 0
@@ -58,7 +61,7 @@ class FrameSums:
     timed: Any = 0.0
 
     def add(self, error: Floats, weight: Floats, time_s: Floats) -> None:
-        """Take in errors, weights and times."""
+        """Add errors, weights and times."""
         weighted = np.einsum("ijn,jn->in", weight, error)
         self.count += error.shape[1]
         self.error = self.error + error.sum(axis=1)
@@ -71,12 +74,12 @@ class FrameSums:
         self.timed = self.timed + error @ time_s
 
     def merge(self, other: "FrameSums") -> None:
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
     def constant(self, *, turns: bool) -> Constant | None:
-        """Return the mean error, where it makes most of the error, is constant, and NEES tells it."""
+        """Return the mean error if it dominates, does not grow and explains the NEES; otherwise None."""
         if not self.count or not self.squared:
             return None
         mean = self.error / self.count
@@ -95,13 +98,13 @@ class FrameSums:
 
 @dataclass
 class ConstantSums:
-    """Sums one estimate stream's errors of position, as they stand and as seen from the body."""
+    """Sums of one estimate stream's position errors, in the fixed frame and in the body's frame."""
 
     fixed: FrameSums = field(default_factory=FrameSums)
     turned: FrameSums = field(default_factory=FrameSums)
 
     def add(self, errors: Errors) -> None:
-        """Take in a block; a bound has no errors, and what has no position no origin."""
+        """Add a block. Bounds have no errors; estimates without a position have no origin."""
         place = errors.position
         if errors.is_bound or len(place) < 2:
             return
@@ -119,14 +122,15 @@ class ConstantSums:
             self.turned.add(_turned(error, cosine, sine), both, time_s)
 
     def merge(self, other: "ConstantSums") -> None:
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         self.fixed.merge(other.fixed)
         self.turned.merge(other.turned)
 
     def found(self) -> Constant | None:
-        """Find the error that stays, if there is one; of both frames that in which it makes more of it.
+        """Find the constant error, if there is one, in the frame in which it explains more of the error.
 
-        Of a body that never turns it is not known, and counts as that of another origin.
+        If the body never rotates, the frames cannot be distinguished, and the error counts as another
+        origin.
         """
         fixed, turned = self.fixed.constant(turns=False), self.turned.constant(turns=True)
         if fixed is None or turned is None:
@@ -135,7 +139,7 @@ class ConstantSums:
 
 
 def _inverse(covariance: Floats) -> Floats:
-    """Return the inverses of covariances (axes, axes, n); an infinite variance weighs nothing."""
+    """Invert covariances (axes, axes, n); an infinite variance has weight zero."""
     if len(covariance) > 2:
         finite = np.where(np.isfinite(covariance), covariance, 1e300)
         return np.moveaxis(np.linalg.inv(np.moveaxis(finite, 2, 0)), 0, 2)
@@ -147,7 +151,7 @@ def _inverse(covariance: Floats) -> Floats:
 
 
 def _turned(vector: Floats, cosine: Floats, sine: Floats) -> Floats:
-    """Return vectors (axes, ..., n) as seen from bodies with these headings (n,)."""
+    """Rotate vectors (axes, ..., n) into the frames of bodies with these headings (n,)."""
     turned = vector.copy()
     turned[0] = cosine * vector[0] + sine * vector[1]
     turned[1] = cosine * vector[1] - sine * vector[0]

@@ -1,10 +1,10 @@
-"""Pairs differences of a metric: what one estimator gave of every run against another's.
+"""Paired differences of a metric: the results of one estimator against those of another in every run.
 
-Intervals are those of the percentile bootstrap, see `fuselog.replay.judging.intervals`. BCa is no
-better here: paired differences of two alike are symmetric, however skewed the metric, and what BCa
-corrects is chance (over 50 runs it called 9 to 11 % of NEES different where nothing is). Every metric
-has an interval of 95 % of its own: of many without a difference, about one in twenty is called different
-by chance.
+Intervals are percentile bootstrap intervals, see `fuselog.replay.judging.intervals`. BCa is not better
+here: paired differences of two equal estimators are symmetric even if the metric is skewed, and BCa
+then corrects only chance (over 50 runs it called 9 to 11 % of NEES different without a difference).
+Each metric has its own 95 % interval: among many metrics without a difference, about one in twenty is
+called different by chance.
 """
 
 import math
@@ -17,11 +17,11 @@ import numpy as np
 from fuselog.replay.judging.intervals import FEWEST_RUNS, RESAMPLES, Floats, Interval
 from fuselog.replay.judging.verdicts import Comparison
 
-# What a metric should be: small, large, near a value; None where neither is better.
+# Target of a metric: small, large, or near a value; None if no direction is better.
 Target = Literal["low", "high"] | float | None
-# So many numbers of resamples are in memory at once.
+# Number of resampled values in memory at a time.
 BATCH_NUMBERS = 1 << 22
-# The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
+# A log-likelihood has no natural zero: a margin of 0.02 means 2 nats.
 NATS = 100.0
 TARGETS: dict[str, Target] = {
     "*rmse*": "low",
@@ -53,13 +53,13 @@ TARGETS: dict[str, Target] = {
 }
 
 
-FEWEST_DOMINATED = 3  # numbers, of which one may be more than all others together
+FEWEST_DOMINATED = 3  # fewest numbers among which one can dominate
 
 
 def dominating(values: Floats) -> int | None:
-    """Return the place of the number (n,), none below zero, that is more than all others together.
+    """Return the index of the number (n,), not negative, that exceeds the sum of all others.
 
-    None if there is none, or if there are too few.
+    None if there is no such number, or if there are too few numbers.
     """
     if len(values) < FEWEST_DOMINATED:
         return None
@@ -68,15 +68,15 @@ def dominating(values: Floats) -> int | None:
 
 
 class Difference(NamedTuple):
-    """States the difference of a metric of two estimators over the same runs.
+    """Difference of a metric between two estimators over the same runs.
 
     Attributes:
         first, second: the means over the runs.
         more: second - first.
         margin: differences up to this do not matter.
-        verdict: on the second: whether the interval lies beyond the margin, or within it.
-        sure: the share of the resamples in which the difference has the sign that it has.
-        runs: how many.
+        verdict: verdict on the second: whether the interval is beyond the margin, or within it.
+        sure: fraction of the resamples in which the difference has the same sign.
+        runs: number of runs.
     """
 
     first: float
@@ -89,28 +89,28 @@ class Difference(NamedTuple):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Return its numbers by the names that they have in tables."""
+        """Return its numbers by their column names in tables."""
         about = {"margin": self.margin, "verdict": str(self.verdict), "sure": self.sure}
         ends = {"difference": self.more.value, "low": self.more.low, "high": self.more.high}
         return {"first_mean": self.first, "second_mean": self.second, **ends, **about, "runs": self.runs}
 
 
 def target_of(quantity: str) -> Target:
-    """Return what a registered metric should be; None for one of which this is not known."""
+    """Return the target of a registered metric; None if it has none."""
     return next((target for pattern, target in TARGETS.items() if fnmatch(quantity, pattern)), None)
 
 
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """Return the second's difference to the first.
+    """Compute the difference of the second estimator to the first.
 
     Args:
         first: (n,) the metric in every run.
-        second: (n,) in the same runs.
-        target: what the metric should be.
-        margin: which share of the first's mean, or of the aim's value, does not matter.
-        scale: of what it is a share instead.
+        second: (n,) the metric in the same runs.
+        target: target of the metric.
+        margin: fraction of the first's mean, or of the target value, that does not matter.
+        scale: replaces this mean or value.
     """
     means = float(first.mean()), float(second.mean())
     if scale is None:
@@ -140,7 +140,7 @@ def _difference(first: Floats, second: Floats, axis: int = -1) -> Floats:
 def _interval(
     first: Floats, second: Floats, statistic: Callable[..., Floats]
 ) -> tuple[float, float, Floats]:
-    """Find where a statistic of the pairs lies with 95 %, and its resamples."""
+    """Compute the 95 % interval of a statistic of the pairs, and its resamples."""
     runs = len(first)
     from scipy.stats import bootstrap, norm, t  # which takes long to import
 
@@ -160,7 +160,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
-    """Say what a difference means; of two on either side of their aim, maybe only which is higher."""
+    """Return the verdict on a difference; it may be only the sign if the two are around a target."""
     if target in ("low", "high"):
         return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):

@@ -1,9 +1,9 @@
-"""Evaluates estimates against truth: alignment, errors, and whether the covariance is believable.
+"""Errors of estimates against truth, and normalised errors that test the covariance (NEES, NIS).
 
 An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
-truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space
-(see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 5.4.
+truth is interpolated at the estimate's stamps, but not over a gap; errors are those of the tangent
+space (see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Sequence
@@ -42,11 +42,11 @@ from fuselog.replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]
 POSITION, HEADING = ("x_m", "y_m", "z_m"), "heading_rad"
-BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator gets below
+BOUND = "bound"  # in the metadata of a stream of lower bounds instead of estimates
 
 
 class Quantity(NamedTuple):
-    """Describes what an error figure shows: its RMSE's name, its columns, the scale of its unit."""
+    """Quantity of an error figure: the name of its RMSE, its columns, the scale of its unit."""
 
     rmse: str
     columns: list[int]
@@ -55,25 +55,24 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Errors:
-    """Holds one estimate stream of an ensemble against its truth, where there is truth.
+    """Errors of one estimate stream of an ensemble, at the stamps at which the truth is known.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
         components: names of the d components of the tangent space.
-        kinds: "linear", "angle" or "rotation" (about an axis of the body) each.
+        kinds: kind of each component: "linear", "angle" or "rotation" (about a body axis).
         run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
         error: (n, d) estimate - truth.
-        covariance: (n, d, d) the estimator's own.
-        nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
-            definite.
-        without_truth: how many estimates had no truth within the gap limit.
-        components_without_truth: the estimate's components that the truth lacks, of which nothing is
-            known here.
-        is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
-            are then what the squares of errors are at least.
-        heading_rad: (n,) the true heading; None where truth and estimate have none.
+        covariance: (n, d, d) as the estimator states it.
+        nees: (n,) normalised estimation error squared; NaN if the covariance is not positive definite.
+        without_truth: number of estimates without truth within the gap limit.
+        components_without_truth: components of the estimate that the truth lacks and that are not
+            judged.
+        is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
+            the smallest possible squared errors.
+        heading_rad: (n,) the true heading; None if truth and estimate have none.
     """
 
     estimator: str
@@ -94,7 +93,7 @@ class Errors:
 
     @property
     def squared(self) -> Floats:
-        """Return (n, d) squares of the errors, of a bound what they are at least; infinite if large."""
+        """Return squared errors (n, d); for a bound, the smallest possible ones; infinite if large."""
         with np.errstate(over="ignore"):
             return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
@@ -105,12 +104,12 @@ class Errors:
 
     @property
     def rotation(self) -> list[int]:
-        """Return the indices of an orientation's components, which are a rotation vector in rad."""
+        """Return the indices of the orientation's components, a rotation vector in rad."""
         return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
 
     @property
     def main(self) -> Quantity:
-        """Return the position, else the orientation, else the first component."""
+        """Return the position, or else the orientation, or else the first component."""
         if self.position:
             return Quantity("position_rmse_m", self.position)
         if self.rotation:
@@ -118,7 +117,7 @@ class Errors:
         return Quantity(f"rmse_{self.components[0]}", [0])
 
 
-# The fields of `Errors` that have an entry per estimate.
+# The fields of `Errors` with one entry per estimate.
 PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 
@@ -126,8 +125,8 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
     """Select some rows of errors.
 
     Args:
-        errors: of an ensemble.
-        rows: (n,), which of them.
+        errors: errors of an ensemble.
+        rows: (n,), whether a row is selected.
     """
     columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
     heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
@@ -135,17 +134,17 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
 
 
 class Innovations(NamedTuple):
-    """Holds the n innovations of one stream of an ensemble.
+    """The n innovations of one stream of an ensemble.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
         run, time_ns: (n,), the number of the run and the stamp.
-        accepted: (n,), whether the gate let the measurement in.
+        accepted: (n,), whether the gate accepted the measurement.
         squared: (n,), normalised innovation squared (NIS).
-        degrees: (n,), how many components were measured.
-        log_likelihood: (n,), of the measurements; NaN where the estimator states none, and None of a log
-            from before it was stated.
+        degrees: (n,), number of measured components.
+        log_likelihood: (n,), of the measurements; NaN if the estimator does not state it, None for logs
+            written before it was stated.
     """
 
     estimator: str
@@ -165,9 +164,9 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Compute where the mean of `runs` chi-square values lies with this probability if all is well.
+    """Compute the interval that contains a mean of `runs` chi-square values with this probability.
 
-    A mean NEES of 3 components over 50 runs is credible within
+    The 95 % interval of the mean NEES of 3 components over 50 runs is
 
     >>> [round(bound, 3) for bound in chi_square_interval(3, 50)]
     [2.36, 3.716]
@@ -178,7 +177,7 @@ def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> t
 
 
 def chi_square_band(degrees: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Compute where chi-square values of so many degrees (n,), each by its degree, lie with 95 %."""
+    """Compute the 95 % intervals of chi-square values divided by their degrees of freedom (n,)."""
     tail = 0.5 * (1 - 0.95)
     low, high = (np.asarray(chi2.ppf(np.full(len(degrees), p), degrees)) for p in (tail, 1 - tail))
     return low / degrees, high / degrees
@@ -187,18 +186,18 @@ def chi_square_band(degrees: NDArray[np.int64]) -> tuple[Floats, Floats]:
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Compute where an RMSE over so many runs lies with this probability if the covariances P are right.
+    """Compute the interval of an RMSE over these runs, assuming that the covariances P are right.
 
-    A sum of squared errors has mean tr P and variance 2 tr P^2, and nearly the distribution of a scaled
-    chi-square variable with these (Box 1954, theorem 3.1); exactly so where all variances are equal.
+    A sum of squared errors has mean tr P and variance 2 tr P^2. Its distribution is close to a scaled
+    chi-square with these moments (Box 1954, theorem 3.1), and equal to it if all variances are equal.
 
     Args:
-        runs: (n,).
+        runs: (n,), number of runs.
         trace: (n,) the mean of tr P over the runs.
-        squared: (n,) that of tr P^2.
-        probability: of lying there.
+        squared: (n,) the mean of tr P^2 over the runs.
+        probability: probability of the interval.
 
-    Returns the lower and the upper bounds (n,); NaN where a covariance is zero or not finite.
+    Returns the lower and the upper bounds (n,); NaN if a covariance is zero or not finite.
     """
     quantiles = 0.5 - 0.5 * probability, 0.5 + 0.5 * probability
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -218,20 +217,21 @@ def errors_of(
 ) -> Errors | None:
     """Compute the errors of an ensemble's Gaussian estimates, in the components that all truths have.
 
-    An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, the
-    truths have nothing in common with the estimates (see `components_without_truth`), or their planes
-    have not (see `unlike`); a truth in another plane is taken into that of the estimates.
+    An axis or a quaternion is judged as a whole or not at all. The result is None if a run has no truth
+    topic, if the truths have no component in common with the estimates (see
+    `components_without_truth`), or if their planes cannot be compared (see `unlike`). A truth in
+    another plane is transformed to that of the estimates.
 
     Args:
         estimates: the stream, or a block of it.
-        truths: of every run.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        steps: (runs,) how many estimates of each run came before.
-        first_run: the number of the first run.
-        first_fixes: the planes of estimates whose channels state none.
+        truths: truths of every run.
+        gap_limit_s: longest gap in s over which the truth is interpolated.
+        steps: (runs,) number of earlier estimates of each run.
+        first_run: number of the first run.
+        first_fixes: origins of planes of estimates whose channels state none.
 
-    Raises BadInput where the stream does not say what its components are, or a truth states that one
-    is of another kind.
+    Raises BadInput if the stream does not state its components, or if a truth states another kind for
+    one of them.
     """
     sources = [each.source for each in truths]
     estimates = replace(estimates, stream=in_body_axes(estimates.stream))
@@ -287,7 +287,7 @@ def errors_of(
 
 
 def _heading_of(state: Floats, components: Components) -> Floats | None:
-    """Return the heading (n,) in a state (n, components); None where it has none."""
+    """Return the heading (n,) of a state (n, components); None if it has none."""
     names, kinds = list(components), list(components.values())
     if components.get(HEADING) == "angle":
         return state[:, names.index(HEADING)]
@@ -300,8 +300,9 @@ def _heading_of(state: Floats, components: Components) -> Floats | None:
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
     """Return the components of a Gaussian estimate stream that the truth of some run lacks.
 
-    All of an axis or a quaternion where it lacks one of theirs; none where a run has no truth topic at
-    all. Raises BadInput where the stream does not say what its components are.
+    An axis or a quaternion is included as a whole if one of its components is missing. The result is
+    empty if a run has no truth topic at all. Raises BadInput if the stream does not state its
+    components.
     """
     components = _components(estimates.stream)
     names = list(components)
@@ -320,7 +321,7 @@ def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tu
 
 
 def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Say what of a Gaussian estimate stream is not judged, and why; empty where all is."""
+    """Explain what of a Gaussian estimate stream is not judged, and why; empty if all is judged."""
     what = " ".join(filter(None, split_topic(estimates.stream.topic)))
     if why := unlike(estimates.stream, sources, first):
         return f"{what}: not judged: {why}"
@@ -344,7 +345,7 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
 
 
 def unestimated(estimates: Stream, sources: Sequence[Source]) -> list[str]:
-    """Name the components of the truth that are errors of sensors, and that the estimates lack."""
+    """Return the sensor errors among the truth's components that the estimates lack."""
     topic = estimates.metadata.get("truth", "")
     if not all(topic in source.topics for source in sources):
         return []
@@ -357,7 +358,7 @@ def unestimated(estimates: Stream, sources: Sequence[Source]) -> list[str]:
 
 
 def _components(stream: Stream) -> dict[str, Any]:
-    """Return names and kinds of an estimate's components; raises BadInput where it states none."""
+    """Return names and kinds of an estimate's components; raise BadInput if it states none."""
     names = stream.components
     kinds = stream.metadata.get("kinds", "").split(",")
     if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):
@@ -376,11 +377,12 @@ def reference(
     gap_limit_s: float,
     plane: Origin | None = None,
 ) -> Floats:
-    """Return the truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+    """Interpolate the truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
 
-    Where it states the origin of another plane than that of the estimates, it is taken into theirs.
+    If the truth states the origin of another plane than that of the estimates, it is transformed to
+    theirs.
 
-    Raises BadInput where the truth lacks a component.
+    Raises BadInput if the truth lacks a component.
     """
     times = estimates.publish_time_ns
     truth = truths.around(topic, times, gap_limit_s, estimates.topic)
@@ -394,7 +396,7 @@ def reference(
 
 
 def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
-    """Return the innovations of an ensemble whose first run has this number."""
+    """Extract the innovations of an ensemble whose first run has this number."""
     estimator, case = split_topic(stream.stream.topic)
     return Innovations(
         estimator,

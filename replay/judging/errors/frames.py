@@ -1,4 +1,4 @@
-"""Takes true positions of targets into the frame of estimates, by a truth of the pose of that frame."""
+"""Transformation of targets' true positions into the frame of estimates, by a truth of its pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 
 def pose_topic(topics: Mapping[str, Topic], frame: str, into: str) -> str | None:
-    """Find the truth that states which pose a frame has in another one."""
+    """Find the truth that states the pose of a frame in another one."""
     for topic in topics_of(topics, schemas.TRUTH_STATE):
         stated = topics[topic].metadata
         is_pose = POSE.keys() <= set(stated.get("components", "").split(","))
@@ -30,9 +30,9 @@ def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Map
     """Explain why positions cannot be compared with truths in another frame; empty if they can.
 
     Args:
-        stated: by the channel of the estimates.
+        stated: metadata of the estimates' channel.
         truths: the topics of the targets.
-        topics: of the run.
+        topics: topics of the run.
     """
     frame, is_planar = frame_of(stated), {"x_m", "y_m"} <= set(stated.get("components", "").split(","))
     for topic in truths:
@@ -51,15 +51,15 @@ def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Map
 def seen_in(
     frame: str, truths: Truths, topic: str, places: Floats, time_ns: Integers, gap_limit_s: float
 ) -> Floats:
-    """Take the places of a target into a frame, whose pose holds for good if it is stated only once.
+    """Transform the positions of a target into a frame; a pose stated only once holds at all times.
 
     Args:
-        frame: see `frame_of`; `not_comparable` has no reason against it.
-        truths: of the run.
+        frame: see `frame_of`; `not_comparable` has no objection to it.
+        truths: truths of the run.
         topic: the truth of the target.
-        places: (n, axes) in the frame of this topic, x and y first; heights stay as they are.
+        places: (n, axes) in the frame of this topic, x and y first; heights are not changed.
         time_ns: (n,), the stamps.
-        gap_limit_s: poses are not interpolated over longer gaps.
+        gap_limit_s: longest gap in s over which poses are interpolated.
     """
     topics = truths.source.topics
     into = frame_of(topics[topic].metadata)

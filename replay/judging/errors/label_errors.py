@@ -1,7 +1,7 @@
-"""Computes errors of several things at once, with the estimators' labels or each step's best.
+"""Errors of several objects together, with the estimators' labels or the best labels of each step.
 
 Source of the total error: Zhang et al., "Cooperative vehicle-infrastructure localization based on the
-symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., things, axes).
+symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., objects, axes).
 """
 
 from itertools import permutations
@@ -16,33 +16,33 @@ MOST_PERMUTED = 6
 
 
 def total_error(squared: Floats) -> Floats:
-    """Compute (20): the root of the mean over steps of all things' squared errors, (..., steps).
+    """Compute (20): the root of the mean over objects of their squared errors, (..., steps).
 
-    It is the root of a sum; the paper's words have a sum of roots.
+    It is the root of a sum; the text of the paper describes a sum of roots.
     """
     return np.sqrt(np.mean(squared, axis=-1))
 
 
 def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """Return the summed squared errors (...,) where every estimate keeps its label.
+    """Compute the summed squared errors (...,) with every estimate keeping its label.
 
     Args:
-        estimates: (..., things, axes).
-        truths: likewise.
+        estimates: (..., objects, axes).
+        truths: (..., objects, axes).
     """
     return np.asarray(np.sum((estimates - truths) ** 2, axis=(-2, -1)))
 
 
 def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = np.inf) -> Floats:
-    """Return the least summed squared errors (...,) that any labelling of the estimates gives.
+    """Compute the smallest summed squared errors (...,) over all labellings of the estimates.
 
-    None counts for more than the squared cutoff: then it is GOSPA (alpha = 2, order 2) squared, since
-    there are as many estimates as truths.
+    No error counts for more than the squared cutoff. With a cutoff this is GOSPA (alpha = 2, order 2)
+    squared, because there are as many estimates as truths.
 
     Args:
-        estimates: (..., things, axes).
-        truths: likewise, as many.
-        cutoff_m: no distance counts as longer.
+        estimates: (..., objects, axes).
+        truths: (..., objects, axes), with as many objects.
+        cutoff_m: longest distance in m that counts.
     """
     count = estimates.shape[-2]
     distance = np.sum((estimates[..., :, None, :] - truths[..., None, :, :]) ** 2, axis=-1)

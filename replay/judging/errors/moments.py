@@ -1,4 +1,4 @@
-"""Finds the moments at which estimates are worst: the largest NEES, and the largest error."""
+"""Moments at which estimates are worst: the largest NEES, and the largest error."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -11,17 +11,17 @@ NEES = "nees"
 
 
 class Moment(NamedTuple):
-    """Holds the moment at which something of an estimator is largest.
+    """Moment at which a quantity of an estimator is largest.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
-        quantity: `nees`, or the error of the position, else of the orientation, else of all components
-            in the unit of the first, such as `error_m` of several targets.
-        value: how large it is there.
+        quantity: `nees`, or the error of the position, or else of the orientation, or else of all
+            components with the unit of the first, such as `error_m` of several targets.
+        value: the quantity at this moment.
         run: the number of the run.
-        time_ns: the stamp.
-        elapsed_s: the same since the run's epoch.
+        time_ns: stamp in ns.
+        elapsed_s: time since the run's epoch in s.
     """
 
     estimator: str
@@ -34,13 +34,13 @@ class Moment(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return what is large, and how large."""
+        """Return the quantity and its value in words."""
         name = "NEES" if self.quantity == NEES else self.quantity
         return f"{name} {self.value:.3g}"
 
 
 class Moments:
-    """Keeps the worst moments of each estimator and case as errors come, of any number of runs."""
+    """The worst moments of each estimator and case, for any number of runs."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, str, str], Moment] = {}
@@ -54,7 +54,7 @@ class Moments:
             self._add(errors, name, length)
 
     def _add(self, errors: Errors, quantity: str, values: Floats) -> None:
-        known = np.isfinite(values)  # a NEES beyond all numbers is counted as none
+        known = np.isfinite(values)  # an infinite NEES is ignored
         if not known.any():
             return
         row = int(np.argmax(np.where(known, values, -np.inf)))
@@ -80,7 +80,7 @@ class Moments:
 
 
 def worst_of(moments: Iterable[Moment]) -> Moment | None:
-    """Return the moment of the largest NEES; if none has a NEES, that of the largest error."""
+    """Return the moment of the largest NEES, or without NEES that of the largest error."""
     return max(moments, key=lambda each: (each.quantity == NEES, _size(each)), default=None)
 
 
@@ -97,5 +97,5 @@ def _main(errors: Errors) -> tuple[str, list[int], float]:
 
 
 def _size(moment: Moment) -> tuple[float, int, int]:
-    """Return what orders moments of one quantity; of equal values, the earliest is the largest."""
+    """Return the sort key of moments of one quantity; among equal values, the earliest comes last."""
     return moment.value, -moment.run, -moment.time_ns

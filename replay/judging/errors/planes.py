@@ -1,4 +1,4 @@
-"""Tells whether estimates and their truth are positions in planes that can be compared."""
+"""Test whether estimates and their truth are positions in local tangent planes that can be compared."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,13 +18,13 @@ from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.sources import Source
 
-ALIGNED = "aligned"  # in the metadata of estimates that are in the truth's frame, whatever theirs was
-# By estimator and case, as in topics: the first fixes that are the origins of every run's plane.
+ALIGNED = "aligned"  # in the metadata of estimates that were aligned with the truth's frame
+# By estimator and case, as in topics: for every run, the first fix, which is the origin of its plane.
 FirstFixes = Mapping[str, Sequence[Origin | None]]
 
 
 def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]:
-    """Read from a replay's outputs the origins that no channel states: first fixes, run by run."""
+    """Read the origins that no channel states from a replay's outputs: first fixes, run by run."""
     return {
         topic.rpartition("/")[0]: [
             Origin(*map(float, place)) if np.isfinite(place).all() else None
@@ -38,7 +38,7 @@ def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]
 
 
 def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | None]:
-    """Return the origins of the plane of estimates, of every run; None where it is not known."""
+    """Return the origin of the estimates' plane in every run; None if it is not known."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return list(first.get(stream.topic.rpartition("/")[0], [None] * runs))
@@ -46,11 +46,11 @@ def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | Non
 
 
 def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Say why estimates cannot be compared with the truth of some run, in words; empty where they can.
+    """Explain why estimates cannot be compared with the truth of some run; empty if they can.
 
-    Two planes whose origins are known can be. A truth that states none is in the plane of its log, where
-    that has one, unless it is in a frame of its own; estimates of a filter that found its plane at the
-    first fix are not in it.
+    Planes whose origins are known can be compared. A truth that states no origin is in the plane of its
+    log, if the log has one, unless the truth has a frame of its own; estimates of a filter that set its
+    origin at the first fix are not in this plane.
 
     Args:
         stream: the estimates.

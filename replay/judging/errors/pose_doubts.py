@@ -1,4 +1,4 @@
-"""Tells what figures of trajectories do not mean: a truth without rotations, a loose alignment."""
+"""Limits of trajectory figures: a truth without orientations, an imprecise alignment."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,12 @@ from fuselog.recorders.trajectories import Trajectory
 from fuselog.replay.judging.errors.alignment import Align, rotation_error_rad
 
 Floats = NDArray[np.float64]
-# Orientations within it never turn; a path or an estimate that turns by more shows that they are none.
+# Orientations that stay within STILL_RAD never turn; a path or an estimate that turns by more than
+# TURNS_RAD shows that they are not real.
 STILL_RAD, TURNS_RAD = 1e-6, np.radians(20.0)
-# An alignment whose rotation is known less well is reported.
+# An alignment whose rotation is less precise is reported.
 LOOSE_DEG = 1.0
-# Beyond it an interval by the slope at the best rotation means nothing.
+# Beyond this, an interval from the slope at the best rotation is meaningless.
 UNKNOWN_DEG = 60.0
 UNTURNED = (
     "its orientations never turn although its path or the estimate does: it is taken as positions "
@@ -21,10 +22,10 @@ UNTURNED = (
 
 
 def lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
-    """Tell whether a truth of positions alone was written with orientations that never turn.
+    """Test whether a truth of positions only was written with orientations that never turn.
 
-    They are one and the same although the path turns, or the estimate turns and the path does not lead
-    where they point.
+    They are constant although the path turns, or the estimate turns and the path does not follow their
+    direction.
     """
     if truth.rotation is None or estimate.rotation is None or len(truth) < 2:
         return False
@@ -37,14 +38,14 @@ def lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
 
 
 def _turned_rad(rotation: Floats) -> Floats:
-    """Compute by what angles rotations (n, 3, 3) differ from the first."""
+    """Compute the angles between rotations (n, 3, 3) and the first of them."""
     return np.asarray(Rotation.from_matrix(rotation[0].T @ rotation).magnitude())
 
 
 def _courses(trajectory: Trajectory) -> Floats:
-    """Return the directions (k, 3) of a path, each over a tenth of its extent; none of one that rests.
+    """Compute the directions (k, 3) of a path, each over a tenth of its extent; empty for one at rest.
 
-    Over so much, errors of single positions do not count.
+    Over this distance, errors of single positions do not matter.
     """
     place = trajectory.position_m
     step_m, ends = 0.1 * float(np.linalg.norm(place - place[0], axis=1).max()), [0]
@@ -56,13 +57,13 @@ def _courses(trajectory: Trajectory) -> Floats:
 
 
 def _angle_rad(course: Floats, direction: Floats) -> float:
-    """Compute the greatest angle of directions (k, 3) with one (1, 3); zero without any."""
+    """Compute the largest angle between directions (k, 3) and one direction (1, 3); zero without any."""
     cosines = np.clip(np.sum(course * direction, axis=1), -1.0, 1.0)
     return float(np.arccos(cosines).max(initial=0.0))
 
 
 def doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) -> list[str]:
-    """Say how loosely positions determine the alignment's rotation."""
+    """Return a sentence if positions determine the alignment's rotation only imprecisely."""
     known_deg = np.degrees(rotation_error_rad(estimate.position_m, truth.position_m, align))
     if known_deg <= LOOSE_DEG:
         return []

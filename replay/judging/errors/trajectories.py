@@ -1,7 +1,8 @@
-"""Compares trajectories with truth: absolute and relative pose errors, APE and RPE.
+"""Trajectories compared with truth: absolute and relative pose errors, APE and RPE.
 
-Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems",
-IROS 2012; conventions and names are those of evo (https://github.com/MichaelGrupp/evo): figures agree.
+Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems", IROS
+2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the figures
+agree with it.
 """
 
 from collections.abc import Sequence
@@ -24,29 +25,29 @@ Integers = NDArray[np.int64]
 DeltaUnit = Literal["m", "frames", "s"]
 Association = Literal["nearest", "interpolated"]
 POSE_KINDS = ("linear",) * 3 + ("quaternion",) * 4
-# Grids for the time offset are no longer than this.
+# Longest grid for the time offset.
 MOST_STEPS = 1 << 20
-# Offsets that are tried in all, and from how many of the best the search goes on.
+# Number of offsets on the grid, and number of the best ones from which the search continues.
 GRID, STARTS = 65, 4
-# From the correlation's best place to the best offset it is a few steps.
+# Most steps from the peak of the correlation to the best offset; it takes a few.
 MOST_MOVES = 50
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Describes how an estimated trajectory is compared with the true one.
+    """Settings of the comparison of an estimated trajectory with the true one.
 
     Attributes:
         align: see `alignment_of`.
-        delta: over how much of the way relative errors are.
-        delta_unit: "m" of the estimate's path, "frames" (poses) or "s".
-        association: each pose of the shorter trajectory belongs to the "nearest" one of the longer in
-            time, as with evo, or the truth is "interpolated" at the stamps of the estimate.
-        max_difference_s: up to which stamps belong together, for the nearest.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        time_offset_s: added to the estimate's stamps; "estimate" finds it.
+        delta: length of the parts of the path over which relative errors are computed.
+        delta_unit: "m" along the estimate's path, "frames" (poses) or "s".
+        association: "nearest" pairs each pose of the shorter trajectory with the nearest in time of the
+            longer, as evo does; "interpolated" interpolates the truth at the stamps of the estimate.
+        max_difference_s: largest difference in s of paired stamps, for "nearest".
+        gap_limit_s: longest gap in s over which the truth is interpolated.
+        time_offset_s: offset in s added to the estimate's stamps; "estimate" estimates it.
 
-    Raises BadInput where a number is out of range.
+    Raises BadInput if a number is out of range.
     """
 
     align: Align = "none"
@@ -76,18 +77,18 @@ class Comparison:
 
 
 class Compared(NamedTuple):
-    """Holds an estimated trajectory against the true one, pose by pose.
+    """Estimated trajectory compared with the true one, pose by pose.
 
     Attributes:
         estimate: the poses that have truth, aligned with it.
-        truth: at these poses.
-        alignment: that was applied.
-        time_offset_s: that was added to the estimate's stamps.
-        without_truth: how many poses of the estimate have no truth.
-        absolute_m, absolute_deg: (n,) APE; degrees are None where one has no rotation.
-        last: (k,) the poses that the pairs of RPE end at.
+        truth: the truth at these poses.
+        alignment: the alignment that was applied.
+        time_offset_s: the offset that was added to the estimate's stamps.
+        without_truth: number of the estimate's poses without truth.
+        absolute_m, absolute_deg: (n,) APE; degrees are None if a trajectory has no rotation.
+        last: (k,) the last poses of the pairs of RPE.
         relative_m, relative_deg: (k,) RPE.
-        doubts: a sentence for what the figures do not mean.
+        doubts: sentences on the limits of the figures.
     """
 
     estimate: Trajectory
@@ -104,10 +105,10 @@ class Compared(NamedTuple):
 
 
 def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> Compared:
-    """Associate, align, and take the errors; a time offset that is sought is added where it helps.
+    """Associate and align two trajectories and compute their errors.
 
-    Raises BadInput where no poses belong together, they do not tell the alignment, or the way is shorter
-    than the delta.
+    An estimated time offset is applied only if it reduces the error. Raises BadInput if no poses can be
+    paired, if they do not determine the alignment, or if the path is shorter than the delta.
     """
     for each in (estimate, truth):
         if not len(each):
@@ -116,13 +117,13 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
         shifted = compare(estimate, truth, replace(comparison, time_offset_s=offset_s))
-        with suppress(BadInput):  # as where the stamps are far apart without
+        with suppress(BadInput):  # such as stamps that are far apart without the offset
             as_it_is = compare(estimate, truth, replace(comparison, time_offset_s=0.0))
             if np.mean(as_it_is.absolute_m**2) <= np.mean(shifted.absolute_m**2):
                 return as_it_is
         return shifted
     if offset_s:
-        _stamps(truth)  # without which the offset would go unnoticed
+        _stamps(truth)  # without stamps, the offset would be ignored silently
         estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
     matched, true = associate(estimate, truth, comparison)
     doubts = [f"{true.name}: {UNTURNED}"] if lacks_rotations(true, matched) else []
@@ -150,7 +151,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
 def associate(
     estimate: Trajectory, truth: Trajectory, comparison: Comparison
 ) -> tuple[Trajectory, Trajectory]:
-    """Return the poses of both that belong together; by their places where one has no stamps."""
+    """Return the paired poses of both trajectories; they are paired by order if one has no stamps."""
     times, true_times = estimate.time_ns, truth.time_ns
     if times is None or true_times is None:
         if len(estimate) != len(truth):
@@ -183,7 +184,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """Find the times with one of the others within a limit, and their nearest; of two the first."""
+    """Find the times that have one of the others within a limit, and the nearest of these."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
@@ -194,7 +195,7 @@ def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, 
 def _interpolated(
     truth: Trajectory, time_ns: Integers, gap_limit_s: float
 ) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """Return the truth at those stamps that it is known at, and which these are."""
+    """Interpolate the truth at the stamps at which it is known, and return which these are."""
     poses = truth.position_m
     if truth.rotation is not None:
         quaternion = Rotation.from_matrix(truth.rotation).as_quat(scalar_first=True)
@@ -209,14 +210,14 @@ def _interpolated(
 
 
 def _stamps(trajectory: Trajectory) -> Integers:
-    """Return the stamps of a trajectory that needs some."""
+    """Return the stamps of a trajectory; raise BadInput if it has none."""
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: has no stamps; give a trajectory with stamps, such as TUM")
     return trajectory.time_ns
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
-    """Find first and last poses of consecutive parts of the way, each just over the delta."""
+    """Find the first and last poses of consecutive parts of the path, each just over the delta."""
     unit, delta = comparison.delta_unit, comparison.delta
     steps: NDArray = np.ones(len(estimate) - 1)
     if unit == "m":
@@ -240,27 +241,27 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
 
 
 def _way(trajectory: Trajectory, first: Integers, last: Integers) -> Floats:
-    """Return the ways (k, 3) of pairs, each seen from its first pose where that is known."""
+    """Compute the displacements (k, 3) of pairs, in the first pose's frame if it has an orientation."""
     way = trajectory.position_m[last] - trajectory.position_m[first]
     rotation = trajectory.rotation
     return way if rotation is None else np.einsum("kji,kj->ki", rotation[first], way)
 
 
 def _turn(trajectory: Trajectory, first: Integers, last: Integers) -> Floats | None:
-    """Return the rotations (k, 3, 3) of pairs, each seen from its first pose."""
+    """Compute the rotations (k, 3, 3) of pairs, in the frame of the first pose."""
     rotation = trajectory.rotation
     return None if rotation is None else rotation[first].transpose(0, 2, 1) @ rotation[last]
 
 
 def _angle_deg(left: Floats | None, right: Floats | None) -> Floats | None:
-    """Compute the angles (n,) of the rotations from one matrix (n, 3, 3) to the other."""
+    """Compute the angles (n,) of the rotations between matrices (n, 3, 3)."""
     if left is None or right is None:
         return None
     return np.degrees(Rotation.from_matrix(left.transpose(0, 2, 1) @ right).magnitude())
 
 
 def statistics(error: Floats) -> dict[str, float]:
-    """Compute what evo tells of errors (n,), which are not negative."""
+    """Compute the statistics that evo prints for errors (n,), which are not negative."""
     return {
         "rmse": float(np.sqrt(np.mean(error**2))),
         "mean": float(np.mean(error)),
@@ -272,7 +273,7 @@ def statistics(error: Floats) -> dict[str, float]:
 
 
 def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
-    """Return APE and RPE over all poses of runs, as `ape_translation_rmse_m`, and how many there are."""
+    """Compute APE and RPE over all poses of runs, as `ape_translation_rmse_m`, and their counts."""
     errors: dict[tuple[str, str], list] = {
         ("ape_translation", "m"): [run.absolute_m for run in runs],
         ("ape_rotation", "deg"): [run.absolute_deg for run in runs],
@@ -293,13 +294,13 @@ def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
 
 
 def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
-    """Estimate what to add to the estimate's stamps, in s, so that it is nearest to the truth.
+    """Estimate the offset in s to add to the estimate's stamps that minimises its distance to the truth.
 
-    What is least is the RMSE of aligned positions. The search goes down from where that is least among
-    the offsets at which the speeds of both correlate most, which no alignment changes, a grid of all
-    that leave half of the poses a truth, and none at all.
+    The RMSE of aligned positions is minimised. The local search starts from the best of the following
+    offsets: those at which the speeds of both trajectories, which no alignment changes, correlate most;
+    a grid of all that leave half of the poses with truth; and zero.
 
-    Raises BadInput where one has no stamps, or its speed never changes.
+    Raises BadInput if a trajectory has no stamps, or if its speed never changes.
     """
     from scipy.optimize import minimize_scalar  # which takes long to import
 
@@ -327,7 +328,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
     def covered(offset_s: float) -> NDArray[np.bool_]:
         return (times[1][0] <= times[0] + offset_s) & (times[0] + offset_s <= times[1][-1])
 
-    # of few poses the RMSE is small anywhere
+    # with few poses, the RMSE is small at any offset
     least = max(int(covered(offset_s).sum()) for offset_s in candidates) / 2
 
     def rmse_m(offset_s: float) -> float:
@@ -338,7 +339,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
         true = _positions_at(truth, times[1], times[0][inside] + offset_s)
         try:
             found = alignment_of(there, true, align, estimate.name)
-        except BadInput:  # of this part of the way, which may be straight
+        except BadInput:  # this part of the path may be straight
             return np.inf
         error = found.scale * there @ found.rotation.T + found.translation_m - true
         return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
@@ -357,9 +358,9 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 
 
 def _best_lags(estimate: Floats, truth: Floats) -> Integers:
-    """Find how many places later the first signal correlates most with the other: the highest peaks.
+    """Find the lags at the highest peaks of the correlation of two signals.
 
-    Pearson's correlation of what overlaps, which is half of the shorter one at least.
+    It is Pearson's correlation of the overlap, which is at least half of the shorter signal.
     """
     from scipy.signal import correlate, correlation_lags  # which takes long to import
 

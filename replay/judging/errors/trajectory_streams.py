@@ -1,4 +1,4 @@
-"""Reads the trajectories of estimates and truths from the streams of a log."""
+"""Conversion between trajectories and the streams of estimates and truths in a log."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,10 +14,10 @@ from fuselog.replay.judging.errors.trajectories import POSE_KINDS
 
 
 def trajectory_of(stream: Stream) -> Trajectory | None:
-    """Return the poses that a truth, an estimate or a Pose stream states; None where it has no position.
+    """Extract the poses of a truth, estimate or Pose stream; None if it has no position.
 
-    What the position lacks is zero, as the height of a robot in the plane; a heading is a rotation about
-    the vertical. Poses that are not finite are left out.
+    Missing components of the position are zero, such as the height of a planar robot; a heading is a
+    rotation about the vertical axis. Poses that are not finite are left out.
     """
     if stream.schema.full_name == schemas.POSE.full_name:
         return _of_poses(stream)
@@ -42,7 +42,7 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
 
 
 def _of_poses(stream: Stream) -> Trajectory:
-    """Return positions with unit quaternions; what is not finite is left out."""
+    """Extract positions and orientations; poses that are not finite are left out."""
     position_m, quaternion = (
         stream[name].reshape(len(stream), width)
         for name, width in (("position_m", 3), ("quaternion", 4))
@@ -53,11 +53,11 @@ def _of_poses(stream: Stream) -> Trajectory:
 
 
 def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
-    """Return a trajectory as an estimate stream, in those of the truth's components that it states.
+    """Convert a trajectory to an estimate stream with those of the truth's components that it has.
 
-    It states no covariance: that is zero, of which there is no NEES.
+    Its covariance is zero, so it has no NEES.
 
-    Raises BadInput where the trajectory has no stamps, or the truth none of its components.
+    Raises BadInput if the trajectory has no stamps, or the truth has none of its components.
     """
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
@@ -88,7 +88,7 @@ def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
 
 
 def truth_of(trajectory: Trajectory, topic: str) -> Stream:
-    """Return a trajectory as a truth stream; raises BadInput where it has no stamps."""
+    """Convert a trajectory to a truth stream; raise BadInput if it has no stamps."""
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
     names, state = [*POSITION], trajectory.position_m

@@ -1,6 +1,7 @@
-"""Reads the truth at the stamps of estimates along with them: memory holds what they are at.
+"""Truths, read along with the estimates so that only the messages around their stamps are in memory.
 
-A truth that is stated twice, by one topic or by two, is doubtful; what is read is looked at for that.
+A truth that is stated twice, by one topic or by two, is doubtful; messages are checked for this as they
+are read.
 """
 
 from collections.abc import Iterator
@@ -17,19 +18,19 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 BLOCK_MESSAGES = 1 << 16
-# In the metadata of a truth: there are targets that no topic of the log has the truth of.
+# In the metadata of a truth: some targets have no truth in the log.
 COVERS, SOME_TARGETS = "covers", "some targets"
 
 
 class Doubt(NamedTuple):
-    """Holds what is doubtful about a truth of so many messages."""
+    """Doubt about a truth with this number of messages."""
 
     messages: int
     why: str
 
 
 class Truths:
-    """Reads the truths of one run, for readers that each go through it in time."""
+    """Truths of one run, for readers that each read them in order of time."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -50,10 +51,10 @@ class Truths:
         self._reached: dict[tuple[str, str], int] = {}
 
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
-        """Return the messages of a topic about some stamps: no later ones would change the truth there.
+        """Return the messages of a topic around some stamps, so many that later ones have no influence.
 
-        `reader` is who asks; what all readers have passed is forgotten, and read anew where one that was
-        not there yet asks for it.
+        `reader` identifies the caller. Messages before the stamps of all readers are dropped, and read
+        again for a new reader that asks for them.
         """
         if len(time_ns) == 0:
             return self.source.empty(topic)
@@ -72,7 +73,7 @@ class Truths:
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """Find how a truth of estimates is stated twice: at one stamp, or by two topics."""
+        """Return how a truth of estimates is stated twice: at one stamp, or by two topics."""
         found: dict[str, list[str]] = {}
         judging = {topic for topic, _ in self._reached} | self._forgotten
         for (topic, other), apart in self._apart.items():
@@ -90,7 +91,7 @@ class Truths:
         return {topic: Doubt(topics[topic].messages, "; ".join(why)) for topic, why in found.items()}
 
     def _note_twice(self, block: dict[str, Stream]) -> None:
-        """Note how far truths of one thing are apart in a block, by linear component."""
+        """Record the differences between truths of one object in a block, by linear component."""
         for topic, stream in block.items():
             again = np.flatnonzero(np.diff(stream.publish_time_ns) == 0)
             if len(again):
@@ -119,7 +120,7 @@ class Truths:
             self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
 
     def _current(self, topic: str) -> Stream:
-        """Return what is held of a topic, from the last message that some reader may still need."""
+        """Return the messages kept of a topic, from the last one that some reader may still need."""
         held = self._parts[topic]
         readers = [at_ns for (of, _), at_ns in self._reached.items() if of == topic]
         passed_ns = min(readers or self._reached.values(), default=-1)
@@ -131,7 +132,7 @@ class Truths:
 
 
 def _states(truth: Stream) -> dict[str, Floats]:
-    """Return the linear components (n,) of a truth, by their names."""
+    """Return the linear components (n,) of a truth by name."""
     names = truth.components
     kinds = truth.metadata.get("kinds", "").split(",") if truth.metadata.get("kinds") else []
     columns = truth["state"].reshape(len(truth), -1).T
@@ -140,7 +141,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """Compute how far two truths are apart, by component, at the first's stamps among the other's."""
+    """Compute the difference of two truths by component, at the stamps of the first within the other."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

@@ -1,4 +1,4 @@
-"""Tells components of which no measurement informs an estimator: they stay as they were at the start."""
+"""Detection of components that no measurement affects: they keep their initial mean and variance."""
 
 from dataclasses import dataclass, field
 
@@ -10,17 +10,17 @@ from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.vectors.components import stated_components
 from fuselog.replay.engine.vectors.tangent import tangent_components
 
-FEWEST = 10  # estimates of a run, of which fewer may not have met a measurement yet
-MOVED = 1e-9  # standard deviations, and a share of the variance
+FEWEST = 10  # estimates of a run; with fewer, no measurement may have been processed yet
+MOVED = 1e-9  # in standard deviations, and as a fraction of the variance
 
 
 @dataclass
 class Uninformed:
-    """Follows one estimate stream, and keeps the components that have never moved nor become surer.
+    """Components of one estimate stream whose mean never changed and whose variance never decreased.
 
     Attributes:
-        names: of the components that are numbers of their own, linear or angles.
-        still: (names,), which of them have stayed in all runs.
+        names: components that are linear or angles.
+        still: (names,), whether each is unchanged in all runs.
         first: by run, the mean and variance (names,) of its first estimate.
         most: the largest number of estimates of a run.
     """
@@ -31,7 +31,7 @@ class Uninformed:
     most: int = 0
 
     def add(self, estimates: Ragged, first_run: int) -> None:
-        """Take in a block of estimates of runs from this number on."""
+        """Add a block of estimates of runs whose numbers begin at `first_run`."""
         stream = estimates.stream
         components = stated_components(stream.metadata, {}, f"topic {stream.topic}")
         tangent = [name for name, _ in tangent_components(list(components), list(components.values()))]
@@ -54,12 +54,12 @@ class Uninformed:
             self.most = max(self.most, len(own))
 
     def merge(self, other: "Uninformed") -> None:
-        """Take in what was found of other runs."""
+        """Add the results of other runs."""
         self.still = self.still & other.still if self.names and other.names else other.still
         self.names, self.most = self.names or other.names, max(self.most, other.most)
 
     def found(self) -> list[str]:
-        """Name the components of which nothing is told while other ones are estimated."""
+        """Return the unchanged components, if others are estimated."""
         if self.most < FEWEST or self.still.all():
             return []
         return [name for name, is_still in zip(self.names, self.still.tolist(), strict=True) if is_still]

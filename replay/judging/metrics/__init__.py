@@ -1,1 +1,1 @@
-"""Makes metrics of errors: the numbers of all that is judged; begin with `measuring`."""
+"""Metrics: the numbers computed from errors, innovations and other outputs; begin with `measuring`."""

@@ -1,6 +1,6 @@
-"""Averages estimators' diagnostics over the runs, for spans of time.
+"""Means over runs and time spans of estimators' diagnostics.
 
-Such are the probabilities of modes, the effective share of particles, and messages that came late.
+These are the probabilities of modes, the effective share of particles, and out-of-sequence messages.
 """
 
 from collections.abc import Iterator
@@ -19,22 +19,22 @@ from fuselog.replay.judging.metrics.sums import BinnedSums
 if TYPE_CHECKING:
     import pandas as pd
 
-# Spans of time: at most so many, of a millisecond times a power of two.
+# The most time spans, and their shortest length in ns; lengths are doubled as needed.
 SPANS = 1024
 SPAN_NS = 1_000_000
 MODES, SMOOTHED_MODES, EFFECTIVE = "modes", "smoothed_modes", "effective_share"
-# What became of messages that came late.
+# Treatment of late messages.
 DROPPED, INSERTED, WAITED = "dropped", "inserted", "waited for"
 LATE = (DROPPED, INSERTED, WAITED)
 
 
 class OutputDiagnostics(NamedTuple):
-    """Holds what one output tells.
+    """Diagnostics in one output.
 
     Attributes:
         what: one of the names above.
-        names: of the values.
-        values: (n, names), NaN in rows that tell nothing.
+        names: names of the values.
+        values: (n, names), NaN in rows without a value.
     """
 
     what: str
@@ -43,7 +43,7 @@ class OutputDiagnostics(NamedTuple):
 
 
 def diagnostics_of(output: Output) -> OutputDiagnostics | None:
-    """Read what an output tells that has a mean over time; None where it is of another kind."""
+    """Extract the diagnostics in an output that have a mean over time; None if it has none."""
     stream = output.rows.stream
     schema = stream.schema.full_name
     if schema == schemas.MODE_PROBABILITIES.full_name:
@@ -66,18 +66,18 @@ def diagnostics_of(output: Output) -> OutputDiagnostics | None:
 
 
 def _late_s(stream: Stream) -> Floats:
-    """Compute how long after they were measured messages (n,) were taken."""
+    """Compute the delay (n,) in s from the measurement of messages to their processing."""
     return (stream.log_time_ns - stream.publish_time_ns).astype(np.float64) * 1e-9
 
 
 @dataclass
 class Means:
-    """Sums over the runs what one stream tells.
+    """Sums over the runs of the diagnostics in one stream.
 
     Attributes:
-        estimator, case: whose it is.
+        estimator, case: the estimator and what it estimates.
         what, names: see `OutputDiagnostics`.
-        sums: by time since the epoch, of that time in seconds and of every value.
+        sums: sums of the time since the epoch (s) and of every value, by this time.
     """
 
     estimator: str
@@ -87,7 +87,7 @@ class Means:
     sums: BinnedSums = field(repr=False)
 
     def add(self, output: Output, values: Floats) -> None:
-        """Take in a block."""
+        """Add a block."""
         rows = output.rows
         epochs_ns = np.array([source.epoch_ns for source in output.sources], np.int64)
         elapsed_ns = rows.stream.publish_time_ns - np.repeat(epochs_ns, np.diff(rows.offsets))
@@ -97,8 +97,8 @@ class Means:
 
     @property
     def table(self) -> "pd.DataFrame":
-        """Return one row per span of time: its mean time, count of messages, mean of every value."""
-        import pandas as pd  # which takes long to import
+        """Return one row per time span: mean time, number of messages, mean of every value."""
+        import pandas as pd  # slow to import
 
         _, count, sums = self.sums.filled()
         means = pd.DataFrame(sums / count[:, None], columns=["elapsed_s", *self.names])
@@ -109,13 +109,13 @@ class Means:
 
 
 class MeansOfAll:
-    """Holds the means of all streams of a replay."""
+    """Means of the diagnostics in all streams of a replay."""
 
     def __init__(self) -> None:
         self._of: dict[str, Means] = {}
 
     def add(self, output: Output) -> None:
-        """Take in a block of a stream, if it tells anything of the kind."""
+        """Add a block of a stream, if it has diagnostics."""
         diagnostics = diagnostics_of(output)
         if diagnostics is None or not len(diagnostics.values):
             return
@@ -126,7 +126,7 @@ class MeansOfAll:
         self._of[topic].add(output, values)
 
     def merge(self, other: "MeansOfAll") -> None:
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         for topic, means in other._of.items():
             if topic in self._of:
                 self._of[topic].sums.merge(means.sums)
@@ -134,13 +134,13 @@ class MeansOfAll:
                 self._of[topic] = means
 
     def _tables(self, *wanted: str) -> "Iterator[tuple[str, pd.DataFrame]]":
-        """Yield what is told and its table, of every stream that tells one of what is wanted."""
+        """Yield the kind of diagnostics and the table of every stream with one of the wanted kinds."""
         for means in self._of.values():
             if means.what in wanted and len(table := means.table):
                 yield means.what, table
 
     def modes(self) -> "Iterator[pd.DataFrame]":
-        """Return how probable modes are: a row per span of time and mode."""
+        """Yield tables of mode probabilities: a row per time span and mode."""
         for what, table in self._tables(MODES, SMOOTHED_MODES):
             fixed = ["index", "estimator", "case", "elapsed_s", "estimates"]
             wide = table.rename(columns={"messages": "estimates"}).reset_index()
@@ -150,14 +150,14 @@ class MeansOfAll:
             yield long
 
     def effective(self) -> "Iterator[pd.DataFrame]":
-        """Return the effective share of the particles: a row per span of time."""
+        """Yield tables of the effective share of particles: a row per time span."""
         for _, table in self._tables(EFFECTIVE):
             yield table.rename(columns={"messages": "estimates"})
 
     def late(self) -> "Iterator[pd.DataFrame]":
-        """Yield the messages that came late: a row per span of time and what became of them.
+        """Yield tables of late messages: a row per time span and treatment.
 
-        `late_s` is their mean delay, `repeated` how many others were used again for one on average.
+        `late_s` is their mean delay, `repeated` the mean number of other messages that were reprocessed.
         """
         for what, table in self._tables(*LATE):
             table.insert(2, "became", what)

@@ -1,7 +1,7 @@
-"""Defines a metric, and how metrics become the numbers of all that is judged.
+"""Definition of a metric, and the collection of metrics that computes the numbers of a replay.
 
-They register by name, as estimators do. A metric is fed block by block, and what it makes of them can be
-merged: over the blocks of a long log, over the runs of an ensemble, over the workers of a campaign.
+Metrics are registered by name, as estimators are. A metric is fed block by block, and its states can be
+merged: over the blocks of a long log, the runs of an ensemble, or the workers of a campaign.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,17 +15,17 @@ from fuselog.replay.judging.errors.evaluation import Errors, Innovations
 
 
 class Output(NamedTuple):
-    """Holds messages of one output topic of an estimator, of any schema.
+    """Messages of one output topic of an estimator, of any schema.
 
-    Row r of a run belongs to `sources[run]`, whose number in the whole ensemble is `first_run` + run.
+    Run r of `rows` belongs to `sources[r]`, whose number in the whole ensemble is `first_run` + r.
 
     Attributes:
-        estimator: the label of the estimator.
+        estimator: label of the estimator.
         case: what it estimates, such as `robot1`; may be empty.
-        leaf: the last part of the name of the topic.
+        leaf: last part of the topic name.
         rows: the messages, run by run.
-        sources: the sensor streams and truth of each run.
-        first_run: the number in the whole ensemble of the first run.
+        sources: sensor streams and truth of each run.
+        first_run: number of the first run in the whole ensemble.
     """
 
     estimator: str
@@ -42,18 +42,18 @@ State = TypeVar("State", bound=Any)
 
 @dataclass(frozen=True)
 class Metric(Generic[Judged, State]):
-    """Describes a registered metric: what it tells, what it judges, and how it comes to its numbers.
+    """Registered metric: its description, its input, and how it is computed.
 
     Attributes:
-        summary: what it tells, in a line.
-        judges: `Errors` for what follows from estimates and truth, `Innovations` for what a filter says
-            of its measurements, the type that an entry point `fuselog.judges` gives, such as
-            `SetErrors`, or `Output` for all messages.
-        start: the state before anything was judged.
-        add: the state after one block more; it may change the one that it is handed. The blocks of a
-            run come in time.
-        merge: the state of two parts that have no run in common.
-        finish: a state's numbers as `quantity_unit`; none where there is nothing to say.
+        summary: one-line description.
+        judges: type of the input: `Errors` for metrics of estimates and truth, `Innovations` for
+            metrics of a filter's innovations, the type that an entry point `fuselog.judges` returns,
+            such as `SetErrors`, or `Output` for all messages.
+        start: start() -> the state without any input.
+        add: add(state, block) -> the state after one more block; it may modify the given state. The
+            blocks of a run come in order of time.
+        merge: merge(first, second) -> the state of both parts, which have no run in common.
+        finish: finish(state) -> numbers by name, as `quantity_unit`; empty if there are none.
 
     Most metrics are made of sums: see `metric_of_sums`.
     """
@@ -66,7 +66,7 @@ class Metric(Generic[Judged, State]):
     finish: Callable[[State], Mapping[str, float]]
 
     def of(self, judged: Judged) -> Mapping[str, float]:
-        """Return the numbers of `judged` alone, as one block."""
+        """Compute the numbers of `judged` as a single block."""
         return self.finish(self.add(self.start(), judged))
 
 
@@ -79,13 +79,13 @@ def metric_of_sums(
     sums: Callable[[Judged], Mapping[str, Any]],
     finish: Callable[[Sums], Mapping[str, float]],
 ) -> Metric[Judged, Sums]:
-    """Return a metric whose state is sums by name.
+    """Make a metric whose state is sums by name.
 
     Args:
-        summary: what it tells.
-        judges: what it judges.
-        sums: of one block: numbers and arrays, which add up, and sets, which unite.
-        finish: the numbers that follow from the sums over all blocks; {} stands for no block at all.
+        summary: one-line description.
+        judges: type of the input.
+        sums: sums(block) -> sums by name: numbers and arrays are added up, sets are united.
+        finish: finish(sums over all blocks) -> the numbers; without any block, the sums are {}.
 
     Returns:
         The metric, for registration under a name.
@@ -104,7 +104,7 @@ def metric_of_sums(
 
 
 def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
-    """Add sums of both by name: numbers and arrays add up, sets unite."""
+    """Add sums by name: numbers and arrays are added up, sets are united."""
     total = dict(first)
     for name, value in second.items():
         if name not in total:
@@ -115,19 +115,19 @@ def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
 
 
 def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any, Any]]:
-    """Return the metrics of these names, of all where none is given; BadInput for an unknown one."""
+    """Return the metrics with these names, or all metrics; raise BadInput for an unknown name."""
     return {name: load("metrics", name, Metric) for name in names or available("metrics")}
 
 
 def metric_key(estimator: str, quantity: str, case: str) -> str:
-    """Name a number: `estimator.quantity[.case]`."""
+    """Return the key of a number: `estimator.quantity[.case]`."""
     return ".".join(filter(None, (estimator, quantity, case)))
 
 
 class MetricCollection:
-    """Collects what metrics make of all that is judged, as it comes.
+    """Collection of metrics that are computed block by block.
 
-    What is judged together (one output topic of one estimator) is told by a key.
+    A key identifies what is judged together: one output topic of one estimator.
     """
 
     def __init__(self, metrics: Mapping[str, Metric[Any, Any]]) -> None:
@@ -136,7 +136,7 @@ class MetricCollection:
         self._named: dict[tuple[type, str], tuple[str, str]] = {}
 
     def add(self, key: str, judged: Any) -> None:
-        """Judge a block; raises BadInput where a metric raises."""
+        """Add a block to all metrics that judge its type; raise BadInput if a metric raises."""
         place = type(judged), key
         self._named[place] = judged.estimator, judged.case
         states = self._states.setdefault(place, {})
@@ -147,14 +147,14 @@ class MetricCollection:
                     states[name] = metric.add(state, judged)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return it as it is pickled: metrics are found again by their names."""
+        """Return the state for pickling; metrics are stored by name and looked up again."""
         return {**vars(self), "_metrics": list(self._metrics)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _metrics=find_metrics(state["_metrics"]))
 
     def merge(self, other: "MetricCollection") -> None:
-        """Take in what was made of other runs by the same metrics."""
+        """Add the states of other runs, of the same metrics."""
         self._named |= other._named
         for place, theirs in other._states.items():
             ours = self._states.setdefault(place, {})
@@ -163,9 +163,9 @@ class MetricCollection:
                     ours[name] = self._metrics[name].merge(ours[name], state) if name in ours else state
 
     def finish(self, of: Callable[[str], bool] | None = None) -> dict[str, float]:
-        """Return the numbers, as `estimator.quantity[.case]`, of all keys or of some.
+        """Compute the numbers of all keys, or those that `of` selects, as `estimator.quantity[.case]`.
 
-        Errors come first, then innovations. Raises BadInput where a metric raises.
+        Errors come first, then innovations. Raises BadInput if a metric raises.
         """
         values: dict[str, float] = {}
         for place in sorted(self._states, key=lambda place: _RANKS.get(place[0], 2)):
@@ -184,9 +184,9 @@ _RANKS: dict[type, int] = {Errors: 0, Innovations: 1, Output: 3}
 
 
 def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> dict[str, float]:
-    """Measure all that was judged, each whole, as `estimator.quantity[.case]`.
+    """Compute metrics of judged objects, each as one block, as `estimator.quantity[.case]`.
 
-    Raises BadInput where a metric raises.
+    Raises BadInput if a metric raises.
     """
     measurement = MetricCollection(metrics)
     for number, each in enumerate(judged):

@@ -1,4 +1,4 @@
-"""Defines the metrics of any estimator: errors, consistency, innovations, failures, coverage.
+"""Metrics for any estimator: errors, consistency, innovations, failures, coverage.
 
 NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
 """
@@ -22,7 +22,7 @@ from fuselog.replay.judging.metrics.sums import BinnedSums
 
 
 def squares(errors: Errors) -> Sums:
-    """Sum squared errors by the name of their RMSE: of the position, and of other components."""
+    """Sum squared errors by the name of their RMSE: of the position, and of every other component."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
     found |= squares_by_name(errors.squared, errors.components, errors.kinds)
     return found | {rmse_of(name): np.nan for name in errors.components_without_truth}
@@ -53,7 +53,7 @@ def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[
 def accuracy(sums: Sums) -> dict[str, float]:
     """Compute the RMSE of position, orientation and every other component over all runs and steps.
 
-    NaN, which is written as null, for a component that the truth lacks.
+    The RMSE of a component without truth is NaN, which is written as null.
     """
     if not sums:
         return {}
@@ -67,21 +67,21 @@ def accuracy(sums: Sums) -> dict[str, float]:
 
 
 def rmse_of(component: str) -> str:
-    """Name the RMSE of a component: `turn_rmse_radps` of `turn_radps`."""
+    """Return the name of a component's RMSE: `turn_rmse_radps` for `turn_radps`."""
     quantity, _, unit = component.rpartition("_")
     return f"{quantity}_rmse_{unit}".strip("_")
 
 
 @dataclass
 class Consistent:
-    """Sums NEES: over all, and by step over the runs.
+    """Sums of NEES: over everything, and by step over the runs.
 
     Attributes:
-        count, total: of finite NEES of the state.
-        places, of_places: of the position alone.
-        missing: estimates without a NEES, their covariance being singular.
+        count, total: number and sum of finite NEES of the state.
+        places, of_places: number and sum of finite NEES of the position.
+        missing: number of estimates without a NEES because their covariance is singular.
         by_step: NEES in one column.
-        components: how many the state has.
+        components: number of components of the state.
     """
 
     count: int
@@ -127,11 +127,11 @@ def _merge_nees(first: Consistent, second: Consistent) -> Consistent:
 
 
 def consistency(state: Consistent) -> dict[str, float]:
-    """Compute mean NEES of state and position, and the share of steps whose mean is in bounds."""
+    """Compute the mean NEES of state and position, and the fraction of steps within its bounds."""
     if state.count == 0:
         return {}
     values = {"nees": state.total / state.count}
-    if state.missing:  # of singular covariances there is none
+    if state.missing:  # singular covariances have no NEES
         values["estimates_without_nees"] = float(state.missing)
     if state.places:
         values["position_nees"] = state.of_places / state.places
@@ -143,11 +143,11 @@ def consistency(state: Consistent) -> dict[str, float]:
 
 
 def step_bounds(runs: Floats, size: int) -> tuple[Floats, Floats]:
-    """Compute where 95 % of mean NEES lie over so many runs: the lower and the upper bound, (n,) each.
+    """Compute the 95 % bounds of mean NEES over the given numbers of runs: lower and upper, (n,) each.
 
     Args:
-        runs: (n,), how many there are at each step.
-        size: components of the error.
+        runs: (n,), number of runs at each step.
+        size: number of components of the error.
     """
     counts, place = np.unique(runs, return_inverse=True)
     bounds = np.array([chi_square_interval(size, int(count)) for count in counts])
@@ -164,27 +164,27 @@ def _nis(innovations: Innovations) -> Sums:
 
 
 def innovation(sums: Sums) -> dict[str, float]:
-    """Compute mean NIS per measured component (1 when all is well) and the share that a gate stopped."""
+    """Compute the mean NIS per measured component (expected: 1) and the share rejected by a gate."""
     if not sums.get("messages"):
         return {}
     gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
-    if not sums["degrees"]:  # all said nothing of their states
+    if not sums["degrees"]:  # no message measured a component
         return gated
     return {"nis_per_component": sums["squared"] / sums["degrees"], **gated}
 
 
 def _log_likelihoods(innovations: Innovations) -> Sums:
-    """Sum log-likelihoods; NaN where one of what was let in is not stated."""
+    """Sum log-likelihoods; NaN if that of an accepted measurement is not stated."""
     stated = innovations.log_likelihood
     let_in = np.array([np.nan]) if stated is None else stated[innovations.accepted]
     return {"log_likelihood": float(let_in.sum()), "runs": set(np.unique(innovations.run).tolist())}
 
 
 def likelihood(sums: Sums) -> dict[str, float]:
-    """Compute the log-likelihood of a run's measurements as the filter predicted them: the runs' mean.
+    """Compute the log-likelihood of a run's measurements under the predictions, averaged over runs.
 
-    Of the measurements that a gate let in alone, so that it is no measure to tune a gate by. Nothing
-    where the estimator does not state it of all of them.
+    Only accepted measurements count, so gates cannot be tuned by this metric. There is no result if the
+    estimator does not state the likelihood of all of them.
     """
     if not sums.get("runs") or not np.isfinite(sums["log_likelihood"]):
         return {}
@@ -198,14 +198,14 @@ def _failed(output: Output) -> Sums:
 
 
 def failures(sums: Sums) -> dict[str, float]:
-    """Count the runs that failed."""
+    """Count the failed runs."""
     return {"failed_runs": float(len(sums["runs"]))} if sums else {}
 
 
 def covered(output: Output) -> Sums:
-    """Count the seconds that the runs span and that were estimated, the measurements not used, and ages.
+    """Sum the spans of the runs, the times estimated, the unused measurements and the ages of estimates.
 
-    An estimate is as old as the time from its stamp to when it could be given.
+    The age of an estimate is the time from its stamp to when it was available.
     """
     schema, stream = output.rows.stream.schema.full_name, output.rows.stream
     if schema == schemas.GAUSSIAN_ESTIMATE.full_name:
@@ -223,7 +223,7 @@ def covered(output: Output) -> Sums:
 
 
 def coverage(sums: Sums) -> dict[str, float]:
-    """Return the share of the span that was estimated, the measurements not used, the mean age."""
+    """Compute the share of the span that was estimated, the unused measurements, or the mean age."""
     if "age_s" in sums:
         return {"estimate_age_s": sums["age_s"] / sums["estimates"]} if sums["age_s"] > 0.0 else {}
     if "skipped" in sums:
@@ -233,7 +233,7 @@ def coverage(sums: Sums) -> dict[str, float]:
 
 
 def estimated_share(sums: Sums) -> float | None:
-    """Return the share of the runs' spans for which there are estimates; None where there is no span."""
+    """Compute the share of the runs' spans for which there are estimates; None without a span."""
     return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
 
 
@@ -254,9 +254,10 @@ def _solved(output: Output) -> Sums:
 
 
 def solution(sums: Sums) -> dict[str, float]:
-    """Return how the batch solutions ended: the share that converged, and the most iterations of one.
+    """Compute how batch solutions ended: the share that converged, and the largest number of iterations.
 
-    Where a start is stated, also the mean cost at the end; of single iterations that at the start.
+    If the start is stated, the mean cost at the end is added; for single iterations, the cost at the
+    start.
     """
     if sums.get("starts"):
         return {"start_cost": sums["start_cost"] / sums["starts"]}
@@ -278,7 +279,7 @@ def _effective(output: Output) -> Sums:
 
 
 def effective(sums: Sums) -> dict[str, float]:
-    """Return a filter's effective share of particles, 1 / (N sum w^2): the mean over all estimates."""
+    """Compute the mean effective share of particles, 1 / (N sum w^2), over all estimates."""
     return {"effective_share": sums["shares"] / sums["estimates"]} if sums.get("estimates") else {}
 
 

@@ -1,4 +1,4 @@
-"""Keeps sums that merge: of an estimate stream's errors by step and time, of innovations by run."""
+"""Mergeable sums of the errors of an estimate stream by step and time, and of innovations by run."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -12,27 +12,27 @@ from fuselog.replay.judging.metrics.sums import BinnedSums, Integers
 
 @dataclass
 class Quantities:
-    """Sums one estimate stream: what tables and figures are made of.
+    """Sums of one estimate stream, from which tables and figures are made.
 
     The columns of both sums are elapsed time, squared error of the position, of the rotation and of
-    each component, trace of the main quantity's covariance and of its square, and NEES. `constant` tells
-    an error that stays.
+    each component, trace of the main quantity's covariance and of its square, and NEES. `constant` are
+    the sums from which a constant error is detected.
     """
 
-    errors: Errors  # the last block: for names and kinds
+    errors: Errors  # the last block, for its names and kinds
     by_step: BinnedSums
     by_time: BinnedSums
     constant: ConstantSums = field(default_factory=ConstantSums)
 
     def merge(self, other: "Quantities") -> None:
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         self.by_step.merge(other.by_step)
         self.by_time.merge(other.by_time)
         self.constant.merge(other.constant)
 
 
 def columns_of(errors: Errors) -> Floats:
-    """Return rows (n, 6 + d) of what is summed; see `Quantities`."""
+    """Compute the rows (n, 6 + d) to be summed; see `Quantities`."""
     squared = errors.squared
     main = errors.main.columns
     covariance = errors.covariance[:, main][:, :, main]
@@ -50,13 +50,13 @@ def columns_of(errors: Errors) -> Floats:
 
 
 class OfRuns(NamedTuple):
-    """Holds numbers of innovations, of each run (runs,) or of all.
+    """Statistics of innovations, of each run (runs,) or of all runs.
 
     Attributes:
-        messages, accepted: how many there are, and how many a gate let in.
-        degrees, accepted_degrees: the measured components of these.
+        messages, accepted: number of innovations, and number of those that a gate accepted.
+        degrees, accepted_degrees: number of measured components of these.
         squared: the sum of NIS.
-        log_likelihood: of those that were let in; NaN where it is not stated of all.
+        log_likelihood: sum over accepted innovations; NaN if it is not stated for all of them.
     """
 
     messages: Any
@@ -68,14 +68,14 @@ class OfRuns(NamedTuple):
 
 
 class InnovationSums:
-    """Sums one innovation stream by run, from a first one on."""
+    """Sums of one innovation stream by run, starting with a first run."""
 
     def __init__(self, first_run: int) -> None:
         self.first_run = first_run
         self._sums = BinnedSums(len(OfRuns._fields) - 1, first=first_run)
 
     def add(self, innovations: Innovations) -> None:
-        """Take in a block."""
+        """Add a block."""
         stated, accepted = innovations.log_likelihood, innovations.accepted
         let_in = np.where(accepted, np.nan if stated is None else stated, 0.0)
         degrees = innovations.degrees
@@ -85,7 +85,7 @@ class InnovationSums:
         self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
 
     def merge(self, other: "InnovationSums") -> None:
-        """Take in the sums of other runs."""
+        """Add the sums of other runs."""
         self._sums.merge(other._sums)
 
     def by_run(self) -> tuple[Integers, OfRuns]:

@@ -1,4 +1,4 @@
-"""Sums in bins what is kept of errors whose number nobody knows beforehand."""
+"""Sums in bins, for errors whose number is not known in advance."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +8,12 @@ Integers = NDArray[np.int64]
 
 
 class BinnedSums:
-    """Sums rows of numbers (n, columns) by group and by bin of a position, a whole number from 0 on.
+    """Sums of rows of numbers (n, columns) by group and by bin of a position, an integer from 0 on.
 
-    Bin b holds the positions from b width to (b + 1) width. Where there is a limit, the width doubles
-    as often as needed, so that the sums never take more than `limit` bins a group; where there are very
-    many groups, those of several sums merged take no more than about `cells` bins in all.
-    `first` is the first group that there is: of those before it nothing is kept.
+    Bin b contains the positions from b width to (b + 1) width. If there is a `limit` of bins per group,
+    the width doubles as often as needed to keep it. `cells` limits the number of bins of all groups in
+    the same way, but only when sums are merged. `first` is the first group; nothing is stored for
+    groups before it.
     """
 
     def __init__(
@@ -29,13 +29,13 @@ class BinnedSums:
         self._first = first
         self._limit = limit
         self._cells = cells
-        # first column: how many rows there were
+        # first column: number of rows
         self._sums: Floats = np.zeros((1, 0, 1 + columns))
         self._bins = 0
         self._groups = 0
 
     def add(self, position: Integers, values: Floats, group: Integers | None = None) -> None:
-        """Add rows (n, columns) at positions (n,), of groups (n,), by default all of the first."""
+        """Add rows (n, columns) at positions (n,) to groups (n,), by default all to the first group."""
         if len(position) == 0:
             return
         group = np.zeros(len(position), np.int64) if group is None else group - self._first
@@ -52,7 +52,7 @@ class BinnedSums:
             part[:, :, 1 + column] += sums.reshape(shape)
 
     def merge(self, other: "BinnedSums") -> None:
-        """Add the sums of others, which have the same columns and no group before the first here."""
+        """Add other sums with the same columns, which have no group before the first one here."""
         theirs = other._sums[: other._groups, : other._bins]
         while self.width < other.width:
             self._double()
@@ -69,7 +69,7 @@ class BinnedSums:
             self._double()
 
     def filled(self) -> tuple[Integers, Floats, Floats]:
-        """Return every cell that has rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
+        """Return the cells that have rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
         used = self._sums[: self._groups, : self._bins]
         cells = np.argwhere(used[:, :, 0] > 0)
         rows = used[cells[:, 0], cells[:, 1]]
@@ -86,7 +86,7 @@ class BinnedSums:
         self.width *= 2
 
     def _reserve(self, groups: int, bins: int) -> None:
-        """Have room, with some to spare: growing again and again must not copy again and again."""
+        """Grow the arrays if necessary, with room to spare so that they are rarely copied."""
         there = self._sums.shape
         self._groups, self._bins = max(self._groups, groups), max(self._bins, bins)
         if groups > there[0] or bins > there[1]:
@@ -100,6 +100,6 @@ class BinnedSums:
 
 
 def _halved(sums: Floats) -> Floats:
-    """Add up two bins each."""
+    """Add up pairs of adjacent bins."""
     even = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, 0)))
     return even[:, 0::2] + even[:, 1::2]

@@ -1,1 +1,1 @@
-"""Draws scenes of any family: canvas, plane, plots; begin with `canvas`."""
+"""Elements for the scenes of any family: canvas, plane, plots; begin with `canvas`."""

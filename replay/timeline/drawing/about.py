@@ -1,4 +1,4 @@
-"""Draws what a sensor sees about it: in its own frame, its x axis to the right.
+"""Drawings of a sensor's measurements around it, in its own frame with its x axis to the right.
 
 Ranges are circles, bearings and lines of sight are rays from the origin, detections are points.
 """
@@ -13,13 +13,13 @@ from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import PALETTE, Canvas
 from fuselog.replay.timeline.drawing.plane import draw_lines, draw_scans, plane_view
 
-# A ray without a range is so long, and a circle has so many corners.
+# Length of a ray without a range, and number of vertices of a circle.
 RAY_M = 1.0
 CORNERS = 49
 
 
 def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DView]:
-    """Return a view of what a sensor sees about itself: none where that has no place in its plane."""
+    """Draw a sensor's measurements around it, if they have positions in its plane; return the view."""
     if stream.schema.full_name == schemas.DETECTION.full_name:
         seen = stream["position_m"][:, :2]
         if seen.shape[1] == 2:
@@ -40,7 +40,7 @@ def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DV
 
 
 def _circles(stream: Stream) -> Floats:
-    """Return the circles (n, corners, 2) on which targets lie."""
+    """Return the circles (n, corners, 2) of possible target positions at the measured ranges."""
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return stream["range_m"][:, None, None] * around

@@ -1,8 +1,8 @@
-"""Defines what is drawn (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
+"""Scene (content of a timeline), canvas (the recording that it is drawn on), and drawing code.
 
 A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
-that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`. Where stamps are
-no dates, as those of a simulated clock in a bag, `utc` is when they reached the recorder.
+that moves is on three Rerun timelines: `step`, `sim_time` (since the run's epoch) and `utc`. If stamps
+are not dates, as those of a simulated clock in a bag, `utc` is the time of recording.
 """
 
 import re
@@ -27,7 +27,7 @@ Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]
 
-# Okabe and Ito's colours, told apart by everyone; red is kept for what went wrong.
+# Okabe and Ito's colours, which everyone can distinguish; red is reserved for faults.
 PALETTE: tuple[Colour, ...] = (
     (86, 180, 233),
     (230, 159, 0),
@@ -36,19 +36,19 @@ PALETTE: tuple[Colour, ...] = (
     (240, 228, 66),
     (0, 114, 178),
 )
-# How wide a line is, in pixels.
+# Width of a line in pixels.
 WIDTH = 1.5
 TRUTH: Colour = (200, 200, 200)
 MUTED: Colour = (130, 130, 130)
 WRONG: Colour = (230, 60, 40)
 
-# What moves has at most so many rows per entity, evenly in time: several per pixel of a plot, and
-# several a second in a log of a quarter of an hour.
+# The most rows of a moving entity, evenly in time: several per pixel of a plot, and several a second
+# in a log of a quarter of an hour.
 DRAWN_ROWS = 5000
-# A stream is silent after so many of its usual intervals, but not before so long.
+# A stream has a gap after this multiple of its usual interval, but not before this time.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
-# A stream has a rate if half of its intervals are within this share of the usual one.
+# A stream has a rate if half of its intervals differ from the usual one by at most this fraction.
 RATE_JITTER = 0.25
 ESTIMATES = (
     schemas.GAUSSIAN_ESTIMATE,
@@ -57,21 +57,21 @@ ESTIMATES = (
     schemas.TRACK_ESTIMATE,
     schemas.SCORE_VECTOR,
 )
-# Stamps before the year 2000 count from something else than 1970.
+# Stamps before the year 2000 do not count from 1970.
 DATES_FROM_NS = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds one run and what the estimators made of it.
+    """One run and the results of the estimators.
 
     Attributes:
-        source: the run's sensor streams and truth.
-        outputs: the estimators' streams of this run, by topic.
-        errors: the errors of this run's estimates, where there is truth.
-        focus: the case that is seen first; None is the first one.
-        moments: where NEES and errors of the whole run are largest.
-        divergences: where estimators diverge, by topic of their innovations.
+        source: sensor streams and truth of the run.
+        outputs: output streams of this run, by topic.
+        errors: errors of this run's estimates, if there is truth.
+        focus: the case that is shown first; None for the first one.
+        moments: the moments of the run's largest NEES and errors.
+        divergences: points at which estimators diverge, by topic of their innovations.
     """
 
     source: Source
@@ -83,29 +83,29 @@ class Scene:
 
     @property
     def estimators(self) -> list[str]:
-        """Return the estimators' labels, in the order they were given."""
+        """Return the estimators' labels, in the order in which they were given."""
         names = [split_topic(topic)[0] for topic in self.outputs]
         return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
     @property
     def cases(self) -> list[str]:
-        """Return what is estimated, or has a truth: `robot1`, say. A single one may be named ""."""
+        """Return the cases with estimates or a truth, such as `robot1`; a single case may be ""."""
         estimated = [split_topic(topic)[1] for topic in self.outputs]
         found = {*estimated, *(_prefix(topic) for topic in self._truths)}
         return sorted(found, key=_natural) or [""]
 
     def colour(self, estimator: str) -> Colour:
-        """Return the one colour that `estimator` has everywhere."""
+        """Return the colour that `estimator` has in all views."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
 
     @property
     def spare_colours(self) -> Iterator[Colour]:
-        """Return colours without end, first those that no estimator has."""
+        """Yield colours without end, first those that no estimator has."""
         used = len(self.estimators) % len(PALETTE)
         return cycle([*PALETTE[used:], *PALETTE[:used]])
 
     def width(self, estimator: str) -> float:
-        """Return how wide lines of `estimator` are, in pixels, so that one on another shows both.
+        """Return the line width of `estimator` in pixels, so that overlapping lines are all visible.
 
         The viewer draws entities in the order of their names, so the first ones are the widest.
         """
@@ -144,7 +144,7 @@ class Scene:
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """Return the run's sensor topics below `case`, and those below none; see `unread`."""
+        """Return the run's sensor topics below `case` and those below no case, if they can be read."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -155,7 +155,7 @@ class Scene:
 
     @cached_property
     def unread(self) -> dict[str, str]:
-        """Return the run's topics whose messages are no columns, such as images, and why."""
+        """Return why messages of some topics cannot be read as columns, such as images, by topic."""
         found: dict[str, str] = {}
         for topic in self.source.topics:
             try:
@@ -170,7 +170,7 @@ class Scene:
 
     @property
     def dates(self) -> "Dates | None":
-        """Return date stamps by the topic with most messages; None where stamps are dates."""
+        """Return the dates of stamps, from the topic with most messages; None if stamps are dates."""
         streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
         return dates_of(max(streams, key=len)) if streams else None
 
@@ -184,15 +184,15 @@ def _prefix(topic: str) -> str:
 
 
 def _natural(name: str) -> list[tuple[str, int]]:
-    """Return the key that puts robot2 before robot10."""
+    """Return the sort key that puts robot2 before robot10."""
     return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
 @dataclass(frozen=True)
 class Dates:
-    """Holds two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+    """Two clocks: stamps (k,), and by how many ns the dates are later (k,).
 
-    Between two stamps the difference is linear, and before the first and after the last it stays.
+    The difference is linear between two stamps, and constant before the first and after the last.
     """
 
     stamps_ns: Times
@@ -207,7 +207,7 @@ class Dates:
 
 
 def dates_of(stream: Stream) -> Dates | None:
-    """Return the dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    """Return the dates at which a stream's messages were logged; None if its stamps are dates."""
     stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
     if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
         return None
@@ -216,15 +216,15 @@ def dates_of(stream: Stream) -> Dates | None:
 
 @dataclass(frozen=True)
 class Canvas:
-    """Represents a recording and its clocks.
+    """Recording with the clocks of a run.
 
     Attributes:
-        recording: where it goes.
+        recording: the Rerun recording.
         epoch_ns: the run's time zero.
-        end_ns: when the last estimate or truth is.
-        steps_ns: the distinct times of estimates, which `step` counts.
-        is_still: nothing that moves is sent: it is there already.
-        dates: what stamps are as dates, where they are none themselves.
+        end_ns: time of the last estimate or truth.
+        steps_ns: distinct times of estimates, which `step` counts.
+        is_still: whether moving entities are not sent, because they have been sent already.
+        dates: dates of stamps, if stamps are not dates.
     """
 
     recording: rr.RecordingStream
@@ -235,12 +235,12 @@ class Canvas:
     dates: Dates | None = None
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
-        """Send all rows of an entity at once.
+        """Send all rows of an entity in one call.
 
         Args:
-            entity: the path.
-            time_ns: (n,), the stamps.
-            columns: of Rerun, with n rows.
+            entity: path of the entity.
+            time_ns: (n,), stamps in ns.
+            columns: Rerun columns with n rows.
         """
         if len(time_ns) == 0 or self.is_still:
             return
@@ -254,16 +254,16 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log `what` holds of `entity` at all times, such as a style."""
+        """Log properties (`what`) of `entity` that hold at all times, such as a style."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Draws a scenario family: `draw` sends everything and returns the layout of its views.
+    """Drawing of a scenario family.
 
     Attributes:
-        draw: (canvas, scene) -> the layout.
+        draw: draw(canvas, scene) sends everything and returns the layout of the views.
     """
 
     draw: Callable[[Canvas, Scene], rrb.Container | rrb.View]
@@ -272,7 +272,7 @@ class Timeline:
 def draw_cases(
     scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
 ) -> rrb.Container | rrb.View:
-    """Return the layouts of all cases, in tabs where there are several, an estimated one first."""
+    """Draw all cases and return their layouts, in tabs if there are several, an estimated case first."""
     layouts = [draw_case(case) for case in scene.cases]
     if len(layouts) == 1:
         return layouts[0]
@@ -282,14 +282,14 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:
-    """Return a case's board, and to its right its plots if there are any, all equally high."""
+    """Return a case's board with its plots to the right, if there are any, all of equal height."""
     shares = [float(strips_of(plot)) for plot in plots]
     columns = [board, rrb.Vertical(*plots, row_shares=shares)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
 
 
 def strips_of(board: Board) -> int:
-    """Count the views that are seen one below another in a part of a layout."""
+    """Count the views one below another in a part of a layout."""
     if not isinstance(board, rrb.Container):
         return 1
     within = [strips_of(each) for each in board.contents if isinstance(each, rrb.Container | rrb.View)]
@@ -297,21 +297,21 @@ def strips_of(board: Board) -> int:
 
 
 def entity_path(*parts: str) -> str:
-    """Return an entity from its parts; empty ones, such as the case of a log with one, are left out."""
+    """Join parts to an entity path, without empty ones, such as the case of a log with only one."""
     return "/".join(part for part in parts if part)
 
 
 def escaped(entity: str) -> str:
-    """Write an entity as Rerun wants it, whatever is in its parts: an estimator `ukf:2`, say."""
+    """Escape an entity path for Rerun, with any characters in its parts, such as `ukf:2`."""
     return "/".join(rr.escape_entity_path_part(part) for part in entity.split("/"))
 
 
 def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows to draw: all, or the last of each of `rows` equal spans of time.
+    """Return the rows to draw: all of them, or the last one in each of `rows` equal spans of time.
 
     Args:
         time_ns: (n,), in order.
-        rows: how many at most.
+        rows: largest number of rows.
     """
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
@@ -320,11 +320,11 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a curve to draw: all, or the least and the greatest of each span of time.
+    """Return the rows of a curve to draw: all of them, or the minimum and maximum of each span of time.
 
     Args:
         time_ns, values: (n,), in order of time.
-        rows: how many at most.
+        rows: largest number of rows.
     """
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
@@ -332,9 +332,9 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
 
 
 def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a scatter of points to draw: all, or `rows` of them at random, in order.
+    """Return the rows of a scatter plot to draw: all of them, or `rows` at random, in order.
 
-    Extremes as of a curve would leave out what is between them, where most points are.
+    Extremes as for a curve would leave out the points in between, which are the majority.
     """
     if count <= rows:
         return np.arange(count)
@@ -342,11 +342,11 @@ def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
-    """Return the rows of the least and of the greatest value of every span, the first where several are.
+    """Return the rows of the minimum and maximum of every span, the first one among equals.
 
     Args:
-        of_span: (n,), the number of each value's span, from zero on and sorted.
-        values: (n,); NaN is no extreme.
+        of_span: (n,), sorted index of each value's span, from zero on.
+        values: (n,); NaN is never an extreme.
     """
     first = np.flatnonzero(np.diff(of_span, prepend=-1))
     sizes = np.diff(first, append=len(of_span))
@@ -358,16 +358,16 @@ def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
 
 
 def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
-    """Tell in which of so many equal spans of time each stamp is, from zero on."""
+    """Return the index of each stamp's span, out of `spans` equal spans of time."""
     span_ns = max((time_ns[-1] - time_ns[0]) / spans, 1.0)
     return np.minimum((time_ns - time_ns[0]) / span_ns, spans - 1).astype(np.int64)
 
 
 def gap_limit_ns(time_ns: Times) -> int:
-    """Return how long a stream with these times, sorted, may be silent before it is missed.
+    """Compute how long a stream with these sorted times may be silent before this counts as a gap.
 
-    A stream without a rate, such as of shots or of what a camera happens to see, comes in bursts: it is
-    compared with the pauses in which half of its time passes, apart from the longest.
+    A stream without a rate, such as gunshots or objects seen by a camera, comes in bursts. Its limit is
+    based on the pauses that make up half of its time, without the longest one.
     """
     intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)
     usual_ns = usual_interval_ns(time_ns)
@@ -379,12 +379,12 @@ def gap_limit_ns(time_ns: Times) -> int:
 
 
 def usual_interval_ns(time_ns: Times) -> float:
-    """Return the median between distinct times, sorted; zero where there is only one."""
+    """Compute the median interval of distinct, sorted times; zero if there is only one."""
     intervals = np.diff(np.unique(time_ns))
     return float(np.median(intervals)) if len(intervals) else 0.0
 
 
 def nice(value: float) -> float:
-    """Return the smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
+    """Return the smallest number not below a positive value that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value))

@@ -1,4 +1,4 @@
-"""Draws single estimates close up: errors in the plane with 95 % ellipses, the truth at the origin."""
+"""Close-up of single estimates: errors in the plane with 95 % ellipses, and the truth at the origin."""
 
 import numpy as np
 import rerun as rr
@@ -18,14 +18,14 @@ from fuselog.replay.timeline.drawing.plane import (
     turn_up,
 )
 
-# The height of a line of text below the ellipses, by that of what is above it.
+# Height of a line of text below the ellipses, as a fraction of the picture above it.
 LINE_SHARE = 0.1
 
 
 def draw_close_up(canvas: Canvas, scene: Scene, case: str) -> rrb.Spatial2DView | None:
-    """Draw the errors of a case of which each estimator has one estimate, with NEES below them.
+    """Draw the errors of a case in which each estimator has one estimate, with NEES below them.
 
-    Returns None where there are more estimates, or none with a place.
+    Return None if there are more estimates, or none with a position.
     """
     found = [each for each in scene.errors_of(case) if not each.is_bound]
     placed = [each for each in found if set(PLANE) <= set(each.components)]

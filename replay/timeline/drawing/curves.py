@@ -1,4 +1,4 @@
-"""Draws curves over logarithms, a view for each panel: Rerun's own plots have time on their axis."""
+"""Curves with logarithmic axes, one view per panel, because Rerun's plots only have time as an axis."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -14,12 +14,12 @@ from fuselog.replay.timeline.drawing.canvas import MUTED, Canvas, Colour
 from fuselog.replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
 from fuselog.replay.timeline.sinks import open_recording
 
-# Numbers of an axis are this share of the panel inside its edge.
+# Distance of an axis' numbers from the edge, as a fraction of the panel.
 LABEL_SHARE = 0.08
 
 
 class CurvePanel(NamedTuple):
-    """Holds the curves of a view: a name with its axes, positive places (n, 2) by curve, its strokes."""
+    """Curves of a view: name with its axes, positive points (n, 2) by curve, and strokes by curve."""
 
     name: str
     curves: Mapping[str, Floats]
@@ -27,9 +27,9 @@ class CurvePanel(NamedTuple):
 
 
 def save_curves(title: str, panels: Sequence[CurvePanel], rrd: Path) -> None:
-    """Write curves over logarithms as a timeline in which nothing moves.
+    """Write curves with logarithmic axes as a static timeline.
 
-    Raises BadInput where the file cannot be written.
+    Raises BadInput if the file cannot be written.
     """
     with open_recording("fuselog-curves", title, save=rrd) as recording:
         recording.send_recording_name(title)
@@ -63,16 +63,16 @@ def curve_view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DVie
 
 
 def _drawn(places: Floats) -> Floats:
-    """Return the decimal logarithms of places (n, 2), those left out that are not positive numbers."""
+    """Compute decimal logarithms of points (n, 2); points that are not positive are left out."""
     is_there = (np.isfinite(places) & (places > 0)).all(axis=1)
     found: Floats = np.log10(places[is_there])
     return found
 
 
 def _draw_decades(canvas: Canvas, entity: str, low: Floats, high: Floats) -> None:
-    """Draw lines at 1, 2 and 5 times the powers of ten, each with its number near its lower or left end.
+    """Draw lines at 1, 2 and 5 times the powers of ten, with numbers near their lower or left end.
 
-    Of more than two decades there are only the powers.
+    Over more than two decades, only the powers are drawn.
     """
     lines, at, labels = [], [], []
     inside = low + LABEL_SHARE * (high - low)

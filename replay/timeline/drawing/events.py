@@ -1,4 +1,4 @@
-"""Writes what happened in a run: worst moments, rejected and late measurements, failures, gaps."""
+"""Event log of a run: worst moments, rejected and late measurements, failures, gaps."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ NOT_SENSED = frozenset(
 )
 
 
-# What components say of a receiver's solution, as RTKLIB numbers them, and of a body.
+# Meaning of components on a receiver's solution, numbered as in RTKLIB, and on a body.
 STATES: Mapping[str, Mapping[float, str]] = {
     "quality": {
         1: "solution fixed",
@@ -49,9 +49,9 @@ STATES: Mapping[str, Mapping[float, str]] = {
 
 
 class Happened(NamedTuple):
-    """Holds what happened to an estimator or a sensor: a text for each time, all of one level.
+    """Events of an estimator or a sensor: a text for each time, all of one level.
 
-    `part` is the entity below that of `who`, if it has one of its own.
+    `part` is the entity below that of `who`, if the events have one of their own.
     """
 
     who: str
@@ -64,7 +64,7 @@ class Happened(NamedTuple):
 def above_events(
     board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
 ) -> rrb.Container:
-    """Return a board so many times as high as the events below it, if there are any."""
+    """Return a board above events, if there are any; the board is `share` times as high."""
     return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
 
 
@@ -76,10 +76,10 @@ def draw_events(
     also: Iterable[Happened] = (),
     more: Collection[str] = (),
 ) -> list[rrb.TextLogView]:
-    """Draw the events of a case, one entity per estimator and sensor: no view where nothing happened.
+    """Draw the events of a case, one entity per estimator and sensor; no view if there are none.
 
-    `not_drawn` says of topics that have no drawing why, beside those that cannot be read; `also` is what
-    happened that only a scenario family knows of; `more` are other cases whose worst moments are here.
+    `not_drawn` gives the reasons why topics have no drawing, besides unreadable topics; `also` are
+    events from the scenario family; `more` are other cases whose worst moments are included.
     """
     root = entity_path("events", case)
     reasons = {**scene.unread, **(not_drawn or {})}
@@ -96,10 +96,10 @@ def draw_events(
 
 
 def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
-    """Put the time in the run before each text: the viewer's own column of stamps is narrow, and cuts.
+    """Put the time in the run before each text, because the viewer truncates its own column of stamps.
 
     Args:
-        canvas: with the run's epoch.
+        canvas: a canvas with the run's epoch.
         time_ns, texts: (n,), n of them.
     """
     elapsed_s = ((time_ns - canvas.epoch_ns) * 1e-9).tolist()
@@ -107,13 +107,13 @@ def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
 
 
 def events_view(root: str) -> rrb.TextLogView:
-    """Return all events below an entity."""
+    """Return a view of all events below an entity."""
     shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
 
 
 def _of_moments(scene: Scene, cases: Collection[str]) -> Iterator[Happened]:
-    """Yield where the estimators of some cases are worst."""
+    """Yield the moments at which the estimators of some cases are worst."""
     found: dict[str, list[Moment]] = {}
     for moment in sorted(scene.moments, key=lambda each: each.time_ns):
         if moment.case in cases:
@@ -124,7 +124,7 @@ def _of_moments(scene: Scene, cases: Collection[str]) -> Iterator[Happened]:
 
 
 def _of_divergences(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield where estimators diverge, unless a diagnosis has found out what happened."""
+    """Yield the points at which estimators diverge, unless a diagnosis has found the cause."""
     diagnosed = {estimator for estimator, _ in scene.outputs_of(case, schemas.DIAGNOSED)}
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         if stream.topic in scene.divergences and estimator not in diagnosed:
@@ -174,7 +174,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
-    """Tell what was kept out, by the sensors that have a message of its stamp, and of its target."""
+    """Describe rejected measurements by the sensors that have a message of the same stamp and target."""
     sensed = {
         _within(topic, case): scene.read(topic)
         for topic in scene.topics_near(case)
@@ -195,18 +195,18 @@ def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
 
 
 def _targets(stream: Stream) -> list[int]:
-    """Return what messages are about, 0 for nothing."""
+    """Return the targets of messages, 0 for none."""
     none = np.zeros(len(stream), np.int64)
     return stream.columns.get("target_id", none).tolist()
 
 
 def _within(topic: str, case: str) -> str:
-    """Name a topic as it is called within its case."""
+    """Return the name of a topic within its case."""
     return topic.removeprefix(f"/{case}").removeprefix("/")
 
 
 def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield spans in which a sensor was dead, as stated or seen as a gap; how good solutions are."""
+    """Yield outages and gaps of sensors, and changes of the state of their solutions."""
     for topic in scene.topics_near(case):
         if scene.source.topics[topic].schema_name in NOT_SENSED:
             continue
@@ -223,7 +223,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
-    """Yield where what a sensor says of its solution or its body changes, see STATES."""
+    """Yield changes of the state that a sensor reports of its solution or its body, see STATES."""
     if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
         return
     for column, component in enumerate(stream.components):
@@ -235,7 +235,7 @@ def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
 
 
 def _gaps(stream: Stream) -> Times:
-    """Find where a sensor was silent for much longer than usual: (n, 2), from and to."""
+    """Find gaps much longer than a sensor's usual interval: (n, 2), start and end."""
     times = stream.publish_time_ns
     long = np.diff(times) > gap_limit_ns(times)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)

@@ -1,6 +1,6 @@
-"""Draws places on the earth: points by latitude and longitude on a map.
+"""Maps of the earth with points by latitude and longitude.
 
-The map's tiles come from the network; without it the points are still in their places.
+The tiles of the map come from the network; without it, the points are still at their positions.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import Canvas, Colour, escaped, thin
 from fuselog.replay.timeline.drawing.plane import TRAIL_S, trail_of
 
-# Fixes up to these standard deviations in m: an ambiguity that is fixed, one that floats, code alone.
+# Colours of fixes up to these standard deviations in m: ambiguity fixed, ambiguity float, code only.
 QUALITIES: tuple[tuple[float, Colour], ...] = (
     (0.05, (180, 255, 120)),
     (0.5, (130, 190, 85)),
@@ -23,21 +23,21 @@ QUALITIES: tuple[tuple[float, Colour], ...] = (
 )
 POOR: Colour = (120, 95, 60)
 SHOWN_SHARE = 0.9
-# So many times the shown extent beyond it is far off.
+# Positions are far off beyond this multiple of the displayed extent.
 FAR = 10.0
-# How wide the map is drawn, about, and its tiles.
+# Approximate width of the map and width of its tiles.
 MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
 
 
 def degrees_of(stream: Stream) -> Floats:
-    """Return latitude and longitude (n, 2) of geodetic fixes."""
+    """Return latitude and longitude (n, 2) in deg of geodetic fixes."""
     return np.stack([stream["latitude_deg"], stream["longitude_deg"]], axis=1)
 
 
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
-    """Draw geodetic fixes as points, and the way past them as a thin line; none that are far off.
+    """Draw geodetic fixes as points connected by a thin line; positions that are far off are left out.
 
-    Points have the colour of the deviation that fixes state, else the one that is given.
+    Points are coloured by the standard deviation that fixes state, otherwise with `colour`.
     """
     degrees = degrees_of(stream)
     rows = np.flatnonzero(are_near(degrees))
@@ -51,45 +51,45 @@ def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> N
 
 
 def draw_way(canvas: Canvas, entity: str, degrees: Floats, colour: Colour) -> None:
-    """Draw a whole way as a thin line.
+    """Draw a whole path as a thin line.
 
     Args:
-        canvas, entity: what is drawn on, and where.
-        degrees: latitude and longitude of the places that it passes, (n, 2).
-        colour: of the line.
+        canvas, entity: the canvas, and the path of the entity.
+        degrees: latitude and longitude of the path in deg, (n, 2).
+        colour: colour of the line.
     """
     way = rr.GeoLineStrings(lat_lon=[degrees], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0))
     canvas.fix(entity, way)
 
 
 def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
-    """Return colours (n, 3) of fixes, by their mean standard deviation.
+    """Return colours (n, 3) of fixes by their mean standard deviation.
 
     Args:
-        covariance_m2: (n, d * d), row-major; d is 0 where fixes come without.
-        unknown: the colour where it is NaN.
+        covariance_m2: (n, d * d), row-major; d is 0 if fixes have none.
+        unknown: colour if it is NaN.
     """
     size = round(covariance_m2.shape[1] ** 0.5)
     sigma_m = np.full(len(covariance_m2), np.nan)
-    if size:  # fixes may come without
+    if size:  # fixes may have no covariance
         sigma_m = np.sqrt(covariance_m2[:, :: size + 1].mean(axis=1))
     limits = [limit for limit, _ in QUALITIES]
     colours = np.array([*(colour for _, colour in QUALITIES), POOR, unknown], np.uint8)
-    # what is not known comes after all numbers
+    # NaN sorts after all numbers
     return colours[np.searchsorted([*limits, np.inf], sigma_m)]
 
 
 def map_view(
     canvas: Canvas, root: str, degrees: Floats, paths: Sequence[str] = (), trail_s: float = TRAIL_S
 ) -> rrb.MapView:
-    """Return a map that shows at least the places that are not far off.
+    """Make a map that shows at least the positions that are not far off.
 
     Args:
-        canvas: what is drawn on.
-        root: of what is shown.
-        degrees: latitude and longitude of places, (n, 2).
-        paths: entities of which it shows what lies up to `trail_s` before the cursor.
-        trail_s: see there.
+        canvas: the canvas.
+        root: entity that is shown.
+        degrees: latitude and longitude of positions in deg, (n, 2).
+        paths: entities that are shown up to `trail_s` before the cursor.
+        trail_s: length of these trails in s.
     """
     near = are_near(degrees)
     left_out = "" if near.all() else f", {(~near).sum()} far off left out"
@@ -103,20 +103,20 @@ def map_view(
 
 
 def usual(places: Floats) -> Floats:
-    """Return the corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
+    """Compute corners (2, d) that contain most positions, so that outliers do not shrink the picture."""
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     return np.nanquantile(places, [tail, 1.0 - tail], axis=0)
 
 
 def are_near(places: Floats) -> NDArray[np.bool_]:
-    """Return which places are not far off: the map's view centres on all that it has."""
+    """Find the positions that are not far off; the map's view centres on everything in it."""
     low, high = usual(places)
     margin = FAR * (high - low).max()
     return ((places >= low - margin) & (places <= high + margin)).all(axis=1)
 
 
 def _zoom(degrees: Floats) -> float:
-    """Find the zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
+    """Compute the zoom at which all positions fill the map; at zoom z the world is 2^z tiles wide."""
     low, high = degrees.min(axis=0), degrees.max(axis=0)
     latitude = np.radians(0.5 * (low[0] + high[0]))
     width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)

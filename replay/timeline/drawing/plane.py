@@ -1,8 +1,8 @@
-"""Draws a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
+"""Scenes in the plane: paths, poses, covariance ellipses, numbered points, lines of sight.
 
-What is sent are the true coordinates. Rerun's 2-D views have y pointing down, so everything below `map`
-hangs on one transform that turns it up. What moves sits at its time and vanishes when it is no longer
-current; a path is a segment per row, of which the view shows the last minute.
+True coordinates are sent. In Rerun's 2D views y points down, so everything below `map` has a transform
+that makes it point up. Moving objects are logged at their time and disappear when they are no longer
+current; a path has one segment per row, and the view shows the last minute of it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,28 +36,28 @@ ROOT = "map"
 GRID: Colour = (45, 45, 45)
 TRAIL_S = 60.0
 ELLIPSE_VERTICES = 24
-# The lines of a look stay for so many of the usual intervals between looks.
+# The lines of a scan stay for this multiple of the usual interval between scans.
 SHOWN_INTERVALS = 1.5
-# Of clouds of particles so many are drawn, those of whole stamps; the area of each is its weight.
+# The most particles drawn, always all those of a stamp; the area of each is proportional to its weight.
 CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
-# What is left free beside the places, as a share of their side, or of so much of the longer one.
+# Margin as a fraction of a side, and the shortest side that counts as a fraction of the longer one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
 LEGEND = "Legend"
-# A legend's row: its characters, those between names, its height in them, and that by the board's.
+# A legend's row: its width and the gap between names in characters, its height in them and in the board.
 LEGEND_CHARACTERS, LEGEND_GAP, LEGEND_ROW, LEGEND_SHARE = 100.0, 5.0, 6.0, 0.07
-# Points closer than this share of the map's extent share one label.
+# Points closer than this fraction of the map's extent share one label.
 LABEL_SHARE = 0.04
 
 
 class Stroke(NamedTuple):
-    """Describes how a line looks: colour, and radius in pixels. Wide ones lie below narrow ones."""
+    """Style of a line: colour, and radius in pixels. Wide lines are drawn below narrow ones."""
 
     colour: Colour
     radius_px: float = 1.0
 
     def fields(self, widen: float = 1.0) -> dict[str, Any]:
-        """Return the fields of Rerun's archetypes."""
+        """Return the fields of Rerun's archetypes, with the radius multiplied by `widen`."""
         radius_px = self.radius_px * widen
         radii = rr.Radius.ui_points(radius_px)
         return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - radius_px}
@@ -67,24 +67,24 @@ TRUE = Stroke(TRUTH, 3.0)
 
 
 def stroke_of(scene: Scene, estimator: str) -> Stroke:
-    """Return how lines of an estimator look, so that one on another shows both."""
+    """Return the style of an estimator's lines; widths differ so that overlapping lines are visible."""
     return Stroke(scene.colour(estimator), 0.25 + 0.75 * scene.width(estimator) / WIDTH)
 
 
 def turn_up(canvas: Canvas, root: str = ROOT) -> None:
-    """Let y point up below an entity."""
+    """Make y point up below an entity."""
     canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
 
 
 def draw_points(
     canvas: Canvas, entity: str, numbers: NDArray[np.int64 | np.str_], places: Floats
 ) -> None:
-    """Draw fixed points with their numbers or names; close ones share a label, below the lowest.
+    """Draw fixed points with their numbers or names; close ones share a label below the lowest.
 
-    A point that single precision, which viewers draw in, puts at infinity is nowhere to be drawn.
+    Viewers draw in single precision; a point that is infinite in it is left out.
 
     Args:
-        canvas, entity: what is drawn on, and where.
+        canvas, entity: the canvas, and the path of the entity.
         numbers, places: (n,), and (n, 2) in m.
     """
     is_somewhere = (np.abs(places) <= np.finfo(np.float32).max).all(axis=1)
@@ -102,14 +102,14 @@ def draw_points(
 
 
 def neighbours(places: Floats, extent_m: float) -> list[list[int]]:
-    """Group points whose labels would overlap: a point joins a group that it is all close to.
+    """Group points whose labels would overlap: all points of a group are close to each other.
 
     Args:
         places: (n, 2), in m.
-        extent_m: what the view shows.
+        extent_m: extent of the view in m.
 
     Returns:
-        the rows of each group.
+        The rows of each group.
     """
     farthest = LABEL_SHARE * extent_m
     groups: list[list[int]] = []
@@ -127,10 +127,10 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     """Draw a point at each time, such as a measurement.
 
     Args:
-        canvas, entity: what is drawn on, and where.
+        canvas, entity: the canvas, and the path of the entity.
         time_ns: (n,).
         places: (n, 2), in m.
-        stroke: its colour and width.
+        stroke: colour and width of the points.
     """
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
@@ -139,11 +139,11 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_scans(
     canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """Draw all points of a stamp together, until those of the next.
+    """Draw all points of a stamp together, until the next stamp.
 
     Args:
         canvas, entity, time_ns, places: as for `draw_dots`, in order of time.
-        colour, radius_px: of the points.
+        colour, radius_px: colour and radius of the points.
     """
     times, sizes = np.unique(time_ns, return_counts=True)
     columns = rr.Points2D.columns(positions=places)
@@ -153,14 +153,14 @@ def draw_scans(
 
 
 class Cloud(NamedTuple):
-    """Holds the particles of an estimator that are drawn.
+    """Drawn particles of an estimator.
 
     Attributes:
-        estimator: whose they are.
-        stamps: (s,) their times.
-        row: (n,) the number of each particle's stamp, in order.
+        estimator: label of the estimator.
+        stamps: (s,) times.
+        row: (n,) index of each particle's stamp, in order.
         places: (n, 2).
-        weights: (n,) one on average over the particles of a stamp.
+        weights: (n,) with a mean of one over the particles of a stamp.
     """
 
     estimator: str
@@ -171,7 +171,7 @@ class Cloud(NamedTuple):
 
 
 def clouds_of(scene: Scene, case: str) -> Iterator[Cloud]:
-    """Yield the particles of all estimators that say where they are."""
+    """Yield the particles of all estimators whose particles have positions."""
     for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
         if not set(PLANE) <= set(stream.components):
             continue
@@ -192,7 +192,7 @@ def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
 
 
 def draw_cloud(canvas: Canvas, entity: str, cloud: Cloud, colour: Colour) -> None:
-    """Draw all particles of a stamp until those of the next."""
+    """Draw all particles of a stamp until the next stamp."""
     points = rr.Points2D.columns(
         positions=cloud.places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(cloud.weights)
     )
@@ -213,8 +213,9 @@ def draw_polygons(
 
     Args:
         canvas, entity, time_ns, stroke: as for `draw_dots`.
-        sizes: (n,), how many there are at each time; none is an empty set, not a gap.
-        polygons: those of all times one after another, (vertices, 2) in m, each without its end.
+        sizes: (n,), number of polygons at each time; zero is an empty set, not a gap.
+        polygons: polygons of all times one after another, (vertices, 2) in m, each without its closing
+            vertex.
     """
     rows = thin(time_ns)
     first = np.cumsum(sizes) - sizes
@@ -227,7 +228,7 @@ def draw_polygons(
 
 
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
-    """Draw the way of a point: each row the segment from the place before.
+    """Draw the path of a point: each row is the segment from the position before.
 
     Args:
         canvas, entity, time_ns, places, stroke: as for `draw_dots`.
@@ -238,11 +239,11 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 
 
 def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
-    """Draw the whole true way of a point, faintly: it is there before the path gets to it.
+    """Draw the whole true path of a point, faintly, also ahead of the cursor.
 
     Args:
-        canvas, entity: what is drawn on, and where.
-        places: (n, 2), in m; what is not known is NaN.
+        canvas, entity: the canvas, and the path of the entity.
+        places: (n, 2), in m; unknown ones are NaN.
     """
     known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
     style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)], "draw_order": 0.0}
@@ -257,7 +258,7 @@ def draw_poses(
     Args:
         canvas, entity, time_ns, stroke: as for `draw_dots`.
         poses: (n, 3), x, y in m, heading in rad.
-        length_m: of the arrows.
+        length_m: length of the arrows in m.
     """
     times, sizes = _until_stale(canvas, time_ns, np.ones_like(time_ns), gap_limit_ns(time_ns))
     vectors = length_m * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
@@ -279,11 +280,11 @@ def draw_ellipses(
 
 
 def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats, stroke: Stroke) -> None:
-    """Draw the outline of a thing at each time, closed or not.
+    """Draw the outline of an object at each time, closed or not.
 
     Args:
         canvas, entity, time_ns, stroke: as for `draw_dots`.
-        outlines: (n, vertices, 2), in m, left out where NaN.
+        outlines: (n, vertices, 2), in m; those with NaN are left out.
     """
     good = np.isfinite(outlines).all(axis=(1, 2))
     times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
@@ -293,16 +294,18 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
 
 
 def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
-    """Return closed outlines (n, vertices + 1, 2) of Gaussians, NaN where one is not positive definite.
+    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if not positive definite.
 
     Args:
         means, covariances: (n, 2), (n, 2, 2).
-        probability: with which they hold the Gaussians.
+        probability: probability of the Gaussian inside the outline.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, ELLIPSE_VERTICES + 1)
     circle = np.sqrt(chi2.ppf(probability, 2)) * np.stack([np.cos(angle), np.sin(angle)])
     root = np.zeros_like(covariances)
-    with np.errstate(invalid="ignore", divide="ignore"):  # Cholesky that does not raise for all
+    with np.errstate(
+        invalid="ignore", divide="ignore"
+    ):  # a Cholesky factorisation that does not raise if one matrix fails
         root[:, 0, 0] = np.sqrt(covariances[:, 0, 0])
         root[:, 1, 0] = covariances[:, 1, 0] / root[:, 0, 0]
         root[:, 1, 1] = np.sqrt(covariances[:, 1, 1] - root[:, 1, 0] ** 2)
@@ -318,16 +321,16 @@ def draw_lines(
     radius_px: float = 0.75,
     interval_ns: float | None = None,
 ) -> None:
-    """Draw the lines of one time, a look, together.
+    """Draw the lines of one time, a scan, together.
 
-    They make way for the next look, and vanish where that comes later than usual.
+    They are replaced by the next scan, and disappear if that comes later than usual.
 
     Args:
-        canvas, entity: what is drawn on, and where.
+        canvas, entity: the canvas, and the path of the entity.
         time_ns: (n,), sorted.
         lines, colours: (n, points, 2) in m, (n, 4).
-        radius_px: half of the lines' width in pixels; wide ones lie below narrow ones.
-        interval_ns: the usual time between looks; by default the median.
+        radius_px: half of the lines' width in pixels; wide lines are drawn below narrow ones.
+        interval_ns: usual time between scans; by default the median.
     """
     looks = np.unique(time_ns)
     looks = looks[thin(looks)]
@@ -347,7 +350,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Return rows of so many things each, and an empty one where none comes for `shown_ns`."""
+    """Return times and numbers of objects; the number becomes zero `shown_ns` after the last ones."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])
@@ -365,15 +368,15 @@ def plane_view(
     *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
-    """Return a view, on a grid, that shows at least some places.
+    """Make a view with a grid that shows at least some positions.
 
     Args:
-        canvas: what is drawn on.
-        root, others: of what is shown.
-        paths: entities of which it shows what lies up to `trail_s` before the cursor.
+        canvas: the canvas.
+        root, others: entities that are shown.
+        paths: entities that are shown up to `trail_s` before the cursor.
         places: (n, 2), in m.
-        trail_s: see there.
-        name: of the view.
+        trail_s: length of these trails in s.
+        name: name of the view.
     """
     extent = extent_of(places)
     low, high = bounds_of(places)
@@ -391,7 +394,7 @@ def plane_view(
 
 
 def bounds_of(places: Floats) -> tuple[Floats, Floats]:
-    """Return the lower left and the upper right corner (2,) of a view of places (n, 2), NaN left out."""
+    """Compute the lower left and upper right corner (2,) of a view of positions (n, 2), ignoring NaN."""
     known = places[np.isfinite(places).all(axis=1)]
     low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else (np.zeros(2), np.zeros(2))
     margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent_of(known))
@@ -399,13 +402,13 @@ def bounds_of(places: Floats) -> tuple[Floats, Floats]:
 
 
 def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board: Board) -> Board:
-    """Return a board below what its colours stand for: a row of dots with their names.
+    """Return a board with a legend above it: a row of coloured dots with names.
 
     Args:
-        canvas: what is drawn on.
-        name: tells this legend from others of the layout.
-        colours: by name; none leaves the board alone.
-        board: a scene, or several of the same colours.
+        canvas: the canvas.
+        name: name of the legend, unique in the layout.
+        colours: colours by name; without any, the board is returned unchanged.
+        board: a scene, or several with the same colours.
     """
     if not colours:
         return board
@@ -432,7 +435,7 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
-    """Return what lies up to so long before the cursor, on every timeline."""
+    """Return the time range that ends at the cursor and is `trail_s` long, on every timeline."""
     steps = round(trail_s * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
     cursor = rrb.TimeRangeBoundary.cursor_relative
     begin = cursor(seconds=-trail_s)
@@ -446,13 +449,13 @@ def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
 
 
 def extent_of(places: Floats) -> float:
-    """Return the larger side of the box around places (n, 2), NaN left out; one if it has no extent."""
+    """Compute the longer side of the box around positions (n, 2), ignoring NaN; one if it is zero."""
     known = places[np.isfinite(places).all(axis=1)]
     return float(np.ptp(known, axis=0).max()) or 1.0 if len(known) else 1.0
 
 
 def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: float) -> None:
-    """Draw lines at the multiples of the step in x and in y."""
+    """Draw lines at the multiples of the step in x and y."""
     lines = []
     for axis in range(2):
         at = step_m * np.arange(np.ceil(low[axis] / step_m), np.floor(high[axis] / step_m) + 1)

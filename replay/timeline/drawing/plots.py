@@ -1,4 +1,4 @@
-"""Plots what every family uses: components, errors with bands, NEES and NIS with bounds.
+"""Plots for every family: components, errors with bands, NEES and NIS with bounds.
 
 Every function sends its columns and returns the views that show them. A band is Rerun's `Measurements`,
 which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.
@@ -41,15 +41,15 @@ from fuselog.replay.timeline.drawing.close_up import draw_close_up
 SIGMAS = 2.0
 _AXES = ("w", "x", "y", "z", "vx", "vy", "vz", "yaw", "pitch", "roll")
 _TITLES = {"NEES": "NEES of this run,", "NIS": "NIS of"}
-# So many plots are seen one below another at most, and so many of them in one tab.
+# The most plots one below another, and the most of them in one tab.
 MOST_STRIPS, TAB_STRIPS = 6, 4
-# What a legend takes of a plot's height: for itself, for each entry, and at most.
+# Fraction of a plot's height that a legend takes: for itself, for each entry, and at most.
 LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
-# The same in the low panels of NEES and NIS.
+# The same in the smaller panels of NEES and NIS.
 SMALL_ENTRY, SMALL_MOST = 0.15, 0.7
-# An error plot names the estimators of which more than this share of the errors is outside.
+# An error plot names the estimators with more than this fraction of errors outside its range.
 SILENT_SHARE = 0.01
-# Where plots of shares and probabilities end, below their legends.
+# Upper end of plots of shares and probabilities, which leaves room for their legends.
 SHARES = 1.5
 WHOLE_RUN = rrb.TimeAxis(
     view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
@@ -58,12 +58,12 @@ Style = Callable[..., rr.AsComponents]
 
 
 def line(width: float) -> Style:
-    """Return a curve's look as a line so wide, in pixels."""
+    """Return the style of a curve as a line of a width in pixels."""
     return partial(rr.SeriesLines, widths=[width])
 
 
 def dots(size: float) -> Style:
-    """Return a curve's look as points so large, in pixels."""
+    """Return the style of a curve as points of a size in pixels."""
     return partial(rr.SeriesPoints, marker_sizes=[size])
 
 
@@ -71,9 +71,9 @@ LINE, POINTS, SINGLE = line(WIDTH), dots(WIDTH), dots(5.0)
 
 
 class Squares(NamedTuple):
-    """Holds chi-square values of an estimator, degrees of freedom; `of` is what they are of.
+    """Chi-square values of an estimator with their degrees of freedom; `of` names the components.
 
-    It is empty where the degrees tell.
+    `of` is empty if the number of degrees is enough.
     """
 
     degrees: int
@@ -84,11 +84,12 @@ class Squares(NamedTuple):
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True) -> list[Board]:
-    """Draw NEES, errors, NIS and effective particles of a case, at most `MOST_STRIPS` at once.
+    """Draw NEES, errors, NIS and effective particles of a case, at most `MOST_STRIPS` at a time.
 
-    If there are more, errors are in tabs by quantity, and the others too if they are still too many.
-    Single estimates in the plane are seen close up first, since their plots over time are dots.
-    There are no plots without anything to judge. `legend` is False if a scene names the colours.
+    If there are more, errors are in tabs by quantity, and so are the others if they are still too many.
+    Single estimates in the plane are shown close up first, because their plots over time are single
+    points. Without errors or innovations there are no plots. `legend` is False if a scene names the
+    colours.
     """
     errors = draw_errors(canvas, scene, case)
     nees = draw_nees(canvas, scene, case, legend=legend)
@@ -109,14 +110,14 @@ def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 
 
 def in_strips(views: Mapping[str, rrb.View], name: str) -> rrb.Container:
-    """Return views of components one below another; in tabs by quantity if they are too many."""
+    """Return views of components one below another, or in tabs by quantity if they are too many."""
     if len(views) <= MOST_STRIPS:
         return rrb.Vertical(*views.values(), name=name)
     return _tabs(_by_quantity(views), TAB_STRIPS, name)
 
 
 def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None = None) -> rrb.Tabs:
-    """Return a tab of at most so many strips for each group, several for a larger one."""
+    """Return one tab for each group, or several if the group has more than `most` strips."""
     return rrb.Tabs(
         *(
             rrb.Vertical(*views[first : first + most], name=title)
@@ -128,7 +129,7 @@ def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None 
 
 
 def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
-    """Group views by component: the axes of a vector together, single numbers up to a tab's strips."""
+    """Group views by component: the axes of a vector together, single numbers up to a tab's size."""
     groups: dict[str, list[rrb.View]] = {}
     for component, view in views.items():
         groups.setdefault(_vector_of(component), []).append(view)
@@ -145,7 +146,7 @@ def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
 
 
 def _vector_of(component: str) -> str:
-    """Name the quantity that a component is an axis of: position, half size, gyro bias."""
+    """Return the quantity of which a component is an axis: position, half size, gyro bias."""
     quantity, unit, _ = shown_unit(component)
     words = quantity.split()
     kept = [word for word in words if word not in _AXES]
@@ -157,7 +158,7 @@ def _vector_of(component: str) -> str:
 
 
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:
-    """Draw a plot for each component of a case: each estimator's error inside its band of +-2 sigma."""
+    """Draw a plot for each component of a case: each estimator's error in its band of +-2 sigma."""
     found = scene.errors_of(case)
     components = dict.fromkeys(name for errors in found for name in errors.components)
     return {
@@ -194,7 +195,7 @@ def _draw_error(
             names=names, colors=[colour, (*colour, 150)], widths=[scene.width(errors.estimator), 0.0]
         )
         canvas.fix(entity, style)
-    # the most accurate of the estimators that NEES does not refute sets the range, else of all
+    # the most accurate estimator with a credible NEES sets the range, or else the most accurate of all
     credible = list(compress(extents, judged)) or extents
     extent = nice(1.2 * max(min(credible), np.finfo(float).tiny))
     for errors in found:
@@ -207,7 +208,7 @@ def _draw_error(
 
 
 def _is_credible(errors: Errors) -> bool:
-    """Tell whether at least half of the NEES of a run are below what bounds 95 % of consistent ones."""
+    """Test whether the median NEES of a run is below the 95 % bound of consistent estimators."""
     high = chi_square_interval(len(errors.components), 1)[1]
     known = errors.nees[np.isfinite(errors.nees)]
     return bool(len(known)) and float(np.median(known)) <= high
@@ -229,7 +230,7 @@ def _draw_point(
 def draw_nees(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> list[rrb.TimeSeriesView]:
-    """Draw each estimator's NEES with the bounds of a single run; one plot per number of components."""
+    """Draw each estimator's NEES with the bounds of a single run, in a plot per number of components."""
     found = [
         Squares(len(errors.components), "", errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
@@ -241,7 +242,7 @@ def draw_nees(
 def draw_nis(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> list[rrb.TimeSeriesView]:
-    """Draw each estimator's NIS, a point per measurement; one plot per set of measured components."""
+    """Draw each estimator's NIS as points, in a plot per set of measured components."""
     found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         innovations = innovations_of(gather([stream]))
@@ -267,10 +268,11 @@ def _draw_squares(
     scatter: bool = False,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
-    """Draw chi-square values of one run, lines or a scatter, and the band of 95 % of consistent ones.
+    """Draw chi-square values of one run, as lines or points, and the 95 % band of consistent estimators.
 
-    Those above the panel are marks at its upper edge, and its title counts them. It ends above the band;
-    where most values of every estimator are above that, the best one's set its range.
+    Values above the panel are marked at its upper edge and counted in its title. The panel ends above
+    the band, or, if most values of every estimator are above the band, above those of the best
+    estimator.
     """
     views = []
     for degrees, of in sorted({(each.degrees, each.of) for each in found}):
@@ -305,7 +307,7 @@ def _draw_squares(
 
 
 def _end_of(high: float, values: Sequence[Floats]) -> float:
-    """Find where a panel of chi-square values ends whose band, below the legend, ends at `high`."""
+    """Compute the upper end of a panel of chi-square values whose band ends at `high`."""
     room = min(LEGEND_MARGIN + SMALL_ENTRY * (1 + len(values)), SMALL_MOST)
     medians = [np.median(each[np.isfinite(each)]) for each in values if np.isfinite(each).any()]
     if not medians or min(medians) <= high:
@@ -317,7 +319,7 @@ def _end_of(high: float, values: Sequence[Floats]) -> float:
 def _mark_above(
     canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, end: float
 ) -> None:
-    """Mark at the edge of a panel that ends there when values are above it."""
+    """Mark, at the upper edge of a panel, the times of values above it."""
     rows = thin(time_ns)
     edge = rr.Scalars.columns(scalars=np.full(len(rows), 0.98 * end))
     canvas.send(f"{plot}/{name} above", time_ns[rows], edge)
@@ -326,7 +328,7 @@ def _mark_above(
 
 
 def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw the probabilities of all modes, a plot for each estimator and for those given all data."""
+    """Draw the probabilities of all modes, in a plot for each estimator; smoothed ones separately."""
     views = []
     for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
         name = stream.topic.rpartition("/")[2]
@@ -340,7 +342,7 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
 
 
 def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw what share of each filter's particles is effective."""
+    """Draw the effective share of each filter's particles."""
     plot, found = entity_path("plots", case, "effective"), False
     for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
         share, found = stream["effective"] / stream["particles"], True
@@ -352,7 +354,7 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
 def draw_components(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> dict[str, rrb.TimeSeriesView]:
-    """Draw one plot per component of a case's Gaussian estimates: estimators' means, and the truth."""
+    """Draw one plot per component of a case's Gaussian estimates: the estimators' means and truth."""
     found = [("truth", TRUTH, LINE, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         style = line(scene.width(estimator))
@@ -373,7 +375,7 @@ def draw_components(
 
 
 def below_legend(curves: Sequence[Floats]) -> tuple[float, float] | None:
-    """Find a plot's range that leaves room for its legend above all curves; None where they are NaN."""
+    """Compute a range of a plot with room for its legend above all curves; None if all are NaN."""
     values = np.concatenate([np.ravel(each) for each in curves] or [np.empty(0)])
     values = values[np.isfinite(values)]
     if not len(values):
@@ -397,11 +399,11 @@ def draw_curve(
     """Draw one curve of a plot.
 
     Args:
-        canvas: what is drawn on.
-        plot, name, colour: of the curve.
+        canvas: the canvas.
+        plot, name, colour: the entity of the plot, and name and colour of the curve.
         time_ns, values: (n,), in order of time.
-        style: as a line or as points; a single value is a point.
-        most: at most so many values, peaks kept.
+        style: style as a line or as points; a single value is a point.
+        most: largest number of values; peaks are kept.
     """
     rows = thin_curve(time_ns, values, most)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
@@ -418,9 +420,9 @@ def plot_view(
     legend: bool = True,
     zoom_lock: bool = True,
 ) -> rrb.TimeSeriesView:
-    """Plot everything below an entity, over the whole run, under its quantity and unit, and a note.
+    """Plot everything below an entity over the whole run, titled with quantity, unit and note.
 
-    A stated range stays by default.
+    A given range is locked by default.
     """
     return rrb.TimeSeriesView(
         origin=escaped(entity),
@@ -432,9 +434,9 @@ def plot_view(
 
 
 def shown_unit(component: str) -> tuple[str, str, float]:
-    """Return quantity, the unit to show it in, and the factor to that unit: angles are in degrees.
+    """Return quantity, displayed unit, and the factor to that unit; angles are displayed in degrees.
 
-    A name that does not end in a unit, as `pressure_a`, is all quantity.
+    A name that does not end in a unit, such as `pressure_a`, is a quantity without a unit.
     """
     quantity, own = parted(component)
     if own in ("rad", "rad/s"):

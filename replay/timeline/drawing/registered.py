@@ -1,4 +1,4 @@
-"""Draws messages of schemas for which a family has registered a drawing, in the scenes of others."""
+"""Drawings that families register for schemas, for use in the scenes of other families."""
 
 from collections.abc import Callable, Iterable
 
@@ -10,7 +10,7 @@ Draw = Callable[[Canvas, Scene, str], list[Board]]
 
 
 def draw_registered(canvas: Canvas, scene: Scene, case: str, streams: Iterable[Stream]) -> list[Board]:
-    """Draw what entry points `fuselog.drawings` draw of a case, and return their boards.
+    """Draw a case with the registered `fuselog.drawings` entry points, and return their boards.
 
     The name of such an entry point is that of a schema. It is loaded if one of `streams` has the schema.
     """

@@ -1,4 +1,4 @@
-"""Draws orientations in space as triads about one origin."""
+"""Orientations in space, drawn as triads around one origin."""
 
 from collections.abc import Sequence
 
@@ -19,14 +19,14 @@ def draw_triads(
     length: float,
     radius: float,
 ) -> None:
-    """Draw the axes x, y and z, turned, at each time.
+    """Draw the rotated axes x, y and z at each time.
 
     Args:
-        canvas, entity: what is drawn on, and where.
+        canvas, entity: the canvas, and the path of the entity.
         time_ns: (n,).
         quaternions: (n, 4), w first.
-        colours: of x, y and z.
-        length, radius: of the axes, in the unit of the scene.
+        colours: colours of x, y and z.
+        length, radius: length and radius of the axes, in the unit of the scene.
     """
     turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
     canvas.send(entity, time_ns, turned)
@@ -38,7 +38,7 @@ def draw_triads(
 
 
 def space_view(root: str, name: str) -> rrb.Spatial3DView:
-    """Return a view of triads about one origin, x towards the eye."""
+    """Return a view of triads around one origin, with x towards the eye."""
     return rrb.Spatial3DView(
         origin=escaped(root),
         name=name,

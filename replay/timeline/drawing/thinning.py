@@ -1,4 +1,4 @@
-"""Thins a long run for its timeline: whole while it is short, then evenly in time."""
+"""Thinning of a long run for its timeline: short runs are complete, longer ones even in time."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ from fuselog.replay.judging.errors.evaluation import PER_ROW, Errors, Floats, er
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 
 Times = NDArray[np.int64]
-# So many messages of a topic are kept; what is drawn of them is less, see `canvas.DRAWN_ROWS`.
+# Number of messages kept of a topic; fewer are drawn, see `canvas.DRAWN_ROWS`.
 KEPT_ROWS = 50_000
-# An error has a covariance with it, and is drawn as a curve alone.
+# The same for errors, which have covariances and are only drawn as curves.
 KEPT_ERRORS = 20_000
-# Of these, a message says nothing without the others.
+# Schemas whose messages are meaningless without the others, so that all are kept.
 WHOLE = frozenset(
     schema.full_name
     for schema in (
@@ -33,20 +33,21 @@ WHOLE = frozenset(
         schemas.OUTAGE,
     )
 )
-# A vector of more entries is no bundle of curves.
+# A vector with more entries is not drawn as curves.
 WIDE = 12
 BLOCK_MESSAGES = 1 << 17
-# A cell of 2^62 ns is all time.
+# A cell of 2^62 ns contains all times.
 LAST_SHIFT = 62
 Rows = TypeVar("Rows", Stream, Errors)
 
 
 class Thinned(Generic[Rows]):
-    """Keeps rows of a stream as they come, about `limit` after a while and at most twice as many.
+    """Rows of a stream, thinned as they come to about `limit` and at most twice as many.
 
-    Time is cut into cells of a power of two of nanoseconds. Of each, what is kept are the rows of the
-    last stamp, and of those where one of the curves has its least and its greatest value there, so that
-    peaks stay. Cells lie in wider cells, so the blocks that the rows came in do not matter for that.
+    Time is divided into cells of a power of two of nanoseconds. In each cell, the rows of the last
+    stamp are kept, and those at which one of the curves has its minimum or maximum, so that peaks
+    remain. Cells are nested in wider cells, so the result does not depend on the blocks in which the
+    rows come.
     """
 
     def __init__(
@@ -67,13 +68,13 @@ class Thinned(Generic[Rows]):
         self._shift = 0
 
     def add(self, rows: Rows) -> None:
-        """Take in the next rows, sorted by time."""
+        """Add the next rows, sorted by time."""
         if self._shift:
             rows = self._take(rows, self._stays(rows) | self._is_first(rows))
         count = len(self._time_ns(rows))
         if count == 0 and self._parts:
             return
-        if self._count == 0:  # vectors of nothing have no width
+        if self._count == 0:  # vectors without messages have no width
             self._parts = []
         self._parts.append(rows)
         self._count += count
@@ -82,23 +83,23 @@ class Thinned(Generic[Rows]):
 
     @property
     def rows(self) -> Rows:
-        """Return what is kept."""
+        """Return the kept rows."""
         if len(self._parts) > 1:
             self._thin()
         return self._parts[0]
 
     @property
     def is_whole(self) -> bool:
-        """Tell whether all rows are kept so far."""
+        """Test whether all rows have been kept so far."""
         return self._shift == 0
 
     def _coarsen(self, most: int) -> None:
-        """Widen the cells until so many rows are left at most."""
+        """Widen the cells until at most this number of rows is left."""
         self._thin()
         while self._count > most and self._shift < LAST_SHIFT:
             self._shift += 1
             cells = self._time_ns(self._parts[0]) >> self._shift
-            if np.count_nonzero(np.diff(cells)) < most:  # of each cell a row is left at least
+            if np.count_nonzero(np.diff(cells)) < most:  # at least one row per cell is kept
                 self._thin()
 
     def _thin(self) -> None:
@@ -109,7 +110,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Tell which rows are kept of their cells; of the widest, all time, the last stamp's are."""
+        """Find the rows that are kept in their cells; in the widest cell, those of the last stamp."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
@@ -121,13 +122,13 @@ class Thinned(Generic[Rows]):
         return stays[stamp]
 
     def _is_first(self, rows: Rows) -> NDArray[np.bool_]:
-        """Tell which rows have the first stamp: others of it may have come in the block before."""
+        """Find the rows of the first stamp, which the block before may share."""
         time_ns = self._time_ns(rows)
         return time_ns == time_ns[:1]
 
 
 def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
-    """Thin the messages of a topic; of some schemas, they are all kept."""
+    """Make a thinned stream for the messages of a topic; some schemas are kept completely."""
     return Thinned(
         None if schema_name in WHOLE else limit,
         lambda stream: stream.publish_time_ns,
@@ -138,7 +139,7 @@ def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
 
 
 def thinned_errors(limit: int) -> Thinned[Errors]:
-    """Thin the errors of one run."""
+    """Make thinned rows for the errors of one run."""
     return Thinned(
         limit,
         lambda errors: errors.time_ns,
@@ -149,7 +150,7 @@ def thinned_errors(limit: int) -> Thinned[Errors]:
 
 
 def curves_of(stream: Stream) -> Iterator[tuple[Field, Floats]]:
-    """Yield the fields that are curves over time, as (curves, n): no covariances, nothing wide."""
+    """Yield the fields that are curves over time, as (curves, n): no covariances, no long vectors."""
     for entry in stream.schema:
         if entry.kind in ("real", "vector") and not entry.name.startswith("covariance"):
             values = stream[entry.name].reshape(len(stream), -1 if len(stream) else 0).T
@@ -166,7 +167,7 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 
 
 class Thin:
-    """Thins the outputs of a run and the errors of its estimates; keeps the last stamp of an output."""
+    """Thinned outputs of a run and errors of its estimates, with the last stamp of an output."""
 
     def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
@@ -176,7 +177,7 @@ class Thin:
         self.last_ns = -1
 
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
-        """Take in a block."""
+        """Add a block."""
         for topic, stream in outputs.items():
             if topic not in self._outputs:
                 self._outputs[topic] = thinned_stream(stream.schema.full_name, self._rows)
@@ -192,59 +193,59 @@ class Thin:
 
     @property
     def outputs(self) -> dict[str, Stream]:
-        """Return what is kept, by topic."""
+        """Return the kept outputs by topic."""
         return {topic: kept.rows for topic, kept in self._outputs.items()}
 
     @property
     def whole(self) -> dict[str, Stream]:
-        """Return the outputs of which all is kept."""
+        """Return the outputs that are kept completely."""
         return {topic: kept.rows for topic, kept in self._outputs.items() if kept.is_whole}
 
     @property
     def errors(self) -> list[Errors]:
-        """Return what is kept of the errors."""
+        """Return the kept errors."""
         return [kept.rows for kept in self._errors.values()]
 
 
 @dataclass(frozen=True)
 class Held:
-    """Represents a source of which some topics are held in memory already, thinned or in part."""
+    """Source with some topics already in memory, thinned or in part."""
 
     of: Source
     streams: Mapping[str, Stream]
 
     @property
     def name(self) -> str:
-        """Return the source's."""
+        """Return the name of the source."""
         return self.of.name
 
     @property
     def run(self) -> RunMetadata | None:
-        """Return the source's."""
+        """Return the run metadata of the source."""
         return self.of.run
 
     @property
     def epoch_ns(self) -> int:
-        """Return the source's."""
+        """Return the epoch of the source."""
         return self.of.epoch_ns
 
     @property
     def start_ns(self) -> int | None:
-        """Return the source's."""
+        """Return the start of the source's span."""
         return self.of.start_ns
 
     @property
     def rejections(self) -> Rejections:
-        """Return the source's."""
+        """Return the messages that the source rejected."""
         return self.of.rejections
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Return the source's, held or not."""
+        """Return all topics of the source, in memory or not."""
         return self.of.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return what is held of the topics; of others, all."""
+        """Return the messages in memory of the topics; read the other topics completely."""
         others = self.of.read([topic for topic in topics if topic not in self.streams])
         return {
             topic: self.streams[topic] if topic in self.streams else others[topic] for topic in topics
@@ -257,7 +258,7 @@ class Held:
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield all there is, not only what is held."""
+        """Yield blocks of all messages of the source, not only of those in memory."""
         return self.of.blocks(topics, order, block_messages)
 
     def whole(self) -> "Held":
@@ -266,9 +267,10 @@ class Held:
 
 
 class Sensed:
-    """Reads the sensor streams and truths of a source along with a replay of it.
+    """Sensor streams and truths of a source, read along with a replay of it.
 
-    Maps, and what is said but once, such as where a sensor is mounted, hold for every span of the run.
+    Maps, and topics with a single message, such as the mounting of a sensor, hold for every span of the
+    run.
     """
 
     def __init__(self, source: Source, *, is_live: bool) -> None:
@@ -289,7 +291,7 @@ class Sensed:
         return kept
 
     def read_to(self, time_ns: int) -> Held:
-        """Read what comes up to a stamp, and has not come yet, thinned to what is drawn."""
+        """Read new messages up to a stamp and return them thinned for drawing."""
         self.advance(time_ns)
         streams = {topic: fresh.rows for topic, fresh in self._fresh.items()}
         self._fresh = self._empty(DRAWN_ROWS)
@@ -309,7 +311,7 @@ class Sensed:
         return stated.schema_name == schemas.LANDMARK.full_name or stated.messages == 1
 
     def all(self) -> Held:
-        """Return all of it, thinned."""
+        """Read to the end and return everything, thinned."""
         self.advance(np.iinfo(np.int64).max)
         kept = {topic: kept.rows for topic, kept in self._kept.items()}
         return Held(self.source, {**self._lasting, **kept})
