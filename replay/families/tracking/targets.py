@@ -1,4 +1,4 @@
-"""Chooses a tracker's model of its targets: a registered model with a position, or constant velocity."""
+"""The model of a tracker's targets: a registered model with a position, or constant velocity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """States how targets move that keep their velocity.
+    """Parameters of targets that move at constant velocity.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration, in m^2/s^3.
@@ -44,7 +44,7 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 
 
 def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    """Compute the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
     place, mixed, velocity = noise_moments(parameters.acceleration_density, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
@@ -60,11 +60,11 @@ TARGET = Model(
 
 
 class Targets(NamedTuple):
-    """Describes what targets are taken to be.
+    """Assumptions about the targets.
 
     Attributes:
-        stage: their model, with one motion or all modes.
-        parameters: the model's numbers; NaN where one is not used.
+        stage: their bound model, with one motion or with all modes.
+        parameters: the model's numbers; NaN for a number that is not used.
         newborn: a target of which only the position is known.
     """
 
@@ -74,9 +74,10 @@ class Targets(NamedTuple):
 
 
 def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
-    """Return the targets of a tracker's parameters; what these leave out, the scans' channels state.
+    """Build the targets from a tracker's parameters; the scans' channels state what these leave out.
 
-    Raises BadInput that begins with `where` for a model that cannot be a target's, or lacks a number.
+    Raises BadInput, with a message that begins with `where`, if the model cannot describe a target or if
+    a number is missing.
     """
     name = parameters.model
     if name is None:
@@ -127,7 +128,7 @@ def _check(where: str, model: Model) -> None:
 
 
 def _stage_of(where: str, model: Model, mode: str | None) -> Stage:
-    """Return the model with the motion that is named, or all of its modes."""
+    """Bind the model with the motion of the named mode, or with all of its modes."""
     if mode is not None:
         if not model.modes or mode not in model.modes:
             raise BadInput(f"{where}: no mode '{mode}'; {choices(mode, model.modes or ())}")

@@ -1,4 +1,4 @@
-"""Smooths a tracker's tracks: says at the end what all detections say of every state."""
+"""Smoothing of a tracker's tracks, so that every state uses all detections of its track."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,11 +12,11 @@ from fuselog.replay.families.tracking.targets import Targets
 
 
 def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
-    """Raise BadInput where tracks cannot be smoothed: of several motions, or with errors of sensors.
+    """Raise BadInput if tracks cannot be smoothed: with several motions, or with errors of sensors.
 
     Args:
-        name: the estimator's.
-        targets: how they move.
+        name: name of the estimator.
+        targets: how targets move.
         errors: the names of sensors' errors in the tracks' states.
     """
     if errors:
@@ -32,7 +32,7 @@ def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
 
 
 def smoothed(tracks: Ragged, targets: Targets) -> Ragged:
-    """Return the stream of tracks with smoothed states."""
+    """Smooth the states in a stream of tracks."""
     stream, size = tracks.stream, targets.stage.model.size
     run = run_of_rows(tracks.offsets)
     _, track = np.unique(
