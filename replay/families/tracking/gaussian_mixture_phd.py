@@ -96,7 +96,7 @@ def start(given: Filtering) -> tuple[Filtering, Mixture]:
     most = given.parameters.most_components
     if len(given) > most:
         raise BadInput(
-            f"{len(given)} priors are more than {most} components; give --set most_components=..."
+            f"{len(given)} priors exceed the limit of {most} components; raise --set most_components=..."
         )
     mixture = no_components(given.runs, most)
     for component, prior in enumerate(given):
@@ -187,7 +187,7 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
     Raises BadInput as `by_scan` does, and if positions have fewer than two coordinates.
     """
     if len(detection) and detection["position_m"].shape[1] < 2:
-        raise BadInput(f"topic {detection.stream.topic}: positions in the plane need two coordinates")
+        raise BadInput(f"topic {detection.stream.topic}: positions must have at least two coordinates")
     order, (first, end) = by_scan(scan, detection)
     ordered = read_vectors(detection.stream, "position_m", PLANE)[order]
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
@@ -232,7 +232,7 @@ def _outputs(
 def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
     """Read the settings from the parameters, or from the scans' channel: see `given_or_stated`."""
     if parameters.variance_m2 is not None:
-        notice = "'variance_m2' is called 'sigma_m' now, its root; the old name goes in the next release"
+        notice = "'variance_m2' will be removed in the next release; use 'sigma_m', its square root"
         warnings.warn(f"gm-phd: {notice}", FutureWarning, stacklevel=2)
     elif parameters.sigma_m is not None:
         parameters = parameters.model_copy(update={"variance_m2": parameters.sigma_m**2})

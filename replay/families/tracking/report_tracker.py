@@ -214,7 +214,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: ReportTrackerParamete
 
 
 REPORT_TRACKER = recursive(
-    "tracks of vessels from reports of position, course and speed that do not say whose they are",
+    "tracks of vessels from reports of position, course and speed without identities",
     parameters=ReportTrackerParameters,
     find=_find,
     requirements=".../reports (fuselog.CourseFix)",

@@ -84,8 +84,8 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     if (counts > 1).any():
         twice = int(numbers[counts.argmax()]) & 0xFFFFFFFF
         raise BadInput(
-            f"topic {scan.stream.topic}: two scans have the number {twice}; give each a number of its "
-            "own"
+            f"topic {scan.stream.topic}: two scans have the number {twice}; give each scan its own "
+            "scan_id"
         )
     topic, stated = detection.stream.topic, scan["detections"].astype(np.int64)
     order = np.argsort(keys, kind="stable")
@@ -93,12 +93,12 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     there = bounds[1] - bounds[0]
     wrong = np.flatnonzero(there != stated)
     if len(wrong) or len(keys) != stated.sum():
-        problem = "detections of scans that are missing"
+        problem = "some detections belong to scans that are missing"
         if len(wrong):
             row = wrong[0]
             number = scan["scan_id"][row]
-            problem = f"scan {number} states {stated[row]} detections, and has {there[row]}"
-        raise BadInput(f"topic {topic}: {problem}; record every scan with its count")
+            problem = f"scan {number} states {stated[row]} detections, but has {there[row]}"
+        raise BadInput(f"topic {topic}: {problem}; record every scan with its number of detections")
     return order, bounds
 
 
@@ -126,9 +126,9 @@ def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Float
         last = np.searchsorted(time_ns[order], scans.stream.publish_time_ns[rows], side="right") - 1
         if before is None and (last < 0).any():
             raise BadInput(
-                f"topic {scans.stream.topic}: a scan is before the first message of "
-                f"{fixes.stream.topic}, so that the position of its sensor is unknown; begin later, "
-                "with --start"
+                f"topic {scans.stream.topic}: a scan precedes the first message of "
+                f"{fixes.stream.topic}, so the position of its sensor is unknown; start the replay "
+                "later, with --start"
             )
         found[rows] = place[order][np.maximum(last, 0)]
     return found

@@ -72,12 +72,12 @@ def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
     stage, (mean, covariance, mode) = targets.stage, targets.newborn
     if not is_flat(stage.model.kinds) or any(each.noises for each in stage.modes or (stage.motion,)):
         raise BadInput(
-            f"{where}: errors of sensors need a model without rotations in its state and with additive "
-            "noise; take another"
+            f"{where}: sensor errors require a model with additive noise and without rotations in its "
+            "state; use another model"
         )
     if errors.shared and stage.modes:
         raise BadInput(
-            f"{where}: registration errors need targets of one motion; give mode=..., or "
+            f"{where}: registration errors require targets with one motion; set mode=..., or use "
             "correlated errors"
         )
     size, longer = len(mean), len(mean) + len(errors.names)

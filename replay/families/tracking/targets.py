@@ -50,7 +50,7 @@ def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> C
 
 
 TARGET = Model(
-    "a target in the plane that keeps its velocity",
+    "a target in the plane at constant velocity",
     dict.fromkeys(PLANE_MOTION, "linear"),
     TargetParameters,
     (),
@@ -82,7 +82,7 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
     name = parameters.model
     if name is None:
         if parameters.motion or parameters.mode:
-            raise BadInput(f"{where}: motion and mode need a model; give model=... too")
+            raise BadInput(f"{where}: motion and mode need a model; set model=... too")
         given: Mapping[str, Any] = {"acceleration_density": parameters.acceleration_density}
         model = TARGET
     else:
@@ -104,7 +104,7 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
             number = stated(scans, each, model.parameters, needed=False)
         if np.isnan(number) and each in traced.read:
             raise BadInput(
-                f"{where}: no channel of {', '.join(topic.name for topic in scans)} states {each}; give "
+                f"{where}: no channel of {', '.join(topic.name for topic in scans)} states {each}; set "
                 f"it with --set motion.{each}=..."
             )
         numbers[each] = float(number)
@@ -118,12 +118,12 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
 def _check(where: str, model: Model) -> None:
     if any(model.state.get(name) != "linear" for name in POSITION):
         raise BadInput(
-            f"{where}: has no position x_m, y_m, which a tracker's sensors measure; take another model"
+            f"{where}: the state has no position x_m, y_m, which sensors measure; use another model"
         )
     if model.control is not None:
         raise BadInput(
-            f"{where}: is driven by {model.control.topic}, which is not recorded for targets; take a "
-            "model without a control"
+            f"{where}: the model is driven by {model.control.topic}, which is not recorded for targets; "
+            "use a model without a control"
         )
 
 
@@ -148,7 +148,7 @@ def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats
             sigma[row] = sigma_mps
         elif np.isnan(sigma[row]):
             raise BadInput(
-                f"{where}: a detection does not measure {name}, and the model does not say how "
-                "uncertain it is at first; give it a start with its sigma"
+                f"{where}: detections do not measure {name}, and the model states no initial "
+                "uncertainty of it; add its sigma to the start of the model"
             )
     return mean, sigma

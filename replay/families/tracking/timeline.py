@@ -243,7 +243,7 @@ def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happe
         followed = np.flatnonzero(track != NONE)
         for row in np.flatnonzero(np.diff(track[followed])):
             before, now = track[followed[row]], track[followed[row + 1]]
-            text = f"target {target} goes on with track {now}, before with {before}"
+            text = f"target {target} switches from track {before} to track {now}"
             yield Happened(name, "WARN", at_ns[followed[row + 1] :][:1], [text])
 
 

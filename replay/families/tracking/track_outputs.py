@@ -19,8 +19,8 @@ from fuselog.replay.families.tracking.scans import SensorTopics
 from fuselog.replay.inference.model.stage import Stage
 
 UNUSED = (
-    "there is no room for more tracks; give --set most_tracks=...",
-    "the scan came after a younger one; give --late rewind:SECONDS",
+    "there is no room for more tracks; use a larger --set most_tracks=...",
+    "the scan is out of sequence, after a scan with a later stamp; use --late rewind:SECONDS",
 )
 
 

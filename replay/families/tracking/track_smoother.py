@@ -21,13 +21,13 @@ def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
     """
     if errors:
         raise BadInput(
-            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
-            "of sensors"
+            f"estimator {name}: tracks with sensor errors cannot be smoothed; remove smoothed or the "
+            "sensor errors"
         )
     if targets.stage.modes or not targets.stage.motion.linear:
         raise BadInput(
-            f"estimator {name}: smoothed tracks need a model with one linear motion; leave "
-            "out smoothed, or take another model, or one of its modes"
+            f"estimator {name}: smoothed tracks require a model with one linear motion; remove "
+            "smoothed, or use another model, or one of its modes"
         )
 
 

@@ -222,11 +222,11 @@ class TrackerParameters(Parameters):
         given = values.get("management")
         if goes_by_existence and given not in (None, "existence"):
             raise ValueError(
-                f"{association} needs management = existence; management = {given} is for jpda"
+                f"{association} requires management = existence; use management = {given} with jpda"
             )
         management = given or ("existence" if goes_by_existence else "hits")
         if values.get("undetected_per_m2") and management != "existence":
-            raise ValueError("undetected_per_m2 needs management = existence")
+            raise ValueError("undetected_per_m2 requires management = existence")
         likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
         return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
@@ -257,28 +257,27 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
                 rows.append((number, scan.name, seen.name, origin, frame))
     missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
     if missing:
-        raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
+        raise BadInput(f"no scans of sensor {min(missing)}; remove it from sensors")
     found = SensorTopics(*zip(*rows, strict=True)) if rows else SensorTopics((), (), (), (), ())
     for scan_name, origin in zip(found.scans, found.origins, strict=True):
         if origin and (
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
         ):
             raise BadInput(
-                f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
-                "which is "
-                "missing; record the position of the sensor"
+                f"topic {scan_name}: the position of its sensor, topic {origin} (fuselog.PositionFix), "
+                "is missing; record it"
             )
     for seen_name, frame in zip(found.detections, found.frames, strict=True):
         if frame != found.frames[0]:
             raise BadInput(
-                f"topic {seen_name} is in {frame_in_words(frame)}, {found.detections[0]} in "
-                f"{frame_in_words(found.frames[0])}, and tracks are in one frame; name the sensors "
-                "of one frame with --set sensors=..."
+                f"topic {seen_name} is in {frame_in_words(frame)}, but {found.detections[0]} is in "
+                f"{frame_in_words(found.frames[0])}, and all tracks must be in one frame; select "
+                "sensors with the same frame by --set sensors=..."
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
-            "bearings alone begin no tracks, since they do not measure how far a target is; add a "
-            "sensor of positions, or of ranges with bearings"
+            "tracks cannot begin from bearings only, which do not measure the distance of a target; "
+            "add a sensor of positions, or of ranges with bearings"
         )
     return found
 
@@ -291,7 +290,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
         if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
             raise BadInput(
                 f"topic {seen.name}: detections without scans; record {prefix}/scan "
-                f"({schemas.SCAN.full_name}), which states how many each scan has, even if none"
+                f"({schemas.SCAN.full_name}), which states the number of detections, even if it is 0"
             )
 
 
@@ -378,18 +377,18 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
 def _out_of_sequence(parameters: TrackerParameters, back_ns: int) -> Advance:
     if parameters.smoothed:
         raise BadInput(
-            "smoothed tracks use later detections in any case; replay them in the order of the stamps, "
-            "or with --late wait:SECONDS"
+            "smoothed tracks cannot be combined with --late rewind; replay in the order of the stamps, "
+            "or use --late wait:SECONDS"
         )
     return partial(advance_out_of_sequence, back_ns=back_ns)
 
 
 TRACKER = recursive(
-    "tracks of many targets from the unordered scans of several sensors",
+    "tracks of many targets from the unordered scans of one or more sensors",
     parameters=TrackerParameters,
     find=_find,
     requirements="per sensor .../scan and .../detection (positions) or .../range_bearing, or "
-    ".../bearing beside those",
+    ".../bearing in addition to those",
     variant="association",
     start=start,
     advance=advance,

@@ -172,11 +172,12 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
     finite = np.isfinite(weights.detected).all() and np.isfinite(weights.missed).all()
     if weights.missed.shape != (tracks,) or not finite or (weights.detected < 0.0).any():
         raise BadInput(
-            "weights: give finite ones of shapes (tracks, detections) for pairs and (tracks,) for misses"
+            "weights must be finite, not negative, and of shapes (tracks, detections) for pairs and "
+            "(tracks,) for misses"
         )
     if (weights.missed <= 0.0).any():
         raise BadInput(
-            "weights: those of misses must be positive, since no track is detected for certain"
+            "the weights of misses must be positive, because no track is detected with certainty"
         )
     if association not in ASSOCIATIONS:
         raise BadInput(f"no association '{association}'; {choices(association, ASSOCIATIONS)}")

@@ -72,8 +72,8 @@ def trajectory_gospa(
     """
     if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
-            f"cutoff {cutoff:g}, switch penalty {switch_penalty:g}, order {order:g}: give a positive "
-            "cutoff and penalty, and an order from 1 on"
+            f"cutoff {cutoff:g}, switch penalty {switch_penalty:g}, order {order:g}: cutoff and penalty "
+            "must be positive, and the order at least 1"
         )
     first, second = _tracks(estimates, truths)
     distance = _distances(first, second)
@@ -113,7 +113,7 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
     cost = np.append(gain[:, row, column].ravel(), np.full((steps - 1) * pairs, half_switch))
     found = linprog(cost, bounds, limits, method="highs")
     if not found.success:
-        raise BadInput(f"the linear programme of trajectory GOSPA has no solution: {found.message}")
+        raise BadInput(f"the linear program of trajectory GOSPA has no solution: {found.message}")
     weights[:, row, column] = found.x[: steps * pairs].reshape(steps, pairs)
     return weights
 
@@ -151,7 +151,7 @@ def _assignments(n: int, m: int) -> Floats:
                 if len(found) > MOST_ASSIGNMENTS:
                     raise BadInput(
                         f"{n} estimates and {m} truths have more than {MOST_ASSIGNMENTS} assignments; "
-                        "take the linear programme, exactly=False"
+                        "use the linear program, exactly=False"
                     )
     return np.array(found)
 
@@ -179,7 +179,7 @@ def hota(
         others: number of points of further tracks, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
+        raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
     levels = np.atleast_1d(np.asarray(thresholds, float))
     first, second = _tracks(estimates, truths)
     similarity = np.nan_to_num(np.maximum(0.0, 1.0 - _distances(first, second) / cutoff))
@@ -214,7 +214,7 @@ def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float, *, others: int 
         others: number of points of further tracks, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
+        raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
     first, second = _tracks(estimates, truths)
     together = (_distances(first, second) < cutoff).sum(axis=0)
     points = int(_present(first).sum() + _present(second).sum()) + others
@@ -226,8 +226,8 @@ def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
     first, second = np.asarray(estimates, float), np.asarray(truths, float)
     if first.ndim != 3 or second.ndim != 3 or first.shape[1:] != second.shape[1:]:
         raise BadInput(
-            f"tracks {first.shape} and trajectories {second.shape}: give (targets, steps, axes) of the "
-            "same steps and axes, NaN where one is absent"
+            f"tracks have shape {first.shape} and trajectories {second.shape}; both must be (targets, "
+            "steps, axes) with the same steps and axes, NaN where a target is absent"
         )
     return first, second
 

@@ -30,9 +30,9 @@ UNREFERENCED_M = 50.0
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
 SOME_ARE_KNOWN = (
-    "the truths say that they cover some of the targets: a track more than "
-    f"{UNREFERENCED_M:g} m from all of them counts as unreferenced, not as false, and referenced_hota "
-    f"and referenced_idf1 leave out tracks that never come within {CUTOFF_M:g} m of one"
+    "the truths cover only some of the targets: a track more than "
+    f"{UNREFERENCED_M:g} m from all truths counts as unreferenced, not as false, and referenced_hota "
+    f"and referenced_idf1 exclude tracks that never come within {CUTOFF_M:g} m of a truth"
 )
 VELOCITY = ("vx_mps", "vy_mps")
 
@@ -106,8 +106,8 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
     truths = source.read(target_topics(source.topics))
     if not scans or not truths:
         raise BadInput(
-            f"{source.name}: has no scans or no truths, and tracks are judged by both; give a log with "
-            "them"
+            f"{source.name}: tracks are judged with scans and truths, and one of them is missing; use a "
+            "log with both"
         )
     last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
     last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
@@ -115,7 +115,7 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
     at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
     if not len(at_ns):
         raise BadInput(
-            f"{source.name}: ends within {burn_in_s:g} s, and tracks are judged after these; give a "
+            f"{source.name}: the log ends within the first {burn_in_s:g} s, which are not judged; use a "
             "longer log"
         )
     places = [

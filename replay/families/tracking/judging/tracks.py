@@ -128,7 +128,7 @@ def reports_of(output: Output) -> Reports:
         if len(targets) != len(tracks):
             raise BadInput(
                 f"{source.name}: {len(targets)} identities for {len(tracks)} reports on {stream.topic}; "
-                "give the log that these are estimates of"
+                "use the log from which these estimates were made"
             )
         both = targets.astype(np.int64), tracks["track_id"].astype(np.int64)
         found[output.first_run + run].append(both)
@@ -172,7 +172,7 @@ def _finish(reports: Reports) -> dict[str, float]:
 
 
 TRACKS = Metric(
-    "how targets with more than 50 reports kept one track of their own",
+    "how well targets with more than 50 reports kept a track of their own",
     Output,
     dict,
     _add,
