@@ -157,7 +157,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """Narrow headings to those that agree with the bearings of landmarks; None if there are none."""
+    """Narrow headings to those that agree with the bearings of landmarks; None if no heading does."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:

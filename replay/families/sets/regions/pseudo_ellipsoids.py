@@ -47,7 +47,7 @@ class Grid(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Border of a set as closed polygons (n, 2), holes with opposite orientation, and the area inside."""
+    """Border of a set as closed polygons (n, 2), with holes the other way round, and the area."""
 
     rings: list[Floats]
     area_m2: float
