@@ -58,7 +58,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     worlds = {_world(topics[each]) for each in streams}
     if len(worlds) > 1:
         raise BadInput(
-            f"estimator {name}: the sensors state different noise or air temperature; give all the same"
+            f"estimator {name}: the sensors state different noise or air; all must state the same"
         )
     noise, medium = worlds.pop()
     setting = Setting(
@@ -112,7 +112,7 @@ def _latest(positions: Ragged, batches: Batches) -> Floats:
 
 
 SHOOTER = batch(
-    "where a shot came from; MODE: bearings-only, local-estimates or native-measurements",
+    "origin of single shots; MODE: bearings-only, local-estimates or native-measurements",
     parameters=ShooterParameters,
     find=_find,
     requirements="per sensor N /sensorN/detections and /sensorN/position",

@@ -266,13 +266,11 @@ def _check(setting: Setting, heard: Detections) -> None:
         expected = (*shape, 2) if name == "position_m" else shape
         if len(shape) != 2 or column.shape != expected:
             raise BadInput(
-                f"detections: {name} has shape {column.shape} beside {shape} of the muzzle blasts; "
-                "give (runs, sensors), and (runs, sensors, 2) positions"
+                f"detections: {name} has shape {column.shape}, and muzzle blasts have shape {shape}; "
+                "expected (runs, sensors), and (runs, sensors, 2) for positions"
             )
     if min(setting.noise) <= 0.0:
-        raise BadInput(
-            f"acoustic noise {setting.noise} must be positive; give standard deviations above zero"
-        )
+        raise BadInput(f"acoustic noise {setting.noise}: all standard deviations must be positive")
 
 
 def _blocks(residual: list, jacobian: list, covariance: list, slope: list | None = None) -> _Blocks:

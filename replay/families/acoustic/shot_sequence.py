@@ -167,11 +167,9 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
                 int(time_ns[begin]), mean, np.diag(sigma**2), "where its first shot fits best"
             )
     raise BadInput(
-        f"topic {reports.topic}: no span of {parameters.start_s:g} s has muzzle blasts of two sensors "
-        "of "
-        f"{SENSORS.topic} whose directions meet, and a shockwave; make start_s longer, or give the log "
-        "a "
-        "prior"
+        f"topic {reports.topic}: no span of {parameters.start_s:g} s has a shockwave, and muzzle blasts "
+        f"of two sensors of {SENSORS.topic} whose directions meet; use a longer start_s, or add a prior "
+        "to the log"
     )
 
 
@@ -212,7 +210,7 @@ HEARD: Components = {
 # For logs that do not state it: a person on foot.
 ASSUMED = {"acceleration_density": 0.1, "trajectory_density": 0.05}
 MOVING_SHOOTER = Model(
-    "a shooter who moves, from the shots that acoustic sensors hear",
+    "a moving shooter, from the shots that acoustic sensors hear",
     {
         "x_m": "linear",
         "y_m": "linear",

@@ -155,7 +155,7 @@ HOW = "where its differences fit best"
 MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
 REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
 SOUND_SOURCE = Model(
-    "where a sound came from, from differences of its arrivals at microphones",
+    "position of a sound source, from differences of arrival times at microphones",
     {"x_m": "linear", "y_m": "linear", "z_m": "linear", "reference_s": "linear"},
     SoundSourceParameters,
     (

@@ -73,7 +73,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         _draw_shot(canvas, "truth", TRUE, then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
         _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator)), stream, cone)
-    name = "Map; the bullet's way ends in its shockwave"
+    name = "Map; the bullet's path ends at its shockwave"
     colours = scene.colours(CASE) | {"muzzle blast": MUZZLE_BLAST[:3], "shockwave": SHOCKWAVE[:3]}
     board = with_legend(canvas, ROOT, colours, plane_view(canvas, ROOT, [], [], shown, name=name))
     board = above_events(board, draw_events(canvas, scene, CASE))

@@ -88,7 +88,7 @@ def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]
     unknown = set(parameters.known_bias_deg) - set(names)
     if unknown:
-        raise BadInput(f"known_bias_deg: no bias '{min(unknown)}'; there are: {', '.join(names)}")
+        raise BadInput(f"known_bias_deg: no bias '{min(unknown)}'; choose from: {', '.join(names)}")
     known = [parameters.known_bias_deg.get(name, np.nan) for name in names]
     return np.radians(known).reshape(-1, 3)
 
@@ -114,14 +114,14 @@ def _constant(ragged: Ragged, field: str, width: int) -> Floats:
     if len(values) == 0 or (values != values[:1]).any():
         raise BadInput(
             f"topic {ragged.stream.topic}: {field} must be the same in all messages and runs; replay "
-            "logs of other sensors on their own"
+            "logs of other sensors separately"
         )
     return values[0]
 
 
 _solving = partial(batch, find=_find, requirements=NEEDS, solve=_solve)
 LOS_POSITIONS = _solving(
-    "target positions from lines of sight, biases taken as zero: schemes 1 and 2",
+    "target positions from lines of sight, with biases assumed to be zero: schemes 1 and 2",
     parameters=PositionsParameters,
 )
 LOS_BIASES = _solving(

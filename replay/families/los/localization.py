@@ -192,15 +192,15 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
     if axis is not None:
         first = 3 * len(measured)
         sentence += (
-            f": nothing changes when all sensors and targets turn together about the axis "
-            f"({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}); know one bias with a large share in it: "
+            f": the measurements do not change if all sensors and targets turn together about the axis "
+            f"({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}); fix one of the biases with a large share: "
             + describe_direction(names[first:], unseen[first:, 0])
         )
     elif angles < n:
-        sentence += ": too few angles; another target adds 3 parameters and 2 angles for each sensor"
+        sentence += ": too few angles; each new target adds 3 parameters and 2 angles per sensor"
     elif rank < n:
         directions = (describe_direction(names, direction) for direction in unseen.T)
-        sentence += f": nothing changes with {'; or with '.join(directions)}"
+        sentence += f": the measurements do not change with {'; or with '.join(directions)}"
     return Observability(rank, n, axis, sentence)
 
 
@@ -248,13 +248,13 @@ def _check(scene: Scene, measured: Floats) -> None:
     sensors = len(scene.position_m)
     for (name, column), width in zip(scene._asdict().items(), (3, 3, 2, 3), strict=True):
         if column.shape != (sensors, width):
-            raise BadInput(f"optical scene: {name} has shape {column.shape}; give {(sensors, width)}")
+            raise BadInput(f"optical scene: {name} has shape {column.shape}, not {(sensors, width)}")
     if measured.ndim != 4 or measured.shape[2:] != (sensors, 2):
         raise BadInput(
-            f"lines of sight have shape {measured.shape}; give (runs, targets, {sensors} sensors, 2)"
+            f"lines of sight have shape {measured.shape}, not (runs, targets, {sensors} sensors, 2)"
         )
     if not (scene.sigma_rad > 0.0).all():
-        raise BadInput("optical scene: sigma_rad must be positive; give each sensor's noise")
+        raise BadInput("optical scene: sigma_rad must be positive for all sensors")
 
 
 def _geometry(scene: Scene, parameters: Floats) -> tuple[Floats, Floats, Floats]:

@@ -84,7 +84,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     scale = max(1.0, nice(ELLIPSOID_SHARE * extent / max(sizes))) if sizes else 1.0
     for each in estimates:
         _draw_estimates(canvas, each, sensors, scale, BEYOND * extent)
-    drawn = f"Scene; 95 % ellipsoids {scale:g} times as large" if estimates else "Scene"
+    drawn = f"Scene; 95 % ellipsoids enlarged {scale:g} times" if estimates else "Scene"
     space = rrb.Spatial3DView(origin=ROOT, name=drawn, eye_controls=eye)
     colours = scene.colours("") | {"sensors": SENSOR, "measured": WRONG}
     board = above_events(with_legend(canvas, ROOT, colours, space), draw_events(canvas, scene, ""))

@@ -201,9 +201,9 @@ def first_ranges(
             delay_ns = round(parameters.range_delay_s / _NS)
             return int(time_ns[rows[begin]]) - delay_ns, stream["range_m"][chosen], of[:, :3], of[:, 3:]
     raise BadInput(
-        f"topic {stream.topic}: no span of {parameters.start_s:g} s has the ranges of {least} pairs of "
-        f"anchor and tag, to three anchors of {ANCHORS.topic}; make start_s longer, or "
-        "give the log a prior"
+        f"topic {stream.topic}: no span of {parameters.start_s:g} s has ranges of {least} pairs of "
+        f"anchor and tag, with three anchors of {ANCHORS.topic}; use a longer start_s, or "
+        "add a prior to the log"
     )
 
 

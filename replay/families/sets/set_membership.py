@@ -182,8 +182,8 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
         arena_m = _numbers(landmarks, "arena_m")
     if arena_m is not None and not (len(arena_m) == 4 and np.all(np.less(arena_m[:2], arena_m[2:]))):
         raise BadInput(
-            f"an arena of {arena_m} m; give low x, low y, high x, high y with --set arena_m=[...] "
-            f"or in the metadata of {landmarks.name}"
+            f"arena_m = {arena_m}: expected low x, low y, high x, high y; set it with --set "
+            f"arena_m=[...] or in the metadata of {landmarks.name}"
         )
     range_m = parameters.maximum_range_m
     if range_m is None and "maximum_range_m" in topic.metadata:
@@ -192,7 +192,7 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
         bound_rad = _numbers(topic, "bound_rad")[0]
     if bound_rad is None:
         raise BadInput(
-            f"topic {topic.name}: the bound of its relative bearings is unknown; give it with --set "
+            f"topic {topic.name}: the bound of its relative bearings is unknown; set it with --set "
             "bound_deg=..., in degrees, or state bound_rad on its channel"
         )
     return Known(bound_rad, parameters.least_landmarks, arena_m, range_m)
@@ -205,7 +205,7 @@ def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
     except ValueError:
         numbers = (np.nan,)
     if not np.isfinite(numbers).all():
-        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; numbers are needed")
+        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; it must be numbers")
     return numbers
 
 

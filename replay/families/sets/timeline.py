@@ -138,7 +138,7 @@ def draw_sets(
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     low, high = np.moveaxis(np.array(corners), 1, 0)
     reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
-    last = ", ".join(f"{each[-1]:.3g} by {estimator}" for estimator, each in areas.items())
+    last = ", ".join(f"{each[-1]:.3g} for {estimator}" for estimator, each in areas.items())
     largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
     extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
     if all(len(each) == 1 for each in areas.values()):

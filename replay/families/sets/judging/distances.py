@@ -64,7 +64,7 @@ def gospa(
         alpha: a surplus point costs cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
-        raise BadInput(f"alpha {alpha:g}: give one above 0 and up to 2")
+        raise BadInput(f"alpha {alpha:g}: alpha must be above 0 and at most 2")
     costs = _assigned_costs(estimates, truths, cutoff, order)
     pairs = costs.pairs
     if alpha == 2.0:
@@ -114,7 +114,7 @@ def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, orde
 
     if not (0.0 < cutoff < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
-            f"cutoff {cutoff:g}, order {order:g}: give a positive cutoff, and an order from 1 on"
+            f"cutoff {cutoff:g}, order {order:g}: the cutoff must be positive, and the order at least 1"
         )
     first, second = _points(estimates, "estimates"), _points(truths, "truths")
     if len(first) == 0 or len(second) == 0:
@@ -122,8 +122,8 @@ def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, orde
         return _Costs(len(first), len(second), np.empty(0), nobody, nobody)
     if first.shape[1] != second.shape[1]:
         raise BadInput(
-            f"estimates have {first.shape[1]} components and truths {second.shape[1]}; give both in "
-            "the same"
+            f"estimates have {first.shape[1]} components and truths {second.shape[1]}; both must have "
+            "the same number"
         )
     costs = np.minimum(cdist(first, second), cutoff) ** order
     estimate, truth = linear_sum_assignment(costs)
@@ -135,7 +135,5 @@ def _points(points: ArrayLike, what: str) -> Floats:
     if found.size == 0:
         return np.empty((0, 0))
     if found.ndim != 2 or not np.isfinite(found).all():
-        raise BadInput(
-            f"{what}: expected finite points (n, d), found shape {found.shape}; leave out NaN"
-        )
+        raise BadInput(f"{what}: expected finite points (n, d), found shape {found.shape}; remove NaN")
     return found

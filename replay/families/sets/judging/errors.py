@@ -207,7 +207,7 @@ def _means(sums: Sums) -> dict[str, float]:
 
 
 SETS = metric_of_sums(
-    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m; area of regions, and what they hold",
+    "OSPA and GOSPA of estimated sets, cutoff 10 m; area of regions, and whether they hold the truth",
     AnySets,
     _sums,
     _means,

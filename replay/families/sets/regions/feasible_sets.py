@@ -72,18 +72,18 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
         float(bound_rad),
     )
     if not 0 < pairs.bound_rad < 0.5 * np.pi:
-        raise BadInput(f"a bound of {bound_rad} rad; give one above 0 and below pi / 2")
+        raise BadInput(f"bound {bound_rad} rad: the bound must be above 0 and below pi / 2")
     if not len(pairs.first) == len(pairs.second) == len(pairs.angle_rad):
         raise BadInput(
             f"{len(pairs.first)} first and {len(pairs.second)} second landmarks for "
-            f"{len(pairs.angle_rad)} angles; give one of each per relative bearing"
+            f"{len(pairs.angle_rad)} angles; expected one of each per relative bearing"
         )
     if not all(np.isfinite(part).all() for part in pairs[:3]):
-        raise BadInput("a landmark or an angle is not finite; leave that relative bearing out")
+        raise BadInput("a landmark or an angle is not finite; remove that relative bearing")
     if np.any(np.all(pairs.first == pairs.second, axis=1)):
         raise BadInput(
-            "the two landmarks of a pair are at one place, so that their angle says nothing; leave it "
-            "out"
+            "the two landmarks of a pair are at the same position, so their angle is undefined; remove "
+            "that pair"
         )
     return pairs
 
@@ -260,7 +260,7 @@ def area(border: Arcs) -> float:
 def box(border: Arcs) -> Arena:
     """Compute the tightest axis-parallel box; raise BadInput for an empty set."""
     if len(border.length) == 0:
-        raise BadInput("the set is empty, so that it has no bounding box")
+        raise BadInput("the set is empty and has no bounding box")
     points = [border.start, border.at(border.length)]
     turn = border.curvature * border.length
     for quarter in range(4):

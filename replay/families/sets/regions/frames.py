@@ -16,11 +16,11 @@ from fuselog.replay.families.sets.regions.moving_sets import Growth
 
 CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
 FINDINGS = (
-    "the bearings of this frame contradict each other: it is left out",
-    "this frame contradicts what came before it: the sets of both are kept",
-    "this frame contradicts both sets that were kept: they count as one from here on",
-    "the earlier frame that contradicted what came before it was wrong",
-    "what came before the earlier frame that contradicted it was wrong",
+    "the bearings of this frame contradict each other: the frame is not used",
+    "this frame contradicts the frames before it: the sets of both are kept",
+    "this frame contradicts both kept sets: they count as one set from here on",
+    "the frame that contradicted those before it was wrong",
+    "the frames before the one that contradicted them were wrong",
 )
 NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 
@@ -91,8 +91,8 @@ def _maximum_range_m(stream: Stream, known: Known) -> float:
         return known.maximum_range_m
     if "range_m" not in stream.columns:
         raise BadInput(
-            f"topic {stream.topic}: nothing bounds the robot's position: the topic has no ranges and "
-            "states no maximum_range_m, and /landmarks states no arena_m; give "
+            f"topic {stream.topic}: the robot's position is not bounded: the topic has no ranges and "
+            "states no maximum_range_m, and /landmarks states no arena_m; use "
             "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
         )
     return float(stream["range_m"].max(initial=0.0))

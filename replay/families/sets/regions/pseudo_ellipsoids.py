@@ -204,7 +204,7 @@ def most_room(ellipsoid: PseudoEllipsoid) -> float:
     most = float(ellipsoid.vector @ centre) - ellipsoid.constant
     error = ROUNDING * abs(ellipsoid.constant)
     if most < -error:
-        raise BadInput("the sets of the pairs have no common point; give a larger bound")
+        raise BadInput("the sets of the pairs have no common point; use a larger bound")
     return max(most, error)
 
 
