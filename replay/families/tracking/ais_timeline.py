@@ -26,7 +26,7 @@ LIVE_S = 600.0
 LISTED_VESSELS = 200
 # Greatest number of reports drawn per estimator.
 DRAWN_REPORTS = 50_000
-# The golden ratio: multiples of it, in turns, give hues that stay far apart.
+# Golden ratio: its multiples modulo 1 are hues that stay far apart.
 GOLDEN = 0.618034
 
 

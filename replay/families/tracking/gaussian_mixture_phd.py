@@ -49,7 +49,7 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class PhdParameters(Parameters):
-    """Motion, births and detections of targets; the scans' channel states what is not given.
+    """Motion, births and detections of targets; missing values are read from the scans' channel.
 
     Attributes:
         sensor: the sensor to use, such as `network`; by default each sensor has its own filter.
@@ -152,7 +152,7 @@ def _work(most: int, detections: int) -> PhdMemory:
 
 
 def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
-    """Make room for the elements: at most twice the weight that each scan can lead to."""
+    """Make empty sets, with room for twice the greatest weight that each scan can lead to."""
     count = len(scans.time_ns)
     bound = np.empty(count)
     passed = (1.0 - settings.detection_probability) * settings.survival_probability

@@ -343,7 +343,7 @@ def process(
 def extract(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Fill in a scan's set: a component counts as as many targets as its weight rounds to."""
+    """Fill in a scan's set; the rounded weight of a component is its number of targets."""
     row = sets.room[scan]
     for component in range(mixture.used[run]):
         weight = mixture.weight[run, component]

@@ -157,7 +157,7 @@ def _no_tracks(runs: int) -> Tracks:
 
 
 def _with_room(tracks: Tracks, more: int) -> Tracks:
-    """Copy the tracks, with room for `more` others in each run."""
+    """Copy the tracks, with room for `more` additional tracks in each run."""
 
     def with_room(each: NDArray) -> NDArray:
         room = np.zeros((len(each), more, *each.shape[2:]), each.dtype)

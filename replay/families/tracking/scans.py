@@ -27,7 +27,7 @@ class SensorTopics(NamedTuple):
 
     @property
     def sensors(self) -> list[str]:
-        """Return the names of the sensors: the beginnings of their topics."""
+        """Return the names of the sensors, which are the prefixes of their topics."""
         return [scan.rpartition("/")[0].strip("/") for scan in self.scans]
 
 

@@ -67,7 +67,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 class TrackerParameters(Parameters):
     """Parameters of target motion, track management and sensors.
 
-    A sensor parameter without a value is read from the channel of the sensor's scans; a value given here
+    A sensor parameter without a value is read from the channel of the sensor's scans. A value given here
     applies to all sensors.
 
     A detection begins a track if it is outside all gates and far enough from all confirmed tracks. With
@@ -111,9 +111,9 @@ class TrackerParameters(Parameters):
             confirmed.
         silence_s: time without a detection after which a confirmed track ends.
         tentative_silence_s: time without a detection after which an unconfirmed track ends.
-        same_within_m: distance below which two tracks are merged into one, if their velocities agree
+        same_within_m: distance below which two tracks count as one target, if their velocities agree
             too.
-        same_within_mps: difference in velocity below which two tracks are merged into one, if their
+        same_within_mps: difference in velocity below which two tracks count as one target, if their
             positions agree too.
         most_tracks: greatest number of tracks at a time.
         smoothed: whether the tracks are smoothed at the end of the run.

@@ -142,7 +142,7 @@ ASSOCIATIONS: dict[str, Associate] = {"nearest": nearest, "hungarian": hungarian
 
 
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
-    """Compute a track's probability of existence after a scan that gave it no detection by `none`.
+    """Compute the existence of a track after a scan in which `none` is the probability of a miss.
 
     Musicki and Evans' (15): a miss lowers it the more, the more probable a detection was.
     """

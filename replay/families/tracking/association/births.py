@@ -41,7 +41,7 @@ class Births(NamedTuple):
 
 
 def births_of(kinds: Sequence[ScanSensor]) -> Births:
-    """Collect the births of these kinds of sensors."""
+    """Collect the births of the given kinds of sensors."""
     begins = tuple(kind.birth is not None for kind in kinds)
     births = [kind.birth for kind in kinds if kind.birth is not None]
     number = tuple(sum(begins[:k]) for k in range(len(kinds)))

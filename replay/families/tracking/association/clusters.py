@@ -15,7 +15,7 @@ NONE = -1
 
 @varying(2)
 class Weights(NamedTuple):
-    """Weights of pairs and misses, from which assignments are formed.
+    """Weights of pairs of tracks and detections, and of misses.
 
     Attributes:
         detected: (tracks, detections), the weight of a pair; 0 outside a gate.
@@ -61,7 +61,7 @@ class AssociationMemory(NamedTuple):
 
 
 def memory_for(tracks: int, detections: int) -> AssociationMemory:
-    """Make memory for scans of up to these numbers of tracks and detections."""
+    """Make memory for scans with up to the given numbers of tracks and detections."""
     items, columns = max(tracks, detections), tracks + detections
     slots = min(tracks, detections, MOST_ENUMERATED)
     return AssociationMemory(

@@ -90,7 +90,7 @@ class ScanMemory(NamedTuple):
 
 
 def memory_of(stage: Stage, motion: CoreMemory, shared: int, places: int, detections: int) -> ScanMemory:
-    """Make memory for numbers of shared errors, of tracks, and of detections in a scan."""
+    """Make memory for the given numbers of shared errors, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
     return ScanMemory(
         motion=motion,
@@ -283,7 +283,7 @@ def comparing(kind: ScanSensor) -> Callable[[int, int, int, ScanMemory], float]:
 
 
 def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
-    """Make `update(track, mode, detections, mean, covariance, memory)`: by associations in the mode."""
+    """Make `update(track, mode, detections, mean, covariance, memory)`, which updates one mode."""
     m, correct = len(kind.measured), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
 

@@ -38,7 +38,7 @@ class Pool(NamedTuple):
 
 
 def pool_of(shared: int, tangent: int, places: int) -> Pool:
-    """Make memory for these numbers of errors, tangent components and tracks."""
+    """Make memory for the given numbers of errors, tangent components and tracks."""
     square = (shared, shared)
     return Pool(
         np.empty(square),

@@ -90,7 +90,7 @@ Result = TypeVar("Result")
 def choosing(
     functions: list[Callable[Arguments, Result]],
 ) -> Callable[Concatenate[int, Arguments], Result]:
-    """Make `call(kind, ...)`, which calls the function with this index."""
+    """Make `call(kind, ...)`, which calls the function with the index `kind`."""
 
     def call(kind: int, *arguments: AnyArgument) -> AnyArgument:
         for number in range_of(1, len(functions)):

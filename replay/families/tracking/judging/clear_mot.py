@@ -25,7 +25,7 @@ def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff:
     Returns:
         (targets, k), the number of the track of each target, or NONE.
     """
-    from scipy.optimize import linear_sum_assignment  # this takes long to import
+    from scipy.optimize import linear_sum_assignment  # slow to import
 
     targets, instants, _ = truths.shape
     pairs = np.full((targets, instants), NONE)

@@ -97,7 +97,7 @@ def target_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
-    """Choose instants from a while after the epoch to the first end of the scans and of the truths.
+    """Choose instants from a burn-in after the epoch to the earliest end of scans and truths.
 
     Truths are interpolated linearly. Raises BadInput if there are no scans or no truths of positions, or
     if they end before the first instant.
@@ -248,7 +248,7 @@ def figures_of_whole_tracks(
         truths: (targets, k, 2), in m, NaN when a target is absent.
         unreferenced_m: see `Judged`.
     """
-    from fuselog.replay.families.tracking.judging.distances import (  # whose assignments import SciPy
+    from fuselog.replay.families.tracking.judging.distances import (  # imports SciPy, which is slow
         hota,
         idf1,
     )

@@ -110,7 +110,7 @@ def track_blocks(
 
 
 class TracksJudge(KindJudge):
-    """Judge of sets of tracks, which reads the targets of each run once for every frame."""
+    """Judge for sets of tracks, which reads the targets of each run once for every frame."""
 
     def __init__(self, runs: JudgedRuns) -> None:
         super().__init__(runs)

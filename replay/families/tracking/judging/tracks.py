@@ -44,7 +44,7 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
     Args:
         targets, tracks: (n,), the numbers of target and track of every report, in order of time.
     """
-    import pandas as pd  # these take long to import
+    import pandas as pd  # slow to import
     from scipy.optimize import linear_sum_assignment
 
     target, of_target = np.unique(targets, return_inverse=True)
