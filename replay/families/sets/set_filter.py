@@ -78,7 +78,7 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
 class SetFilterParameters(SetParameters):
-    """Bounds of the errors; bounds that are not given are read from the channels.
+    """Bounds of the errors; missing bounds are read from the channels.
 
     Over a span of T s, the position of the odometry is wrong by at most `position_error_m` + T
     `position_error_mps`, relative to the pose at the beginning, and its heading by at most

@@ -33,7 +33,7 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """Form of the sets, and bounds from which they are computed; the log states missing bounds.
+    """Form of the sets, and bounds of the errors; missing bounds are read from the log.
 
     Bearings with equal stamps form all their pairs.
 

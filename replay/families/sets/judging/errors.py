@@ -146,7 +146,7 @@ def _judge_run(
 
 
 class SetsJudge(KindJudge):
-    """Judge of sets of targets, and of regions that contain one."""
+    """Judge for sets of targets, and for regions that contain one target."""
 
     def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
         """Judge a block; see `KindJudge`."""

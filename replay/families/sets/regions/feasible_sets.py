@@ -275,7 +275,7 @@ def box(border: Arcs) -> Arena:
 
 
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
-    """Draw closed polygons (n, 2) around the set, which is on their left.
+    """Compute closed polygons (n, 2) around the set, which is on their left.
 
     The polygons contain the set: vertices are on concave arcs and outside convex ones. Together they are
     larger than the set by at most the tolerance, in units of its area.

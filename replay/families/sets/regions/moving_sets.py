@@ -134,7 +134,7 @@ def common_headings(one: Headings, other: Headings) -> Headings | None:
 
 
 def all_headings_of(one: Headings, other: Headings) -> Headings:
-    """Return the smallest interval that contains both."""
+    """Return the smallest interval that contains both intervals."""
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     low = min(-one.half_rad, apart - other.half_rad)
     high = max(one.half_rad, apart + other.half_rad)
