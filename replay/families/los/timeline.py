@@ -93,7 +93,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:
     """Yield the sensors whose position and attitude are in the log."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    from scipy.spatial.transform import Rotation  # slow to import
 
     for topic in scene.source.topics:
         number = re.fullmatch(r"/sensor(\d+)/line_of_sight", topic)
@@ -204,7 +204,7 @@ def _draw_estimates(
 
 def ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
     """Compute half axes (n, 3) and orientations (n, 4) of the 95 % ellipsoids of Gaussians (n, 3, 3)."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    from scipy.spatial.transform import Rotation  # slow to import
 
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
