@@ -43,7 +43,7 @@ class Mode(StrEnum):
 
 
 class Setting(NamedTuple):
-    """Assumptions of the estimator.
+    """Assumptions of the estimator about sensors and medium.
 
     `cross_covariances` keeps the covariances between range and angles in local estimates. The paper
     leaves them out: with them the search is unstable, and the bound of eq (48) falls below that of the

@@ -94,7 +94,7 @@ def hear(state: Components, sensor: Components, parameters: Any) -> Components:
 
     There are two leads, for a shockwave from the left of the muzzle blast and for one from the right: a
     sensor is on one side of the line of fire, and its report uses the lead of that side. Each lead
-    continues smoothly across the line of fire, where the lead of the side that hears it has a kink.
+    continues smoothly across the line of fire, where the true lead has a kink.
     """
     x, y, trajectory, vx, vy = state
     speed = parameters.speed_of_sound_mps
@@ -145,7 +145,7 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     Candidates are all points where the muzzle blasts of two sensors meet, with every direction of the
     bullet in the reports. Least squares with Cauchy's loss start from the candidate with the smallest
-    residuals, clipped at three standard deviations, and reject wrong reports if most are right. Raises
+    residuals, clipped at three standard deviations, and suppress wrong reports if most are right. Raises
     BadInput if the reports do not determine a shot.
     """
     reports, sensors = streams["reports"], streams[SENSORS.topic]

@@ -128,7 +128,7 @@ def _settled(
     place: Floats,
     near_m: float,
 ) -> tuple[Floats, Floats]:
-    """Refine a position (n,) to zero gradient of a soft_l1 cost; also return the information (n, n).
+    """Refine a position (n,) to a root of the cost's gradient; return it and the information (n, n).
 
     A search by the cost ends where rounding hides lower values, at different points on different CPUs.
     If the differences do not determine the distance, the gradient is zero at infinity; then the position
