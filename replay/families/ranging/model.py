@@ -109,7 +109,7 @@ def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Comp
 
 
 def see(state: Components, anchor: Components, parameters: Any) -> Components:
-    """Compute the measured range of an anchor."""
+    """Compute the measured range to an anchor."""
     here = state[0], state[1], parameters.height_m
     return (distance(here, anchor) + parameters.bias_range_m,)
 
