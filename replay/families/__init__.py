@@ -1,5 +1,5 @@
-"""Estimates, judges and draws what single families of systems need; a package each.
+"""Estimators, judges and drawings of single families of systems, a package for each family.
 
-Nothing outside imports them: estimators, models, metrics, judges, drawings and timelines register. One
-family may use another. Begin with a small one, `ranging`.
+Nothing outside imports these packages: estimators, models, metrics, judges, drawings and timelines
+register themselves. One family may use another. Begin with a small one, `ranging`.
 """

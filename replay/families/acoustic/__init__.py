@@ -1,5 +1,5 @@
-"""Locates shooters and sources of sound by arrival times; begin with `localization`.
+"""Localization of shooters and sound sources from arrival times; begin with `localization`.
 
-That is the estimator `shooter`, of single shots. `shot_sequence` and `sound_source` are models of their
-own, for any method.
+That module belongs to the estimator `shooter`, which locates single shots. `shot_sequence` and
+`sound_source` are models, which any method can estimate.
 """

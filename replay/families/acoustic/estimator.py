@@ -1,4 +1,4 @@
-"""Offers the estimator `shooter:MODE`: where shots of a log came from (Osborne et al. 2014)."""
+"""Estimator `shooter:MODE`, which locates the shots of a log (Osborne et al. 2014)."""
 
 from collections.abc import Iterator, Mapping
 
@@ -31,10 +31,10 @@ from fuselog.replay.families.acoustic.localization import (
 
 
 class ShooterParameters(Parameters):
-    """States what the sensors send, and what is estimated.
+    """Data that the sensors send, and choice of what is estimated.
 
     Attributes:
-        mode: what the sensors send to the fusion centre.
+        mode: data that the sensors send to the fusion centre.
         estimate_sensors: whether the sensors' own positions are estimated too.
         cross_covariances: whether local estimates keep the covariances of range and angles; the paper
             leaves them out.
@@ -49,7 +49,7 @@ HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> Iterator[Binding]:
-    """Find the sensors, and what they state of the world."""
+    """Find the sensors, and the noise and medium that they state."""
     sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
     streams = [f"/sensor{s}/detections" for s in sensors]
     static = [f"/sensor{s}/position" for s in sensors]
@@ -58,7 +58,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     worlds = {_world(topics[each]) for each in streams}
     if len(worlds) > 1:
         raise BadInput(
-            f"estimator {name}: the sensors state different noise or air temperature; give all the same"
+            f"estimator {name}: the sensors state different noise or air; all must state the same"
         )
     noise, medium = worlds.pop()
     setting = Setting(
@@ -87,7 +87,7 @@ def _solve(given: Given[ShooterParameters]) -> list[Ragged]:
 
 
 def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tuple[Batches, Detections]:
-    """Lay out what all sensors heard shot by shot, with the latest fix that each sensor then had."""
+    """Arrange the detections of all sensors by shot, with the latest fix of each sensor at that time."""
     table = table_of(detections, ["shot_id", *HEARD])
     batches, shot = batches_of(table, "shot_id", detections[0].runs)
     heard = np.full((3, len(batches.run), len(detections)), np.nan)
@@ -98,7 +98,7 @@ def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tupl
 
 
 def _latest(positions: Ragged, batches: Batches) -> Floats:
-    """Return the latest fix (batches, 2) of a sensor at the end of each batch, NaN where it had none."""
+    """Return the latest fix (batches, 2) of a sensor at the end of each batch, NaN if it had none."""
     times = positions.stream.publish_time_ns
     latest = np.full(len(batches.run), -1)
     for run in np.unique(batches.run):
@@ -112,7 +112,7 @@ def _latest(positions: Ragged, batches: Batches) -> Floats:
 
 
 SHOOTER = batch(
-    "where a shot came from; MODE: bearings-only, local-estimates or native-measurements",
+    "origin of single shots; MODE: bearings-only, local-estimates or native-measurements",
     parameters=ShooterParameters,
     find=_find,
     requirements="per sensor N /sensorN/detections and /sensorN/position",

@@ -1,8 +1,8 @@
-"""Locates where a shot came from: the three localizations of Osborne et al., JAIF 2014.
+"""Localization of a shooter from a single shot: the three methods of Osborne et al., JAIF 2014.
 
-The parameters are the shooter's position, the bullet's direction (not for bearings only, which say
-nothing about it) and, where they are estimated along, the sensors' positions. Where they are not, each
-position fix is taken as it is and its error is added to that of the sensor's measurements.
+The parameters are the shooter's position, the bullet's direction (except in bearings-only mode, which
+has no information about it) and, if they are estimated, the sensors' positions. If they are not, each
+position fix is used as it is, and its error is added to that of the sensor's measurements.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ CONSTANT = (0.0, 0.0, 0.0)
 
 
 class Mode(StrEnum):
-    """Chooses what the sensors send to the fusion centre."""
+    """Data that the sensors send to the fusion centre."""
 
     BEARINGS_ONLY = "bearings-only"
     LOCAL_ESTIMATES = "local-estimates"
@@ -43,11 +43,11 @@ class Mode(StrEnum):
 
 
 class Setting(NamedTuple):
-    """Describes how the estimator sees the world.
+    """Assumptions of the estimator about sensors and medium.
 
-    `cross_covariances` keeps those between range and angles in local estimates. The paper leaves them
-    out: with them the search is unstable, and the bound of eq (48) falls below that of the native
-    measurements, which cannot be.
+    `cross_covariances` keeps the covariances between range and angles in local estimates. The paper
+    leaves them out: with them the search is unstable, and the bound of eq (48) falls below that of the
+    native measurements, which is impossible.
     """
 
     mode: Mode
@@ -58,9 +58,9 @@ class Setting(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Holds one shot per run as all sensors heard it; (runs, sensors), positions (runs, sensors, 2).
+    """One shot per run as detected by all sensors: (runs, sensors), positions (runs, sensors, 2).
 
-    The shockwave and the time difference are NaN where the shockwave was not heard.
+    The shockwave and the time difference are NaN if the shockwave was not heard.
     """
 
     muzzle_blast_rad: Floats
@@ -69,19 +69,19 @@ class Detections(NamedTuple):
     position_m: Floats
 
     def take(self, rows: NDArray[np.intp]) -> "Detections":
-        """Return the runs `rows`."""
+        """Select the runs `rows`."""
         return Detections(*(column[rows] for column in self))
 
 
 def parameter_names(setting: Setting, sensors: Sequence[int]) -> list[str]:
-    """Name the parameters, with their units, for sensors of these numbers."""
+    """Return the names of the parameters, with units, for sensors with these numbers."""
     shot = model.SHOT_COMPONENTS[: 2 if setting.mode == Mode.BEARINGS_ONLY else 3]
     estimated = sensors if setting.estimate_sensors else []
     return [*shot, *(name for sensor in estimated for name in model.sensor_components(sensor))]
 
 
 def estimate(setting: Setting, heard: Detections) -> Solution:
-    """Localize the shot of every run; raises BadInput for wrong shapes or noise that is not positive."""
+    """Localize the shot of every run; raise BadInput for wrong shapes or noise that is not positive."""
     _check(setting, heard)
     return solve(
         lambda parameters, rows: linearize(setting, heard.take(rows), parameters),
@@ -93,7 +93,7 @@ def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m:
     """Compute the CRLB at the truth.
 
     Args:
-        setting: how the estimator sees the world.
+        setting: assumptions of the estimator.
         shooter_m: (runs, 2).
         trajectory_rad: (runs,), the direction of the bullet.
         sensor_m: (sensors, 2), or (runs, sensors, 2).
@@ -110,7 +110,7 @@ def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m:
 def noise_free(
     medium: Medium, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats
 ) -> Detections:
-    """Compute what perfect sensors hear.
+    """Compute the detections of noise-free sensors.
 
     Args:
         medium: the speeds of sound and bullet.
@@ -127,7 +127,7 @@ def noise_free(
 def starting_point(setting: Setting, heard: Detections) -> Floats:
     """Find where the bearings meet, the shockwaves' mean trajectory, and the position fixes.
 
-    The tangents and cotangents of eqs (32)-(34) are the same rays with other weights.
+    The tangents and cotangents of eqs (32)-(34) describe the same rays with other weights.
     """
     unit = np.stack([np.cos(heard.muzzle_blast_rad), np.sin(heard.muzzle_blast_rad)], axis=-1)
     parts = [intersect_rays(heard.position_m, unit)]
@@ -142,14 +142,14 @@ def starting_point(setting: Setting, heard: Detections) -> Floats:
 
 
 def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linearization:
-    """Linearize the chosen measurements, one block of correlated errors per sensor.
+    """Linearize the chosen measurements, with one block of correlated errors per sensor.
 
-    Where the sensors are not estimated, the bound that follows leaves out how the position fixes' share
-    in the covariance depends on the parameters.
+    If the sensors are not estimated, the position fixes' share of the covariance depends on the
+    parameters, which the resulting bound ignores.
 
     Args:
-        setting: how the estimator sees the world.
-        heard: one shot per run, as all sensors heard it.
+        setting: assumptions of the estimator.
+        heard: one shot per run, as detected by all sensors.
         parameters: (runs, n), at which it is linearised.
     """
     position = heard.position_m
@@ -172,7 +172,7 @@ def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linear
 
 
 class _Geometry(NamedTuple):
-    """Holds how the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
+    """Position of the shooter relative to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
 
     azimuth_rad: Floats
     range_m: Floats
@@ -180,7 +180,7 @@ class _Geometry(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """Holds k measurements of every sensor, NaN where missing, with derivatives in a last axis.
+    """k measurements of every sensor, NaN where missing, with derivatives in a last axis.
 
     residual (runs, sensors, k), jacobian (..., k, d), covariance (..., k, k), and its derivative slope
     (..., k, k, d): by azimuth, range and trajectory (d = 3) at first, by all parameters in the end.
@@ -198,7 +198,7 @@ def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Bloc
 
 
 def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Return both directions of arrival and the delay, on the branch nearest to the shockwave."""
+    """Compute both directions of arrival and the delay, on the branch nearest to the shockwave."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     misses = [
@@ -219,7 +219,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
 
 
 def _local_estimates(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Return bearing, and the range and the trajectory that a sensor works out of what it heard."""
+    """Compute the bearing, and the range and trajectory that a sensor derives from its detections."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     side = model.measured_side(heard.muzzle_blast_rad, heard.shockwave_rad)
@@ -266,17 +266,15 @@ def _check(setting: Setting, heard: Detections) -> None:
         expected = (*shape, 2) if name == "position_m" else shape
         if len(shape) != 2 or column.shape != expected:
             raise BadInput(
-                f"detections: {name} has shape {column.shape} beside {shape} of the muzzle blasts; "
-                "give (runs, sensors), and (runs, sensors, 2) positions"
+                f"detections: {name} has shape {column.shape}, and muzzle blasts have shape {shape}; "
+                "expected (runs, sensors), and (runs, sensors, 2) for positions"
             )
     if min(setting.noise) <= 0.0:
-        raise BadInput(
-            f"acoustic noise {setting.noise} must be positive; give standard deviations above zero"
-        )
+        raise BadInput(f"acoustic noise {setting.noise}: all standard deviations must be positive")
 
 
 def _blocks(residual: list, jacobian: list, covariance: list, slope: list | None = None) -> _Blocks:
-    """Make blocks from lists, nested as deep as the matrix, of numbers and arrays (runs, sensors)."""
+    """Make blocks from nested lists of numbers and arrays (runs, sensors)."""
     shape = residual[0].shape
     return _Blocks(
         _stack(residual, shape),
@@ -293,7 +291,7 @@ def _stack(entries: list | tuple | Floats | float, shape: tuple[int, ...]) -> Fl
 
 
 def _chain_rule(setting: Setting, azimuth: Floats, distance: Floats) -> Floats:
-    """Return derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
+    """Compute derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
     runs, sensors = distance.shape
     x, y = np.cos(azimuth), np.sin(azimuth)
     by_shooter = _stack([[-y / distance, x / distance], [x, y], [0.0, 0.0]], distance.shape)
@@ -315,7 +313,7 @@ def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
 
 
 def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
-    """Take position fixes as two more measurements of every sensor, which are its last parameters."""
+    """Append position fixes as two more measurements of every sensor, which are its last parameters."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)
     wider = [(0, 0), (0, 0), (0, 2), (0, 2)]
@@ -330,7 +328,7 @@ def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
 
 
 def _absorb_fixes(view: _Blocks, sigma_m: float) -> _Blocks:
-    """Add the error of a position fix, which shifts what is measured as a shift of the shooter would."""
+    """Add the error of a position fix, which shifts the measurements like a shift of the shooter."""
     by_shooter = view.jacobian[..., :2]
     share = sigma_m**2 * by_shooter @ np.swapaxes(by_shooter, 2, 3)
     return view._replace(covariance=view.covariance + share)

@@ -1,9 +1,10 @@
-"""Locates a shooter who moves, from all shots so far: the model `moving-shooter`.
+"""Model `moving-shooter`, which locates a moving shooter from all shots so far.
 
-A report has the muzzle blast's direction of arrival, the bullet's direction as the shockwave tells it,
-and the shockwave's lead. All are of the place from which the shot was fired: the sound has travelled
-since. Reports may be wrong, by an echo or a shockwave of another shot: to Gaussian methods as a whole,
-see `fuselog.replay.inference.linear_algebra.inflation`; to `particles:N` each component by itself.
+A report contains the muzzle blast's direction of arrival, the bullet's direction derived from the
+shockwave, and the shockwave's lead. All of them refer to the position from which the shot was fired, not
+to that at the arrival of the sound. Reports may be wrong, because of an echo or a shockwave of another
+shot. Gaussian methods treat a report as right or wrong as a whole, see
+`fuselog.replay.inference.linear_algebra.inflation`; `particles:N` treats each component separately.
 """
 
 from collections.abc import Mapping
@@ -28,12 +29,12 @@ from fuselog.replay.inference.model.start import Start, Started
 
 _NS = 1e-9
 HALF_TURN = float(np.pi)
-# Residuals of a start's candidates count up to so many standard deviations.
+# Residuals of the candidates for a start are clipped at this number of standard deviations.
 CUT = 3.0
 
 
 class MovingShooterParameters(ModelParameters):
-    """States noise of motion, sensors and air, and how the start is found.
+    """Noise of motion, sensors and air, and the search for the start.
 
     Attributes:
         acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
@@ -42,11 +43,11 @@ class MovingShooterParameters(ModelParameters):
         sigma_shockwave_rad: standard deviation of the angle at which a sensor hears the shockwave.
         sigma_time_difference_s: standard deviation of the time between shockwave and muzzle blast.
         speed_of_sound_mps: speed of sound in the air.
-        mach_number: speed of the bullet, in speeds of sound.
+        mach_number: speed of the bullet, as a multiple of the speed of sound.
         outlier_probability: probability that a component of a report is wrong and may have any value;
             only `particles:N` uses it.
         longest_s: longest time between shockwave and muzzle blast that a wrong report may have.
-        start_s: the start is found in the reports of so long.
+        start_s: duration of the reports in which the start is found.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
         start_sigma_rad: standard deviation of the direction of shots at the start.
@@ -68,13 +69,13 @@ class MovingShooterParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return place, aim and velocity after a while."""
+    """Predict position, direction of shots and velocity at constant velocity."""
     x, y, trajectory, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, trajectory, vx, vy
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the rows of the lower triangle of the noise's covariance."""
+    """Compute the rows of the lower triangle of the process noise covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     aim = parameters.trajectory_density**2 * duration_s
     # fmt: off
@@ -89,11 +90,11 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def hear(state: Components, sensor: Components, parameters: Any) -> Components:
-    """Return the muzzle blast's direction of arrival, the bullet's direction, and the shockwave's lead.
+    """Compute the muzzle blast's direction of arrival, the bullet's direction, and the shockwave's lead.
 
-    The lead is that of a shockwave from the left of the muzzle blast, and that of one from the right: a
-    sensor is on one side of the line of fire, and that it knows. Each goes on beyond the line without a
-    kink, which the lead of whoever hears it has there.
+    There are two leads, for a shockwave from the left of the muzzle blast and for one from the right: a
+    sensor is on one side of the line of fire, and its report uses the lead of that side. Each lead
+    continues smoothly across the line of fire, where the true lead has a kink.
     """
     x, y, trajectory, vx, vy = state
     speed = parameters.speed_of_sound_mps
@@ -106,7 +107,7 @@ def hear(state: Components, sensor: Components, parameters: Any) -> Components:
 
 
 def hear_noise(parameters: Any) -> Components:
-    """Return the variances of what is heard."""
+    """Return the variances of a report's components."""
     return (
         parameters.sigma_muzzle_blast_rad**2,
         parameters.sigma_shockwave_rad**2,
@@ -118,7 +119,7 @@ def hear_noise(parameters: Any) -> Components:
 def log_likelihood(
     state: Components, measured: Components, sensor: Components, parameters: Any
 ) -> float:
-    """Compute the likelihood; each component is wrong with a probability, and may be anything then."""
+    """Compute the log-likelihood of a report, each component of which may be an outlier of any value."""
     azimuth, trajectory, left, right = hear(state, sensor, parameters)
     turn, longest, share = 2.0 * HALF_TURN, parameters.longest_s, parameters.outlier_probability
     lead_s = parameters.sigma_time_difference_s
@@ -132,7 +133,7 @@ def log_likelihood(
 
 
 def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> float:
-    """Compute the log density of a Gaussian with a share spread over a span; 0 of what is missing."""
+    """Compute the log density of a Gaussian mixed with a uniform density; 0 for a missing value."""
     if np.isnan(deviation):
         return 0.0
     gaussian = -0.5 * (deviation / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_TWO_PI
@@ -140,11 +141,12 @@ def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> f
 
 
 def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Return the shot that fits most of the first reports; BadInput where nothing tells it.
+    """Find the shot that fits most of the first reports.
 
-    Wherever the muzzle blasts of two sensors meet, with every direction of the bullet that was heard, is
-    tried; from where the residuals, cut off at three standard deviations, are least, least squares go on
-    with Cauchy's loss. It leaves wrong reports out as long as most are right.
+    Candidates are all points where the muzzle blasts of two sensors meet, with every direction of the
+    bullet in the reports. Least squares with Cauchy's loss start from the candidate with the smallest
+    residuals, clipped at three standard deviations, and suppress wrong reports if most are right. Raises
+    BadInput if the reports do not determine a shot.
     """
     reports, sensors = streams["reports"], streams[SENSORS.topic]
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))
@@ -165,16 +167,14 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
                 int(time_ns[begin]), mean, np.diag(sigma**2), "where its first shot fits best"
             )
     raise BadInput(
-        f"topic {reports.topic}: no span of {parameters.start_s:g} s has muzzle blasts of two sensors "
-        "of "
-        f"{SENSORS.topic} whose directions meet, and a shockwave; make start_s longer, or give the log "
-        "a "
-        "prior"
+        f"topic {reports.topic}: no span of {parameters.start_s:g} s has a shockwave, and muzzle blasts "
+        f"of two sensors of {SENSORS.topic} whose directions meet; use a longer start_s, or add a prior "
+        "to the log"
     )
 
 
 def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None:
-    """Find place and direction (3,) of a shot by what sensors (n, 2) hear (n, 4); None of too little."""
+    """Fit position and direction (3,) of a shot to reports (n, 4) from sensors (n, 2), if possible."""
     sigma = np.sqrt(np.array(hear_noise(parameters)))
 
     def residuals(shot: Floats) -> Floats:
@@ -195,7 +195,7 @@ def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None
     tried = np.column_stack([np.repeat(meeting, len(aims), axis=0), np.tile(aims, len(meeting))])
     cut = np.minimum(residuals(tried.T[..., None]) ** 2, CUT**2).sum(axis=(1, 2))
     start = tried[np.argmin(cut)]
-    from scipy.optimize import least_squares  # which takes long to import
+    from scipy.optimize import least_squares  # slow to import
 
     return least_squares(lambda shot: residuals(shot).ravel(), start, loss="cauchy").x
 
@@ -207,10 +207,10 @@ HEARD: Components = {
     "left_lead_s": "linear",
     "right_lead_s": "linear",
 }
-# Of logs that do not say it: somebody on foot.
+# For logs that do not state it: a person on foot.
 ASSUMED = {"acceleration_density": 0.1, "trajectory_density": 0.05}
 MOVING_SHOOTER = Model(
-    "a shooter who moves, from the shots that acoustic sensors hear",
+    "a moving shooter, from the shots that acoustic sensors hear",
     {
         "x_m": "linear",
         "y_m": "linear",

@@ -1,8 +1,8 @@
-"""Locates a sound by differences of its arrivals at microphones: the model `sound-source`.
+"""Model `sound-source`, which locates a sound from differences of its arrivals at microphones.
 
-All differences are of one reference, whose own error they share: it is a part of the state, so that the
-differences are independent given it. A source of microphones that all are at one height is taken to be
-there, for nothing tells by how much it is above or below.
+All differences refer to one reference microphone and share its error. This error is part of the state,
+so that the differences are independent given it. If all microphones are at one height, the source is
+assumed to be at that height too, because the data do not determine its height above or below.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,26 +21,26 @@ from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started
 
-# A source is sought on a grid about the microphones, so many times as large as they are apart, and from
-# the best of its points on.
+# Grid around the microphones on which the search for a source begins, in units of the array's size, and
+# number of the best grid points from which it continues.
 SOUGHT = np.linspace(-1.5, 1.5, 21)
 BEST = 3
-ALIKE = 6  # decimals of a cost, in units of one standard deviation squared, that tell two places apart
-NEAR_M = 1e-9  # from a microphone, where no direction leads to it
-WIDER = 100.0  # of the standard deviations of what is found: a start that is worth a ten-thousandth
+ALIKE = 6  # decimals of a cost, in squared standard deviations, that distinguish two positions
+NEAR_M = 1e-9  # least distance to a microphone, at which the direction is undefined
+WIDER = 100.0  # factor on the start's standard deviations, so that it has 1e-4 of the information
 
 
 class SoundSourceParameters(ModelParameters):
-    """States the air and the start.
+    """Speed of sound, and the search for the start.
 
-    The start is found by least squares; its standard deviation is a hundred times what these say, so
-    that it counts little beside the differences.
+    The start is found by least squares. Its standard deviations are a hundred times those that the
+    differences imply, so that it counts little compared with them.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
         start_sigma_m: largest standard deviation of the start, per axis.
-        height_sigma_m: standard deviation of the source's height from that of the microphones, where all
-            have one.
+        height_sigma_m: standard deviation of the source's height from that of the microphones, if all
+            are at one height.
     """
 
     speed_of_sound_mps: PositiveFloat | None = None
@@ -49,31 +49,31 @@ class SoundSourceParameters(ModelParameters):
 
 
 def stay(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Keep the state: it does not move."""
+    """Return the state unchanged."""
     x, y, z, reference = state
     return x, y, z, reference
 
 
 def hear(state: Components, reference: Components, parameters: Any) -> Components:
-    """Compute how much later a sound comes at the first of two points than at the second, and errs."""
+    """Compute how much later a sound arrives at the first of two points, plus the reference's error."""
     away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
     return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
 
 
 def read_differences(stream: Stream) -> Floats:
-    """Read what is measured (n, 1)."""
+    """Read the measured differences (n, 1)."""
     return stream["difference_s"][:, None]
 
 
 def read_variances(stream: Stream) -> Floats:
-    """Return a reading's covariance (n, 1, 1)."""
+    """Read the covariances (n, 1, 1) of the differences."""
     return stream["variance_s2"][:, None, None]
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Return the place that fits the differences of the first stamp best, sought from all sides.
+    """Find the position that fits the differences of the first stamp best, searching on all sides.
 
-    Raises BadInput where they are fewer than the coordinates that they have to tell.
+    Raises BadInput if there are fewer differences than unknown coordinates.
     """
     stream, points = streams["differences"], streams[MICROPHONES.topic]
     first = stream.take(stream.publish_time_ns == stream.publish_time_ns[:1])
@@ -106,7 +106,7 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
     grid = np.stack(np.meshgrid(*[SOUGHT] * free), axis=-1).reshape(-1, free, 1)
     starts = middle[:free, None] + size * grid
     costs = np.sum(residuals(np.swapaxes(starts, 0, 1)) ** 2, axis=1)
-    from scipy.optimize import least_squares  # which takes long to import
+    from scipy.optimize import least_squares  # slow to import
 
     scale = np.full(free, size)
     fits = [
@@ -128,10 +128,11 @@ def _settled(
     place: Floats,
     near_m: float,
 ) -> tuple[Floats, Floats]:
-    """Find where a soft_l1 cost's gradient is zero, near a place (n,), and the information (n, n) there.
+    """Refine a position (n,) to a root of the cost's gradient; return it and the information (n, n).
 
-    A search by the cost itself ends where rounding hides what is lower, at another place on another CPU.
-    Of a source that nothing tells the distance of, the gradient is zero at infinity: it stays in place.
+    A search by the cost ends where rounding hides lower values, at different points on different CPUs.
+    If the differences do not determine the distance, the gradient is zero at infinity; then the position
+    stays.
     """
 
     def cost(there: Floats) -> float:
@@ -141,7 +142,7 @@ def _settled(
         off = residuals(there)
         return slopes(there).T @ (off / np.sqrt(1.0 + off**2))
 
-    from scipy.optimize import root  # which takes long to import
+    from scipy.optimize import root  # slow to import
 
     found = root(gradient, place, tol=1e-14).x
     if np.linalg.norm(found - place) < near_m and cost(found) <= cost(place) + 10.0**-ALIKE:
@@ -154,7 +155,7 @@ HOW = "where its differences fit best"
 MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
 REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
 SOUND_SOURCE = Model(
-    "where a sound came from, from differences of its arrivals at microphones",
+    "position of a sound source, from differences of arrival times at microphones",
     {"x_m": "linear", "y_m": "linear", "z_m": "linear", "reference_s": "linear"},
     SoundSourceParameters,
     (

@@ -1,4 +1,4 @@
-"""Draws shots: a map of sensors, what they heard as rays, the shot's ellipses; NEES."""
+"""Timeline of shots: a map of sensors, detections as rays, and the shot's ellipses, next to NEES."""
 
 from typing import NamedTuple
 
@@ -37,16 +37,16 @@ from fuselog.replay.timeline.drawing.plots import draw_quality
 CASE = "shooter"
 MUZZLE_BLAST = (150, 150, 150, 160)
 SHOCKWAVE = (170, 110, 60, 160)
-# The bullet is drawn up to this share of the map.
+# Length of the bullet's drawn path as a share of the map.
 CONE_SHARE = 0.7
 
 
 class Cone(NamedTuple):
-    """Describes how a shot is drawn.
+    """Size and duration of a drawn shot.
 
     Attributes:
-        length_m: of the bullet's way.
-        mach_angle_rad: half the shockwave's opening.
+        length_m: length of the bullet's path.
+        mach_angle_rad: half the opening angle of the shockwave.
         interval_ns: the usual time between shots.
     """
 
@@ -56,7 +56,7 @@ class Cone(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the map and events beside errors and NEES."""
+    """Draw the map and events next to errors and NEES."""
     turn_up(canvas)
     numbers = list(numbered(scene.source.topics, "sensor", "detections", schemas.SHOT_DETECTION))
     sensors = [s for s in numbers if f"/sensor{s}/position" in scene.source.topics]
@@ -73,7 +73,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         _draw_shot(canvas, "truth", TRUE, then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
         _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator)), stream, cone)
-    name = "Map; the bullet's way ends in its shockwave"
+    name = "Map; the bullet's path ends at its shockwave"
     colours = scene.colours(CASE) | {"muzzle blast": MUZZLE_BLAST[:3], "shockwave": SHOCKWAVE[:3]}
     board = with_legend(canvas, ROOT, colours, plane_view(canvas, ROOT, [], [], shown, name=name))
     board = above_events(board, draw_events(canvas, scene, CASE))
@@ -81,7 +81,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _place(scene: Scene, sensor: int) -> Floats:
-    """Find where a sensor stands (2,): by the truth, else by its first fix; NaN where it has none."""
+    """Find a sensor's position (2,), from the truth or else its first fix; NaN if it has neither."""
     for truth in scene.truths_of(CASE):
         columns = [truth.components.index(name) for name in sensor_components(sensor)]
         return truth["state"][0, columns]
@@ -90,7 +90,7 @@ def _place(scene: Scene, sensor: int) -> Floats:
 
 
 def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
-    """Return the Mach angle as the detections' channels state it, else as usual."""
+    """Return the Mach angle as the detections' channels state it, or else the usual one."""
     for sensor in sensors:
         stated = scene.source.topics[f"/sensor{sensor}/detections"].metadata
         if "mach_number" in stated:
@@ -99,7 +99,7 @@ def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
 
 
 def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: float) -> Times:
-    """Draw a ray for each direction of arrival, when all have heard the shot; return when that is."""
+    """Draw a ray for each direction of arrival when all sensors have heard the shot; return when."""
     detections, positions = (
         [gather([scene.read(f"/sensor{sensor}/{leaf}")]) for sensor in sensors]
         for leaf in ("detections", "position")
@@ -118,7 +118,7 @@ def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: floa
 
 
 def _draw_estimates(canvas: Canvas, estimator: str, stroke: Stroke, stream: Stream, cone: Cone) -> None:
-    """Draw the shooter's ellipse, and the shot where its direction is estimated."""
+    """Draw the shooter's ellipse, and the shot if its direction is estimated."""
     size = len(stream.components)
     covariances = stream["covariance"].reshape(-1, size, size)[:, :2, :2]
     outline = (stream["mean"][:, :2], covariances, stroke)
@@ -129,7 +129,7 @@ def _draw_estimates(canvas: Canvas, estimator: str, stroke: Stroke, stream: Stre
 def _draw_shot(
     canvas: Canvas, name: str, stroke: Stroke, stream: Stream, states: Floats, cone: Cone
 ) -> None:
-    """Draw the bullet's way and the shockwave's cone behind it, where the trajectory is known."""
+    """Draw the bullet's path and the shockwave's cone behind it, if the trajectory is known."""
     if "trajectory_rad" not in stream.components or len(stream) == 0:
         return
     place, angle = states[:, :2], states[:, 2]

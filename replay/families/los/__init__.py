@@ -1,1 +1,4 @@
-"""Locates targets by lines of sight, and estimates sensors' biases; begin with `localization`."""
+"""Localization of targets from lines of sight, with estimation of sensor biases.
+
+Begin with `localization`.
+"""

@@ -1,8 +1,8 @@
-"""Offers `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
+"""Estimators `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
 
-What is solved together, a batch, holds each line of sight once: where a sensor sees a target again the
-next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on one with
-biases, and scheme 3 `los-biases`.
+A batch, which is solved as a whole, contains each line of sight once: when a sensor sees a target again,
+the next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on a log
+with biases, and scheme 3 is `los-biases`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,22 +34,21 @@ NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/att
 
 
 class PositionsParameters(Parameters):
-    """There are no parameters: all biases are taken as zero."""
+    """No parameters: all biases are assumed to be zero."""
 
 
 class BiasesParameters(Parameters):
-    """States what is known of the biases.
+    """Known biases of the sensors.
 
     Attributes:
-        known_bias_deg: biases that are known, in deg, such as `sensor_2_roll = 0`; all others are
-            estimated.
+        known_bias_deg: known biases, in deg, such as `sensor_2_roll = 0`; all others are estimated.
     """
 
     known_bias_deg: dict[str, float] = {}
 
 
 class Sightings(NamedTuple):
-    """Holds batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
+    """Batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
 
     batches: Batches
     targets: list[int]
@@ -57,7 +56,7 @@ class Sightings(NamedTuple):
 
 
 def gather_sightings(streams: list[Ragged]) -> Sightings:
-    """Lay out the lines of sight of all sensors batch by batch."""
+    """Arrange the lines of sight of all sensors by batch."""
     table = table_of(streams, ["target_id", "azimuth_rad", "elevation_rad"])
     table["look"] = table.groupby(["run", "sensor", "target_id"]).cumcount()
     batches, batch = batches_of(table, "look", streams[0].runs)
@@ -70,7 +69,7 @@ def gather_sightings(streams: list[Ragged]) -> Sightings:
 def _find(
     _: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
 ) -> Iterator[Binding]:
-    """Find the sensors, the noise of their angles and the biases that are known."""
+    """Find the sensors, the noise of their angles and the known biases."""
     sensors = list(numbered(topics, "sensor", "line_of_sight", schemas.LINE_OF_SIGHT))
     streams = [f"/sensor{s}/line_of_sight" for s in sensors]
     static = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
@@ -83,13 +82,13 @@ def _find(
 
 
 def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
-    """Return the known biases (sensors, 3) in rad, NaN where wanted."""
+    """Return the known biases (sensors, 3) in rad, NaN for those to estimate."""
     if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]
     unknown = set(parameters.known_bias_deg) - set(names)
     if unknown:
-        raise BadInput(f"known_bias_deg: no bias '{min(unknown)}'; there are: {', '.join(names)}")
+        raise BadInput(f"known_bias_deg: no bias '{min(unknown)}'; choose from: {', '.join(names)}")
     known = [parameters.known_bias_deg.get(name, np.nan) for name in names]
     return np.radians(known).reshape(-1, 3)
 
@@ -98,7 +97,7 @@ def _solve(given: Given[Any]) -> list[Ragged]:
     sensors, sigma_rad, known_rad = given.setup
     position = [_constant(given[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
     turned = [_constant(given[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    from scipy.spatial.transform import Rotation  # slow to import
 
     nominal = Rotation.from_quat(turned, scalar_first=True).inv().as_euler("ZYX")
     scene = Scene(np.array(position), nominal, sigma_rad, known_rad)
@@ -109,20 +108,20 @@ def _solve(given: Given[Any]) -> list[Ragged]:
 
 
 def _constant(ragged: Ragged, field: str, width: int) -> Floats:
-    """Return the one value (width,) that a stream has in all runs."""
+    """Return the one value (width,) of a stream that is the same in all runs."""
     check_width(ragged.stream, field, width)
     values: Floats = ragged[field]
     if len(values) == 0 or (values != values[:1]).any():
         raise BadInput(
             f"topic {ragged.stream.topic}: {field} must be the same in all messages and runs; replay "
-            "logs of other sensors on their own"
+            "logs of other sensors separately"
         )
     return values[0]
 
 
 _solving = partial(batch, find=_find, requirements=NEEDS, solve=_solve)
 LOS_POSITIONS = _solving(
-    "target positions from lines of sight, biases taken as zero: schemes 1 and 2",
+    "target positions from lines of sight, with biases assumed to be zero: schemes 1 and 2",
     parameters=PositionsParameters,
 )
 LOS_BIASES = _solving(

@@ -1,8 +1,8 @@
-"""Finds targets and attitude biases from lines of sight: schemes of Belfadel et al., JAIF 2014.
+"""Estimation of targets and attitude biases from lines of sight: Belfadel et al., JAIF 2014.
 
-The parameters are the positions of all targets (x, y, z each) and then those attitude biases (yaw,
-pitch, roll of each sensor) that are not known. Scheme 3 knows none of them; schemes 1 and 2 take all as
-zero, which in scheme 2 they are not.
+The parameters are the positions of all targets (x, y, z each) and then the attitude biases (yaw, pitch,
+roll of each sensor) that are not known. In scheme 3 all biases are unknown; schemes 1 and 2 assume that
+all are zero, which is wrong in scheme 2.
 """
 
 from collections.abc import Sequence
@@ -32,15 +32,15 @@ from fuselog.replay.estimators.localization.least_squares import (
 )
 from fuselog.replay.estimators.localization.rays import intersect_rays
 
-# Sensors turn together when their turning vectors differ by less than this part of them.
+# Sensors turn together if their turning vectors differ by less than this share of their length.
 SAME_TURN = 1e-6
 
 
 class Scene(NamedTuple):
-    """Holds what is known before the measurements.
+    """Knowledge of the sensors before the measurements.
 
     position_m and nominal_attitude_rad (yaw, pitch, roll) are (sensors, 3), y up. sigma_rad (sensors, 2)
-    is the noise of azimuth and elevation. known_bias_rad (sensors, 3) is NaN where it is wanted.
+    is the noise of azimuth and elevation. known_bias_rad (sensors, 3) is NaN for biases to estimate.
     """
 
     position_m: Floats
@@ -55,10 +55,10 @@ class Scene(NamedTuple):
 
 
 class Observability(NamedTuple):
-    """Holds what the measurements of one run can tell.
+    """Observability of the parameters from the measurements of one run.
 
-    `turning_axis` is the unit vector about which all sensors and targets may turn together unseen, None
-    where the gap is none or another one.
+    `turning_axis` is the unit vector about which all sensors and targets can rotate together without a
+    change in the measurements; None if all parameters are observable, or if others are not.
     """
 
     rank: int
@@ -68,7 +68,7 @@ class Observability(NamedTuple):
 
 
 def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]) -> list[str]:
-    """Name the parameters, with their units, for targets and sensors of these numbers."""
+    """Return the names of the parameters, with units, for targets and sensors with these numbers."""
     places = [name for target in targets for name in target_components(target)]
     biases = [name for sensor in sensors for name in bias_components(sensor)]
     return places + [name for name, wanted in zip(biases, scene.wanted, strict=True) if wanted]
@@ -88,15 +88,14 @@ def predict(scene: Scene, parameters: Floats) -> Floats:
 
 
 def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Solution:
-    """Estimate positions and wanted biases from lines of sight.
+    """Estimate positions and unknown biases from lines of sight.
 
-    The search begins at `start` (runs, n), else where the rays meet. Raises BadInput where shapes do not
-    fit or a noise is not positive.
+    Raises BadInput if shapes do not agree or a noise is not positive.
 
     Args:
-        scene: what is known before the measurements.
+        scene: knowledge before the measurements.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
-        start: (runs, n), where the search begins; else where the rays meet.
+        start: (runs, n), where the search begins; by default, where the rays meet.
     """
     _check(scene, measured)
     return solve(
@@ -106,10 +105,10 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
 
 
 def starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Find where the rays of each target meet, biases taken as zero, (runs, n).
+    """Find the point (runs, n) where the rays of each target meet, with unknown biases set to zero.
 
     Args:
-        scene: what is known before the measurements.
+        scene: knowledge before the measurements.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
 
     Returns:
@@ -122,13 +121,14 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
 
 
 def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Begin as printed, (21)-(23), for the first two sensors, nominal attitudes zero.
+    """Compute the start as printed, (21)-(23), for the first two sensors, with zero nominal attitudes.
 
-    The print has z, x, y as x, y, z. It hangs on the difference of two azimuths: where all is nearly in
-    one upright plane, as in the paper's three-sensor scenes, it starts too far off. Only to try it.
+    The paper has z, x, y for x, y, z. The start depends on the difference of two azimuths: if everything
+    is nearly in one vertical plane, as in the paper's three-sensor scenes, it is too far off. For
+    experiments only.
 
     Args:
-        scene: what is known before the measurements.
+        scene: knowledge before the measurements.
         measured: (runs, targets, sensors, 2), in rad.
 
     Returns:
@@ -149,7 +149,7 @@ def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearizati
     """Linearize lines of sight at parameters.
 
     Args:
-        scene: what is known before the measurements.
+        scene: knowledge before the measurements.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
         parameters: (runs, n).
     """
@@ -177,11 +177,9 @@ def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearizati
 def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observability:
     """Find rank and unobservable directions for one run.
 
-    `measured` only says which lines of sight there are: NaN where none.
-
     Args:
-        scene: what is known before the measurements.
-        measured: (targets, sensors, 2), NaN where there is no line of sight.
+        scene: knowledge before the measurements.
+        measured: (targets, sensors, 2), NaN where there is no line of sight; other values do not matter.
         parameters: (n,).
     """
     counted = (range(1, count + 1) for count in measured.shape[:2])
@@ -194,20 +192,20 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
     if axis is not None:
         first = 3 * len(measured)
         sentence += (
-            f": nothing changes when all sensors and targets turn together about the axis "
-            f"({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}); know one bias with a large share in it: "
+            f": the measurements do not change if all sensors and targets turn together about the axis "
+            f"({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}); fix one of the biases with a large share: "
             + describe_direction(names[first:], unseen[first:, 0])
         )
     elif angles < n:
-        sentence += ": too few angles; another target adds 3 parameters and 2 angles for each sensor"
+        sentence += ": too few angles; each new target adds 3 parameters and 2 angles per sensor"
     elif rank < n:
         directions = (describe_direction(names, direction) for direction in unseen.T)
-        sentence += f": nothing changes with {'; or with '.join(directions)}"
+        sentence += f": the measurements do not change with {'; or with '.join(directions)}"
     return Observability(rank, n, axis, sentence)
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """Find the axis about which this direction turns every sensor alike; None where it does not."""
+    """Find the axis about which a direction turns all sensors alike; None if there is no such axis."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
@@ -222,13 +220,13 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 
 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
-    """Compute the CRLB sigmas of all wanted biases when one of them is known.
+    """Compute the CRLB sigmas of all unknown biases if one of them were known.
 
-    A row with infinite or large values is a bias that must not be the one to fix: what cannot be
-    observed goes on without it.
+    A row with infinite or large values belongs to a bias that must not be the one to fix: fixing it does
+    not make the others observable.
 
     Args:
-        scene: what is known before the measurements.
+        scene: knowledge before the measurements.
         measured: of one run, (targets, sensors, 2), in rad.
         parameters: (n,), at which it is linearised.
 
@@ -250,17 +248,17 @@ def _check(scene: Scene, measured: Floats) -> None:
     sensors = len(scene.position_m)
     for (name, column), width in zip(scene._asdict().items(), (3, 3, 2, 3), strict=True):
         if column.shape != (sensors, width):
-            raise BadInput(f"optical scene: {name} has shape {column.shape}; give {(sensors, width)}")
+            raise BadInput(f"optical scene: {name} has shape {column.shape}, not {(sensors, width)}")
     if measured.ndim != 4 or measured.shape[2:] != (sensors, 2):
         raise BadInput(
-            f"lines of sight have shape {measured.shape}; give (runs, targets, {sensors} sensors, 2)"
+            f"lines of sight have shape {measured.shape}, not (runs, targets, {sensors} sensors, 2)"
         )
     if not (scene.sigma_rad > 0.0).all():
-        raise BadInput("optical scene: sigma_rad must be positive; give each sensor's noise")
+        raise BadInput("optical scene: sigma_rad must be positive for all sensors")
 
 
 def _geometry(scene: Scene, parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return targets, sensors and biased attitudes, components first, to broadcast over both."""
+    """Return targets, sensors and biased attitudes, components first, with shapes that broadcast."""
     runs, sensors = len(parameters), len(scene.position_m)
     targets = (parameters.shape[1] - scene.wanted.sum()) // 3
     target = parameters[:, : 3 * targets].reshape(runs, targets, 3)

@@ -1,12 +1,12 @@
-"""Models moving targets, and attitude biases and clocks of the sensors on aircraft that see them.
+"""Model of moving targets, with attitude biases and clock offsets of the sensors on aircraft.
 
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014
-(`fuselog.recorders.families.los.models`), but nothing stands still and nothing is synchronised. A
-message states the sensor's pose by the sensor's own clock, so that a clock that is ahead by c says what
-the targets were c before its stamp:
+(`fuselog.recorders.families.los.models`), but targets and sensors move and are not synchronised. A
+message states the sensor's pose at a stamp of the sensor's own clock. If this clock is ahead by c, the
+targets are seen as they were c before the stamp:
     (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`: `estimate_drift`
-lets them walk.
+Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`; with
+`estimate_drift` they are random walks.
 """
 
 from typing import Any
@@ -32,7 +32,7 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):
-    """States noise of motion and sights, and the errors of attitudes and clocks.
+    """Noise of motion and lines of sight, and errors of attitudes and clocks.
 
     Attributes:
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
@@ -43,7 +43,7 @@ class MovingSightParameters(ModelParameters):
             pitch.
         sensor_1_roll_bias_rad, sensor_2_roll_bias_rad, sensor_3_roll_bias_rad: bias of this sensor's
             roll.
-        sensor_1_clock_s, sensor_2_clock_s, sensor_3_clock_s: this sensor's clock is ahead by so much.
+        sensor_1_clock_s, sensor_2_clock_s, sensor_3_clock_s: time by which this sensor's clock is ahead.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -64,7 +64,7 @@ class MovingSightParameters(ModelParameters):
 
 
 def moved_target(state: Components, first: int, duration_s: Component) -> Components:
-    """Predict where the target is after a while whose components begin at `first`."""
+    """Predict the position of the target whose components begin at `first`."""
     return (
         state[first] + duration_s * state[first + 3],
         state[first + 1] + duration_s * state[first + 4],
@@ -73,7 +73,7 @@ def moved_target(state: Components, first: int, duration_s: Component) -> Compon
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Move both targets, which keep their velocities."""
+    """Move both targets at constant velocity."""
     x1, y1, z1 = moved_target(state, 0, duration_s)
     x2, y2, z2 = moved_target(state, 6, duration_s)
     velocity1, velocity2 = (state[3], state[4], state[5]), (state[9], state[10], state[11])
@@ -81,17 +81,17 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the variances that white accelerations add.
+    """Compute the variances that white accelerations add.
 
-    What they have in common within one step is left out: steps are fractions of a second, in which the
-    places' own noise is millimetres, and a triangle of 23 components takes minutes to compile.
+    Covariances within a step are left out: steps are fractions of a second, in which the noise of
+    positions is millimetres, and a triangle of 23 components takes minutes to compile.
     """
     place, _, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return (place, place, place, speed, speed, speed, place, place, place, speed, speed, speed)
 
 
 def to_body(orientation: Components, x: Components) -> Components:
-    """Return a vector in the frame of a body with this orientation (w, x, y, z)."""
+    """Rotate a vector into the frame of a body with this orientation (w, x, y, z)."""
     w, a, b, c = orientation
     return (
         (w * w + a * a - b * b - c * c) * x[0]
@@ -107,7 +107,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Return a target's azimuth and elevation, rad; `reference` has its number, and a sensor's pose."""
+    """Compute azimuth and elevation of a target in rad; `reference` is its number, then the pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (
@@ -142,7 +142,7 @@ def _sensor(number: int) -> Sensor:
 
 
 def first_target(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return where the first target is."""
+    """Return the position of the first target."""
     return state[0], state[1], state[2]
 
 

@@ -1,7 +1,7 @@
-"""Draws targets in space that sensors see while both move: tracks, lines of sight, errors close up.
+"""Timeline of moving targets seen by moving sensors: tracks, lines of sight, close-ups of errors.
 
-Drawn for every log of moving lines of sight, whatever made it. Errors are small where distances are
-large, so each target has a view of its own about its true place.
+It draws every log with moving lines of sight, from any source. Errors are small compared with distances,
+so each target has its own view around its true position.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,13 +31,13 @@ from fuselog.replay.timeline.drawing.canvas import (
 from fuselog.replay.timeline.drawing.plane import with_legend
 
 AXES = "xyz"
-# How far a close-up reaches, in sizes of the smallest median error, and where its eye is.
+# Reach of a close-up, in units of the smallest median error, and the position of its eye.
 REACH, EYE = 1.0, np.array([1.6, 1.2, -1.9])
 MARK, THIN = rr.Radius.ui_points(5.0), rr.Radius.ui_points(1.5)
 
 
 class Track(NamedTuple):
-    """States where a target is thought to be (n, 3), or truly is."""
+    """Positions (n, 3) of a target, true or estimated."""
 
     name: str
     target: str
@@ -47,7 +47,7 @@ class Track(NamedTuple):
 
 
 def draw_moving_sights(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
-    """Draw the scene above a close-up of each target's errors: no board without sensors or targets."""
+    """Draw the scene above a close-up of each target's errors; no board without sensors or targets."""
     schema = schemas.MOVING_LINE_OF_SIGHT.full_name
     topics = [
         each for each in scene.topics_near(case) if scene.source.topics[each].schema_name == schema
@@ -84,7 +84,7 @@ def draw_moving_sights(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
 
 
 def _tracks(scene: Scene, case: str) -> Iterator[Track]:
-    """Yield where each target is by the truth, and by all estimates."""
+    """Yield the positions of each target from the truth and from all estimates."""
     found = [("truth", TRUTH, each, each["state"]) for each in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
@@ -96,7 +96,7 @@ def _tracks(scene: Scene, case: str) -> Iterator[Track]:
 
 
 def _targets(components: Sequence[str]) -> list[str]:
-    """Return the targets that components place: target_1, say."""
+    """Return the targets with a position among the components, such as target_1."""
     names = [name.removesuffix("_x_m") for name in components if name.endswith("_x_m")]
     return [name for name in names if {f"{name}_{axis}_m" for axis in AXES} <= set(components)]
 
@@ -106,7 +106,7 @@ def _columns(components: Sequence[str], target: str) -> list[int]:
 
 
 def _draw_way(canvas: Canvas, entity: str, track: Track, label: str | None) -> None:
-    """Draw the whole way of a target, and where it is at the cursor."""
+    """Draw the whole path of a target, and its position at the cursor."""
     way = rr.LineStrips3D([track.places], colors=[track.colour], radii=THIN)
     canvas.fix(f"{entity}/way", way)
     canvas.send(entity, track.time_ns, rr.Points3D.columns(positions=track.places))
@@ -118,8 +118,8 @@ def _draw_way(canvas: Canvas, entity: str, track: Track, label: str | None) -> N
 
 
 def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> None:
-    """Draw a sensor's way, and its line of sight as it is measured, with the attitude as stated."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    """Draw a sensor's path, and its measured line of sight with the attitude as stated."""
+    from scipy.spatial.transform import Rotation  # slow to import
 
     rows = thin(stream.publish_time_ns)
     name = stream.topic.strip("/").partition("/")[0]
@@ -133,7 +133,7 @@ def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> 
 
 
 def _draw_close(canvas: Canvas, scene: Scene, case: str, target: str) -> list[rrb.Spatial3DView]:
-    """Draw the errors of a target with their ellipsoids about its true place: no view without errors."""
+    """Draw a target's errors and their ellipsoids around its true position; no view without errors."""
     found = [each for each in scene.errors_of(case) if target in _targets(each.components)]
     if not found:
         return []

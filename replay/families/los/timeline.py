@@ -1,7 +1,7 @@
-"""Draws optical sensors, targets and lines of sight in space, with NEES, errors, events.
+"""Timeline of optical sensors, targets and lines of sight in space, with NEES, errors and events.
 
-Lines of sight are drawn twice: as measured, with the nominal attitudes, when they come in; and corrected
-by the estimated biases when these are there.
+Lines of sight are drawn twice: as measured, with the nominal attitudes, when they arrive; and corrected
+by the estimated biases when these are available.
 """
 
 import re
@@ -37,14 +37,14 @@ SENSOR: Colour = (240, 228, 66)
 # The longest half axis of an ellipsoid is drawn as about this share of the scene.
 ELLIPSOID_SHARE = 0.03
 MARK = rr.Radius.ui_points(4.0)
-# Rays go on behind the targets by this share.
+# Length of a ray as a factor of the scene's extent, so that rays end behind the targets.
 BEYOND = 1.05
-# From where the scene is seen, in sizes of it from its middle.
+# Position of the eye relative to the scene's centre, in units of the scene's extent.
 EYE = np.array([0.2, 0.5, 1.1])
 
 
 class Sensor(NamedTuple):
-    """States where a sensor stands (3,), its nominal yaw, pitch, roll (3,), and what it saw."""
+    """A sensor with its position (3,), nominal yaw, pitch, roll (3,), and lines of sight."""
 
     number: int
     place: Floats
@@ -53,7 +53,7 @@ class Sensor(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Holds where an estimator has the targets: ellipsoids at each stamp, `at_once` of them."""
+    """An estimator's targets: ellipsoids at each stamp, `at_once` of them."""
 
     estimator: str
     colour: Colour
@@ -65,7 +65,7 @@ class Targets(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the scene in space beside NEES and the errors of all components."""
+    """Draw the scene in space next to NEES and the errors of all components."""
     canvas.fix(ROOT, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
     sensors = list(_sensors(scene))
     targets = _targets(scene)
@@ -84,7 +84,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     scale = max(1.0, nice(ELLIPSOID_SHARE * extent / max(sizes))) if sizes else 1.0
     for each in estimates:
         _draw_estimates(canvas, each, sensors, scale, BEYOND * extent)
-    drawn = f"Scene; 95 % ellipsoids {scale:g} times as large" if estimates else "Scene"
+    drawn = f"Scene; 95 % ellipsoids enlarged {scale:g} times" if estimates else "Scene"
     space = rrb.Spatial3DView(origin=ROOT, name=drawn, eye_controls=eye)
     colours = scene.colours("") | {"sensors": SENSOR, "measured": WRONG}
     board = above_events(with_legend(canvas, ROOT, colours, space), draw_events(canvas, scene, ""))
@@ -92,8 +92,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:
-    """Yield the sensors of the log whose place and attitude it holds."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    """Yield the sensors whose position and attitude are in the log."""
+    from scipy.spatial.transform import Rotation  # slow to import
 
     for topic in scene.source.topics:
         number = re.fullmatch(r"/sensor(\d+)/line_of_sight", topic)
@@ -112,7 +112,7 @@ def _sensors(scene: Scene) -> Iterator[Sensor]:
 
 
 def _targets(scene: Scene) -> Floats:
-    """Return the true places (n, 3) of all targets."""
+    """Return the true positions (n, 3) of all targets."""
     for truth in scene.truths_of(""):
         names = [name for name in truth.components if name.startswith("target_")]
         columns = [truth.components.index(name) for name in names]
@@ -128,7 +128,7 @@ def _draw_points(canvas: Canvas, name: str, places: Floats, colour: Colour) -> N
 
 
 def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> None:
-    """Draw the lines of sight as they come in, biases and all."""
+    """Draw the lines of sight as they arrive, with their biases."""
     for sensor in sensors:
         rays = _rays(sensor, sensor.sights, np.zeros(3), length_m)
         times_ns = sensor.sights.publish_time_ns
@@ -136,7 +136,7 @@ def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> No
 
 
 def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floats:
-    """Return lines (n, 2, 3) from the sensor along what it saw, biases (3,) or (n, 3) taken out."""
+    """Compute lines (n, 2, 3) from the sensor along its sights, corrected by biases (3,) or (n, 3)."""
     attitude = np.broadcast_to(sensor.attitude + bias, (len(sights), 3)).T
     unit = np.stack(direction(sights["azimuth_rad"], sights["elevation_rad"], attitude), axis=1)
     return np.stack([np.broadcast_to(sensor.place, unit.shape), sensor.place + length_m * unit], axis=1)
@@ -148,11 +148,11 @@ def draw_rays(
     """Draw rays, each at its time.
 
     Args:
-        canvas, entity: what is drawn on, and where.
-        shown_ns: sorted times at which some are shown.
-        time_ns: (n,), sorted, each one of these.
+        canvas, entity: the canvas, and the entity on it.
+        shown_ns: sorted times at which rays are shown.
+        time_ns: (n,), sorted, the time of each ray, among these.
         rays: (n, 2, 3), in m, begin and end.
-        colour: theirs.
+        colour: colour of the rays.
     """
     times = np.unique(shown_ns)
     sizes = np.bincount(np.searchsorted(times, time_ns), minlength=len(times))
@@ -163,7 +163,7 @@ def draw_rays(
 
 
 def _targets_of(estimator: str, colour: Colour, stream: Stream) -> Targets:
-    """Compute the ellipsoids of all targets at each stamp, one after another."""
+    """Compute the ellipsoids of all targets, stamp by stamp."""
     count = sum(name.startswith("target_") for name in stream.components) // 3
     covariances = stream["covariance"].reshape(len(stream), len(stream.components), -1)
     blocks = np.stack([covariances[:, i : i + 3, i : i + 3] for i in range(0, 3 * count, 3)], axis=1)
@@ -174,7 +174,7 @@ def _targets_of(estimator: str, colour: Colour, stream: Stream) -> Targets:
 def _draw_estimates(
     canvas: Canvas, targets: Targets, sensors: list[Sensor], scale: float, length_m: float
 ) -> None:
-    """Draw targets' ellipsoids, larger by a scale, and corrected lines of sight so long."""
+    """Draw targets' ellipsoids, enlarged by a scale, and corrected lines of sight."""
     estimator, colour, stream = targets.estimator, targets.colour, targets.stream
     components, times_ns = stream.components, stream.publish_time_ns
     columns = rr.Ellipsoids3D.columns(
@@ -183,7 +183,7 @@ def _draw_estimates(
     entity = f"{ROOT}/{estimator}/targets"
     canvas.send(entity, times_ns, columns.partition([targets.at_once] * len(stream)))
     canvas.fix(entity, rr.Ellipsoids3D.from_fields(colors=[colour]))
-    # a point is seen where the ellipsoid is too small to be
+    # a point stays visible if the ellipsoid is too small
     points = rr.Points3D.columns(positions=targets.centres)
     canvas.send(f"{entity}/place", times_ns, points.partition([targets.at_once] * len(stream)))
     canvas.fix(f"{entity}/place", rr.Points3D.from_fields(colors=[colour], radii=MARK))
@@ -203,8 +203,8 @@ def _draw_estimates(
 
 
 def ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
-    """Return half axes (n, 3) and orientations (n, 4) of what holds Gaussians (n, 3, 3) with 95 %."""
-    from scipy.spatial.transform import Rotation  # which takes long to import
+    """Compute half axes (n, 3) and orientations (n, 4) of the 95 % ellipsoids of Gaussians (n, 3, 3)."""
+    from scipy.spatial.transform import Rotation  # slow to import
 
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -1,1 +1,1 @@
-"""Locates tags by their ranges to anchors; begin with `model`."""
+"""Localization of tags from their ranges to anchors; begin with `model`."""

@@ -1,10 +1,10 @@
-"""Locates something from ranges to anchors whose places are known, as of ultra-wideband radios.
+"""Models that locate tags from ranges to anchors with known positions, as with ultra-wideband radios.
 
-`ranging-pose` has several tags on a body in the plane, and so its heading; `ranging-position` one tag.
-Velocities are random walks. Radios err by more than white noise: they have a bias, `bias_range_m`, an
-error of each anchor or each pair of anchor and tag that lasts for seconds, and outliers where the line
-of sight is blocked. All three are options, see `fuselog.replay.inference.model.augmentation` and
-`fuselog.replay.inference.linear_algebra.inflation`.
+`ranging-pose` uses several tags on a body in the plane, and so estimates its heading as well;
+`ranging-position` uses one tag. Velocities are random walks. Radios have more errors than white noise: a
+bias, `bias_range_m`; an error of each anchor, or of each pair of anchor and tag, that lasts for seconds;
+and outliers when the line of sight is blocked. All three are options, see
+`fuselog.replay.inference.model.augmentation` and `fuselog.replay.inference.linear_algebra.inflation`.
 """
 
 from collections.abc import Mapping
@@ -25,24 +25,24 @@ from fuselog.replay.inference.model.model import Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start, Started
 
-HEADINGS = 8  # from which a pose is sought
+HEADINGS = 8  # from which the search for a pose begins
 _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """States noise, bias and height of the motion, and how the start is found.
+    """Noise, bias and height of the motion, and the search for the start.
 
-    The start is found by least squares in the first ranges, from positions to all sides of the anchors'
-    middle.
+    The start is found by least squares from the first ranges, beginning at positions on all sides of the
+    anchors' centre.
 
     Attributes:
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
         sigma_range_m: standard deviation of a range.
-        bias_range_m: ranges are too long by so much.
+        bias_range_m: bias of measured ranges.
         height_m: height at which the tag moves.
-        range_delay_s: a range was measured so long before its stamp.
-        start_s: the start is found in the ranges of so long.
-        start_reach_m: the search begins so far to all sides of the anchors' middle.
+        range_delay_s: delay of a range's stamp after its measurement.
+        start_s: duration of the ranges in which the start is found.
+        start_reach_m: distance from the anchors' centre at which the search begins, on all sides.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
     """
@@ -59,7 +59,7 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """States how the body turns, too.
+    """Noise and start of the body's rotation.
 
     Attributes:
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
@@ -75,25 +75,25 @@ class PoseRangingParameters(RangingParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return position and velocity after a while."""
+    """Predict position and velocity at constant velocity."""
     x, y, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, vx, vy
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the rows of the lower triangle of the noise's covariance."""
+    """Compute the rows of the lower triangle of the process noise covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return place, 0.0, place, mixed, 0.0, speed, 0.0, mixed, 0.0, speed
 
 
 def move_pose(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return a pose and its velocities after a while."""
+    """Predict a pose and its velocities at constant velocity and turn rate."""
     x, y, heading, vx, vy, turn = state
     return x + duration_s * vx, y + duration_s * vy, heading + duration_s * turn, vx, vy, turn
 
 
 def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the rows of the lower triangle of the noise's covariance."""
+    """Compute the rows of the lower triangle of the process noise covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     angle, turning, turn = noise_moments(parameters.turn_acceleration_density**2, duration_s)
     # fmt: off
@@ -109,13 +109,13 @@ def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Comp
 
 
 def see(state: Components, anchor: Components, parameters: Any) -> Components:
-    """Return the range of an anchor."""
+    """Compute the measured range to an anchor."""
     here = state[0], state[1], parameters.height_m
     return (distance(here, anchor) + parameters.bias_range_m,)
 
 
 def see_by_tag(state: Components, reference: Components, parameters: Any) -> Components:
-    """Return the range of an anchor from a tag on the body, which `reference` has behind the anchor."""
+    """Compute the measured range from a tag to an anchor; `reference` is the anchor, then the tag."""
     cosine, sine = np.cos(state[2]), np.sin(state[2])
     ahead, left, up = reference[3], reference[4], reference[5]
     tag = (
@@ -132,7 +132,7 @@ def see_noise(parameters: Any) -> Components:
 
 
 def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Return the position that fits the first ranges best; see `RangingParameters`, and `find_pose`."""
+    """Find the position that fits the first ranges best; see `RangingParameters` and `find_pose`."""
     time_ns, ranges, anchors, _ = first_ranges(streams, parameters, 3)
 
     def residuals(place: Floats) -> Floats:
@@ -144,13 +144,13 @@ def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Return the pose at rest that fits the first ranges best, sought from several headings.
+    """Find the pose at rest that fits the first ranges best, by searches from several headings.
 
     Args:
         streams: `ranges`, the map of anchors, and the tags.
         parameters: `PoseRangingParameters`.
 
-    Raises BadInput where no `start_s` of the ranges has enough of them.
+    Raises BadInput if no span of `start_s` contains enough ranges.
     """
     time_ns, ranges, anchors, tags = first_ranges(streams, parameters, 4)
 
@@ -177,10 +177,10 @@ def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
 def first_ranges(
     streams: Mapping[str, Stream], parameters: Any, least: int
 ) -> tuple[int, Floats, Floats, Floats]:
-    """Find the first ranges of so many pairs of anchor and tag at least, to three anchors, in `start_s`.
+    """Find the first span of `start_s` with `least` pairs of anchor and tag, and at least three anchors.
 
-    Returns the stamp of the first, the ranges (n,), their anchors (n, 3) and tags (n, 3), zeros where
-    the model has none. Raises BadInput where there are none.
+    Returns the stamp of the first range, the ranges (n,), their anchors (n, 3) and their tags (n, 3),
+    which are zeros for a model without tags. Raises BadInput if there is no such span.
     """
     stream = streams["ranges"]
     time_ns, pairs = stream.publish_time_ns, np.stack([stream["anchor_id"], stream["tag_id"]], axis=1)
@@ -201,39 +201,39 @@ def first_ranges(
             delay_ns = round(parameters.range_delay_s / _NS)
             return int(time_ns[rows[begin]]) - delay_ns, stream["range_m"][chosen], of[:, :3], of[:, 3:]
     raise BadInput(
-        f"topic {stream.topic}: no span of {parameters.start_s:g} s has the ranges of {least} pairs of "
-        f"anchor and tag, to three anchors of {ANCHORS.topic}; make start_s longer, or "
-        "give the log a prior"
+        f"topic {stream.topic}: no span of {parameters.start_s:g} s has ranges of {least} pairs of "
+        f"anchor and tag, with three anchors of {ANCHORS.topic}; use a longer start_s, or "
+        "add a prior to the log"
     )
 
 
 def places(points: Stream | None, asked: Map) -> dict[int, Floats]:
-    """Return the places (3,) of a map by number."""
+    """Return the positions (3,) of a map by number."""
     if points is None:
         return {}
     return dict(zip(points[asked.number].tolist(), points[asked.point], strict=True))
 
 
 def around(anchors: Floats, parameters: Any) -> list[Floats]:
-    """Return places (2,) to four sides of the anchors' middle, from which a search begins.
+    """Return positions (2,) on four sides of the anchors' centre, from which a search begins.
 
     Args:
-        anchors: (n, 3), in m; one that is there more than once counts once.
-        parameters: with `start_reach_m`, how far the places are from the middle.
+        anchors: (n, 3), in m; repeated anchors count once.
+        parameters: with `start_reach_m`, the distance of the positions from the centre.
     """
     middle, reach = np.unique(anchors, axis=0).mean(axis=0)[:2], parameters.start_reach_m
     return [middle + reach * np.array(side) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
 
 
 def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
-    """Return the least of the robust least squares from several starts.
+    """Find the best of the robust least-squares fits from several starts.
 
     Args:
-        residuals: place (k,) -> residuals (n,) of ranges, in m.
-        starts: places (k,) to search from.
-        parameters: with `sigma_range_m`; residuals of more than three of it count less.
+        residuals: position or pose (k,) -> residuals (n,) of ranges, in m.
+        starts: positions or poses (k,) from which to search.
+        parameters: with `sigma_range_m`; residuals of more than three times this count less.
     """
-    from scipy.optimize import least_squares  # which takes long to import
+    from scipy.optimize import least_squares  # slow to import
 
     scale = 3.0 * parameters.sigma_range_m
     fits = [least_squares(residuals, start, loss="soft_l1", f_scale=scale) for start in starts]
@@ -243,7 +243,7 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
 HOW = "where its first ranges fit best"
 VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear"}
 ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "height_m": "linear"}
-# Of logs that do not say it: a radio in the open, on something that is pushed or driven slowly.
+# For logs that do not state it: a radio in the open, on something that is pushed or driven slowly.
 ASSUMED = {"acceleration_density": 0.5, "sigma_range_m": 0.1, "height_m": 1.0}
 RANGING_POSITION = Model(
     "position in the plane from ranges to anchors",

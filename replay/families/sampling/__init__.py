@@ -1,4 +1,4 @@
-"""Models the systems of the S2KF paper; begin with `reactor`.
+"""Models of the systems in the S2KF paper; begin with `reactor`.
 
-The samplings themselves, and the filter that takes them, are in `fuselog.replay.inference`.
+The samplings, and the filter that uses them, are in `fuselog.replay.inference`.
 """

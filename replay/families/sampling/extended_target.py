@@ -1,8 +1,8 @@
-"""Models the extended target: a random walk, measured with multiplicative noise.
+"""Model of an extended target: a random walk, measured with multiplicative noise.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The
-filters take the scales h as Gaussian, though they are uniform: E h^4 = 1/3.
+filters treat the scales h as Gaussian, although they are uniform: E h^4 = 1/3.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ STATES = 4
 
 
 class ExtendedTargetParameters(ModelParameters):
-    """States variances that are added per step, and that of a point.
+    """Variances added per step, and the variance of a measured point.
 
     Attributes:
         size_drift_m2: variance that a step adds to half sides.
@@ -36,7 +36,7 @@ class ExtendedTargetParameters(ModelParameters):
 
 
 def stay(target: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Return a random walk's mean."""
+    """Return the mean of the random walk after a step."""
     return target[0], target[1], target[2], target[3]
 
 
@@ -59,7 +59,7 @@ def point_noise(parameters: Any) -> Components:
 
 
 def read(stream: Stream) -> Floats:
-    """Return the pseudo-measurement (n, 4)."""
+    """Read the pseudo-measurements (n, 4)."""
     return np.stack(quadratic(read_vectors(stream, "position_m", PLANE).T), axis=1)
 
 
@@ -81,7 +81,7 @@ def moments(
 
     Args:
         mean, covariance: of the state: two half sides l and the centre c, in m, (4,) and (4, 4).
-        reference: none.
+        reference: not used.
         parameters: with `point_variance_m2`, r.
         predicted, spread, cross: E y (4,), Cov(y) (4, 4), Cov(state, y) (4, 4), overwritten.
     """
@@ -116,7 +116,7 @@ def scatter(
 ) -> tuple[float, float, float]:
     """Compute the means over the state of v, 2cv and 2v^2 + 4c^2 v, see `moments`, of one axis.
 
-    They are Var m, Cov(m, m^2) and Var m^2 given the state.
+    They are the means of Var m, Cov(m, m^2) and Var m^2 given the state.
 
     Args:
         mean, covariance: (4,), (4, 4).
@@ -147,7 +147,7 @@ def square_covariance(mean: Floats, covariance: Floats, first: int, second: int)
 
     Args:
         mean, covariance: (n,), (n, n).
-        first, second: the places of s and t in the state.
+        first, second: the indices of s and t in the state.
     """
     shared = covariance[first, second]
     return 2.0 * shared * shared + 4.0 * mean[first] * mean[second] * shared

@@ -1,4 +1,4 @@
-"""Draws the extended target: true and estimated rectangles, and the points that are seen."""
+"""Timeline of the extended target: true and estimated rectangles, and the measured points."""
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -25,7 +25,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the plane beside consistency and errors, and sizes in a tab."""
+    """Draw the plane next to consistency and errors, with sizes in a tab."""
     turn_up(canvas)
     shown = [np.empty((0, 2))]
     points = f"{ROOT}/points"

@@ -1,7 +1,7 @@
-"""Models the batch reactor: a quadratic motion, a linear measurement.
+"""Model of the batch reactor, with a quadratic motion and a linear measurement.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
-VI.A and appendix (which prints x_hat where the noise's mean w_hat is meant). In discrete time: every
+VI.A and appendix (which prints x_hat instead of the noise's mean w_hat). Time is discrete: every
 measurement is one step of `step_s`.
 """
 
@@ -18,7 +18,7 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):
-    """States the time step, and variances per step.
+    """Time step, and variances per step.
 
     Attributes:
         step_s: length of a time step.
@@ -32,7 +32,7 @@ class ReactorParameters(ModelParameters):
 
 
 def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Move the reaction by one step."""
+    """Advance the reaction by one step."""
     return react(pressures, parameters.step_s)
 
 
@@ -48,13 +48,13 @@ def moments(
     duration_s: Any,
     parameters: Any,
 ) -> None:
-    """Move mean and covariance by their exact moments.
+    """Predict mean and covariance by their exact moments.
 
     x' = x + g a^2 with a Gaussian: E a^2 = m^2 + P, Var a^2 = 2 P^2 + 4 m^2 P, Cov(x, a^2) = 2 m P_xa.
 
     Args:
         mean, covariance: of both partial pressures, (2,) and (2, 2), changed in place.
-        control, duration_s: of no use: every step is `parameters.step_s` long.
+        control, duration_s: not used: every step is `parameters.step_s` long.
         parameters: with `step_s`.
     """
     square = mean[0] * mean[0] + covariance[0, 0]
@@ -69,7 +69,7 @@ def moments(
 
 
 def read(pressures: Components, reference: Any, parameters: Any) -> Components:
-    """Compute what the sensor reads."""
+    """Compute the reading of the sensor."""
     return total_pressure(pressures)
 
 

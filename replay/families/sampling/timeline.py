@@ -1,4 +1,4 @@
-"""Draws sample sets: every sampling's points in the plane, with the circle that holds 95 %."""
+"""Timeline of sample sets: the points of each sampling in the plane, with the 95 % circle."""
 
 import numpy as np
 import rerun as rr
@@ -8,11 +8,11 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.timeline.drawing.canvas import MUTED, WRONG, Canvas, Scene, Timeline
 from fuselog.replay.timeline.drawing.plane import ROOT, Stroke, ellipses, plane_view, turn_up
 
-PIXELS = 14.0  # the radius of a sample that has all the weight
+PIXELS = 14.0  # radius of a sample with weight 1
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return a view for each set; the area of a point is its weight, a red one has a negative weight."""
+    """Draw a view for each set; the area of a point is its weight, and negative weights are red."""
     turn_up(canvas)
     views = [
         _draw_set(canvas, scene, name, stream)

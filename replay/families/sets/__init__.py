@@ -1,1 +1,1 @@
-"""Computes guaranteed sets of positions from bounded errors; begin with `set_membership`."""
+"""Guaranteed sets of positions from bounded errors; begin with `set_membership`."""

@@ -1,13 +1,13 @@
-"""Moves guaranteed position sets by odometry with bounded errors, and cuts them by every frame.
+"""Filter of guaranteed position sets: moved by odometry with bounded errors, and cut by every frame.
 
-Briechle, Hanebeck (2004) gives the set of one frame of relative bearings, see `set_membership`; moving
+Briechle, Hanebeck (2004) give the set of one frame of relative bearings, see `set_membership`; moving
 and intersecting sets is the recursion of Schweppe, Recursive State Estimation: Unknown but Bounded
-Errors and System Inputs (1968). Errors of odometry are bounded over a span, not per second: a robot
-that starts late is late once. So each frame cuts the set at an earlier stamp, the anchor, and the set of
-now is moved from there in one go.
+Errors and System Inputs (1968). The error of odometry is bounded over a span, not per second: a robot
+that starts late is late only once. So each frame cuts the set at an earlier stamp, the anchor, and the
+current set is moved from there in one step.
 
-A frame and what came before it that contradict each other leave two sets, one of which holds the robot
-if only one of them is wrong; the union is the estimate until later frames have emptied one of the two.
+If a frame contradicts the set before it, two sets are kept, one of which contains the robot if only one
+of them is wrong. Their union is the estimate until later frames have emptied one of the two.
 """
 
 from __future__ import annotations
@@ -78,10 +78,10 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
 class SetFilterParameters(SetParameters):
-    """States bounds of the errors; those that are none are what the channels state.
+    """Bounds of the errors; missing bounds are read from the channels.
 
-    Over a span of T s the position of the odometry is off by at most `position_error_m` + T
-    `position_error_mps`, seen from the pose at the beginning, and its heading by at most
+    Over a span of T s, the position of the odometry is wrong by at most `position_error_m` + T
+    `position_error_mps`, relative to the pose at the beginning, and its heading by at most
     `heading_error_rad` + T `heading_error_radps`.
 
     Attributes:
@@ -91,8 +91,9 @@ class SetFilterParameters(SetParameters):
         position_error_mps: bound of the odometry's error of position per second.
         heading_error_rad: bound of the odometry's error of heading that does not grow with time.
         heading_error_radps: bound of the odometry's error of heading per second.
-        anchor_s: after this time the current set becomes the one that motion is counted from.
-        most_edges: a part of a set with more edges is replaced by a larger one of the form L = 8.
+        anchor_s: time after which the current set becomes the set from which motion is counted.
+        most_edges: number of edges above which a part of a set is replaced by a larger one of the form
+            L = 8.
     """
 
     least_landmarks: Annotated[int, Field(ge=2)] = 2
@@ -106,15 +107,16 @@ class SetFilterParameters(SetParameters):
 
 
 class SetStep(NamedTuple):
-    """Holds the estimate at one frame.
+    """The estimate at one frame.
 
     Attributes:
         time_ns: of the frame.
-        anchor_ns: of the set that this one was moved from; its own stamp where there was none.
-        parts: the set, one part more where two contradict each other.
-        headings: where the heading lies.
-        growth: how many times larger L = 8 made the set.
-        finding: what this frame showed, a number in FINDINGS; None where all is well.
+        anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if there was
+            none.
+        parts: the set, with another part if it contradicts a frame.
+        headings: interval of the heading.
+        growth: factor by which the form L = 8 enlarged the set.
+        finding: what this frame showed, an index in FINDINGS; None if nothing was wrong.
         blamed: the index of the relative bearing to blame, if any.
     """
 
@@ -129,7 +131,7 @@ class SetStep(NamedTuple):
 
 @dataclass
 class Anchor:
-    """Holds what is known of a robot at an earlier stamp; `parts` as in SetStep."""
+    """The set and headings of a robot at an earlier stamp; `parts` as in SetStep."""
 
     time_ns: int
     pose: Floats
@@ -138,12 +140,12 @@ class Anchor:
 
 
 def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
-    """Return the motion between two stamps by the poses that odometry has there.
+    """Compute the motion between two stamps from the poses of the odometry.
 
     Args:
         time_ns: (2,), the earlier one first.
         poses: (2, 3), x, y in m and heading in rad.
-        bounds: how far odometry errs, which grows with the time between.
+        bounds: of the odometry's error, which grow with the time in between.
     """
     span_s = float(time_ns[1] - time_ns[0]) * 1e-9
     *displacement, turn = relative_pose(*poses)
@@ -155,7 +157,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """Return the headings from which landmarks are seen as they were; None where there are none."""
+    """Narrow headings to those that agree with the bearings of landmarks; None if no heading does."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:
@@ -171,7 +173,7 @@ def follow(
     bounds: Bounds,
     parameters: SetFilterParameters,
 ) -> list[SetStep]:
-    """Return the estimates of one run, from its first frame with a set on."""
+    """Compute the estimates of one run, from its first frame with a set on."""
     anchor: Anchor | None = None
     steps = []
     for frame, seen in found:
@@ -195,7 +197,7 @@ def follow(
 
 
 def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> SetStep:
-    """Say what a frame says by itself."""
+    """Make the estimate of a frame by itself."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
     return SetStep(frame.time_ns, frame.time_ns, [cut], headings)
 
@@ -203,7 +205,7 @@ def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) 
 def _advance(
     anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> SetStep:
-    """Move an anchor's set to a frame and cut it by that; the anchor is cut by the frame as well."""
+    """Move an anchor's set to a frame and cut it by the frame, which cuts the anchor as well."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
     motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
     past = [moved(part, anchor.headings, motion) for part in anchor.parts]
@@ -228,7 +230,7 @@ def _advance(
 def _cut(
     anchor: Anchor, step: SetStep, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
 ) -> SetStep | None:
-    """Cut the step and its anchor by a frame; None, and no change, where nothing would be left."""
+    """Cut the step and its anchor by a frame; return None, without a change, if the cut is empty."""
     common = shapely.union_all(step.parts).intersection(cut)
     if common.area == 0.0:
         return None
@@ -252,7 +254,7 @@ def _cut(
 
 
 def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
-    """Find the relative bearing exceeding its bound most at the corner of a set that suits it best."""
+    """Find the relative bearing that exceeds its bound most, at the corner of a set that fits best."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None
@@ -267,7 +269,7 @@ def _area(parts: Sequence[shapely.Geometry]) -> float:
 
 
 def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
-    """Return a set at every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
+    """Compute a set at every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
     known, bounds = given.setup
     stated = map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad))
     metadata = {
@@ -290,7 +292,7 @@ def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
 def _streams(
     prefix: str, metadata: Mapping[str, str], steps: Sequence[SetStep], frame_at: Mapping[int, Frame]
 ) -> tuple[Stream, ...]:
-    """Make sets as `set_membership` gives them, what each rests on, and what was found wrong."""
+    """Make the streams of sets as in `set_membership`, of their anchors, and of findings."""
     blamed = [(frame_at[step.time_ns], step.blamed) for step in steps if step.blamed is not None]
     with_finding = [step for step in steps if step.finding is not None]
     return (

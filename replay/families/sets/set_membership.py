@@ -1,4 +1,4 @@
-"""Computes guaranteed fixes from bounded relative bearings, one set per frame of one stamp.
+"""Guaranteed position sets from bounded relative bearings, one for each frame of equal stamps.
 
 Briechle, Hanebeck (2004). The estimate is the set itself: the exact one, its tightest box, or the
 pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative bearing to blame is
@@ -33,21 +33,21 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """States the form of the sets, and the bounds they come from; a bound that is none is the log's.
+    """Form of the sets, and bounds of the errors; missing bounds are read from the log.
 
-    Bearings of one stamp give all their pairs.
+    Bearings with equal stamps form all their pairs.
 
     Attributes:
         shape: form of the sets: exact, the box around them, or the paper's pseudo-ellipsoids L = 4 and L
             = 8.
         bound_deg: bound of the error of a relative bearing.
-        weighting: how pseudo-ellipsoids weigh what they fuse: by the least area of each step, of all at
-            once (batch), by the determinant, or all alike (equal).
-        sweeps: how many times pseudo-ellipsoids fuse all pairs.
-        least_landmarks: so many landmarks must be seen at one stamp for a set.
-        arena_m: where the robot is for sure (low x, low y, high x, high y).
-        maximum_range_m: without an arena, a robot is no farther from a landmark that it sees; without
-            this either, no farther than the longest range that its sensor measured.
+        weighting: how pseudo-ellipsoids weigh the rings that they fuse: by the least area of each step,
+            of all steps together (batch), by the determinant, or equally (equal).
+        sweeps: number of times that pseudo-ellipsoids fuse all pairs.
+        least_landmarks: least number of landmarks at one stamp that give a set.
+        arena_m: rectangle that certainly contains the robot (low x, low y, high x, high y).
+        maximum_range_m: without an arena, the greatest distance of a robot from a landmark that it sees;
+            by default the longest range that its sensor measured.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"
@@ -60,7 +60,7 @@ class SetParameters(Parameters):
 
 
 def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floats]:
-    """Return the border of the chosen set of one frame; none where it is empty."""
+    """Compute the border of the chosen set of one frame; no polygons if the set is empty."""
     if parameters.shape in ("l4", "l8"):
         order: Literal[4, 8] = 4 if parameters.shape == "l4" else 8
         try:
@@ -76,7 +76,7 @@ def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floa
 
 
 def solve(given: Given[SetParameters]) -> list[Ragged]:
-    """Return a set for every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
+    """Compute a set for every frame of every run; see `fuselog.replay.engine.api.functions.batch`."""
     known: Known = given.setup
     prefix, metadata = f"/estimates/{given.name}", set_metadata(given.topics["seen"].name, known)
     solved = []
@@ -95,7 +95,7 @@ def solve(given: Given[SetParameters]) -> list[Ragged]:
 
 
 def set_metadata(topic: str, known: Known) -> dict[str, str]:
-    """Describe sets in their channel: of which components, beside which truth, from which frames."""
+    """Make the metadata of a channel of sets: components, truth, and the frames they come from."""
     return {
         "components": "x_m,y_m",
         "kinds": "linear,linear",
@@ -108,12 +108,12 @@ def set_metadata(topic: str, known: Known) -> dict[str, str]:
 def set_streams(
     prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
 ) -> tuple[Stream, Stream]:
-    """Return the sets of a run, and how many vertices each has, as streams.
+    """Make the streams of a run's sets, and of the number of vertices of each.
 
     Args:
         prefix: of their topics.
-        metadata: what the channels state.
-        borders: by stamp (ns) the rings of each set, (vertices, 2) in m; no ring for an empty one.
+        metadata: of the channels.
+        borders: stamp (ns) and rings of each set, (vertices, 2) in m; no rings for an empty set.
     """
 
     def whole(numbers: Iterable[int]) -> Integers:
@@ -141,7 +141,7 @@ def set_streams(
 
 
 def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
-    """Return the relative bearings that are to blame for empty sets, by the frame and its pair."""
+    """Make the stream of relative bearings to blame for empty sets, from frames and indices of pairs."""
     pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
     return make_stream(
         f"{prefix}/fault",
@@ -159,7 +159,7 @@ def bearings_in(topics: Mapping[str, Topic], leaves: Sequence[str]) -> Iterator[
 
     Args:
         topics: of the log.
-        leaves: the ends of the topics' names, the best first.
+        leaves: the last parts of the topics' names, the preferred ones first.
     """
     for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
         leaf = next((leaf for leaf in leaves if f"{prefix}/{leaf}" in topics), None)
@@ -175,15 +175,15 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: SetParameters) -> Ite
 
 
 def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
-    """Read what the parameters say and, where they do not, the channels' metadata."""
+    """Read bounds and arena from the parameters, or from the channels' metadata if not given."""
     bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
     arena_m: tuple[float, ...] | None = parameters.arena_m
     if arena_m is None and "arena_m" in landmarks.metadata:
         arena_m = _numbers(landmarks, "arena_m")
     if arena_m is not None and not (len(arena_m) == 4 and np.all(np.less(arena_m[:2], arena_m[2:]))):
         raise BadInput(
-            f"an arena of {arena_m} m; give low x, low y, high x, high y with --set arena_m=[...] "
-            f"or in the metadata of {landmarks.name}"
+            f"arena_m = {arena_m}: expected low x, low y, high x, high y; set it with --set "
+            f"arena_m=[...] or in the metadata of {landmarks.name}"
         )
     range_m = parameters.maximum_range_m
     if range_m is None and "maximum_range_m" in topic.metadata:
@@ -192,20 +192,20 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
         bound_rad = _numbers(topic, "bound_rad")[0]
     if bound_rad is None:
         raise BadInput(
-            f"topic {topic.name}: the bound of its relative bearings is unknown; give it with --set "
+            f"topic {topic.name}: the bound of its relative bearings is unknown; set it with --set "
             "bound_deg=..., in degrees, or state bound_rad on its channel"
         )
     return Known(bound_rad, parameters.least_landmarks, arena_m, range_m)
 
 
 def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
-    """Read finite numbers, with commas between, that a channel states."""
+    """Read finite numbers, separated by commas, from a channel's metadata."""
     try:
         numbers = tuple(float(part) for part in topic.metadata[name].split(","))
     except ValueError:
         numbers = (np.nan,)
     if not np.isfinite(numbers).all():
-        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; numbers are needed")
+        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; it must be numbers")
     return numbers
 
 

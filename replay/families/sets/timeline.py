@@ -1,6 +1,6 @@
-"""Draws set-valued fixes: every estimator's set as polygons around the truth, and its area.
+"""Timeline of set-valued estimates: every estimator's set as polygons around the truth, and its area.
 
-A frame whose set is empty shows none; the relative bearing to blame is among the events.
+No set is drawn at a frame whose set is empty; the relative bearing to blame is among the events.
 """
 
 from functools import partial
@@ -39,17 +39,17 @@ from fuselog.replay.timeline.drawing.plane import (
 )
 from fuselog.replay.timeline.drawing.plots import draw_curve, plot_view
 
-# What one bearing allows is drawn of so many frames, evenly in time; at the others it is not there.
+# Number of frames, evenly spaced in time, at which the regions of single bearings are drawn.
 BEARING_FRAMES = 100
 ALLOWED = (110, 110, 90)
 FRAMES = partial(rr.SeriesPoints, marker_sizes=[2.5])
-# The map shows what this share of the sets does not reach beyond.
+# Share of the sets that the map's extent contains, along each axis.
 SHOWN_SHARE = 0.9
 SIZE = schemas.ESTIMATE_SIZE
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the plane and events beside the areas, for each robot."""
+    """Draw the plane and events next to the areas, for each robot."""
     turn_up(canvas)
     landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
     if landmarks is not None:
@@ -88,9 +88,9 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
 
 
 def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list[str]:
-    """Draw all places that each single bearing and its bound allow; return the entity, if there are any.
+    """Draw the positions that each single bearing and its bound allow; return the entity, if any.
 
-    What was measured, and what is known of it, is as the channel of a set states.
+    The channel of a set states the topic with the bearings, and the bounds.
     """
     stated = [stream.metadata for _, stream in scene.outputs_of(robot, SIZE)]
     stated = [each for each in stated if {"measured", *Known._fields} <= {*each}]
@@ -109,7 +109,7 @@ def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list
 
 
 def _single(pairs: Pairs) -> list[Pairs]:
-    """Return a frame of one relative bearing for each of a frame."""
+    """Split a frame into frames of one relative bearing each."""
     rows = [slice(row, row + 1) for row in range(len(pairs.angle_rad))]
     return [
         Pairs(pairs.first[row], pairs.second[row], pairs.angle_rad[row], pairs.bound_rad) for row in rows
@@ -119,7 +119,7 @@ def _single(pairs: Pairs) -> list[Pairs]:
 def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
 ) -> tuple[Floats, list[rrb.TimeSeriesView]]:
-    """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas."""
+    """Draw a case's sets; return two corners (2, 2) around most of them, and the plot of their areas."""
     plot, corners, areas = entity_path("plots", case, "area"), [], {}
     for estimator, sizes in scene.outputs_of(case, SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")
@@ -138,7 +138,7 @@ def draw_sets(
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     low, high = np.moveaxis(np.array(corners), 1, 0)
     reach = np.stack([np.quantile(low, tail, axis=0), np.quantile(high, 1.0 - tail, axis=0)])
-    last = ", ".join(f"{each[-1]:.3g} by {estimator}" for estimator, each in areas.items())
+    last = ", ".join(f"{each[-1]:.3g} for {estimator}" for estimator, each in areas.items())
     largest = max(np.max(each, initial=np.finfo(float).tiny) for each in areas.values())
     extent, note = (0.0, nice(1.2 * float(largest))), f", at the end {last}"
     if all(len(each) == 1 for each in areas.values()):

@@ -1,7 +1,8 @@
-"""Draws vessels: reports in the colours of their tracks, on a map and in the tangent plane.
+"""Timeline of vessels: reports in the colours of their tracks, on a map and in the tangent plane.
 
-The map's tiles come from the network; without it the reports are still in their places. Beside it:
-how many tracks and vessels are live, and the share of each vessel's reports that its own track has.
+The map's tiles come from the network; offline the reports are still drawn at their positions. Next to
+the map are the numbers of live tracks and vessels, and the share of each vessel's reports that its own
+track has.
 """
 
 import numpy as np
@@ -23,9 +24,9 @@ REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
 TRAIL_S = 300.0
 LIVE_S = 600.0
 LISTED_VESSELS = 200
-# What is drawn of each estimator at most.
+# Greatest number of reports drawn per estimator.
 DRAWN_REPORTS = 50_000
-# Hues this far apart, in turns, never meet again soon.
+# Golden ratio: its multiples modulo 1 are hues that stay far apart.
 GOLDEN = 0.618034
 
 
@@ -42,7 +43,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) -> rrb.Container:
-    """Draw the reports on the map and in the plane; white without tracks."""
+    """Draw the reports on the map and in the plane, in white if there are no tracks."""
     reports, geodetic = scene.read(REPORTS), scene.read(GEODETIC)
     numbers = np.zeros(len(reports), np.int64)
     if tracks is not None and len(tracks) == len(reports):
@@ -67,7 +68,7 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
 
 
 def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return a colour (n, 3) for every track number; neighbours in number are far apart in hue."""
+    """Return a colour (n, 3) for every track number; successive numbers have very different hues."""
     hue = numbers * GOLDEN % 1.0
     value = np.where(numbers % 2 == 0, 1.0, 0.75)
     colours = hsv_to_rgb(np.stack([hue, np.full(len(hue), 0.7), value], axis=1))
@@ -75,7 +76,7 @@ def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 
 def _draw_live(canvas: Canvas, scene: Scene, tracks: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:
-    """Plot how many tracks and vessels were heard within ten minutes."""
+    """Plot how many tracks and vessels were heard within the last ten minutes."""
     identity = scene.read(IDENTITY)
     curves = [("vessels", TRUTH, identity.publish_time_ns, identity["thing_id"])]
     for name, stream in tracks:
@@ -93,7 +94,7 @@ def _send_curve(canvas: Canvas, entity: str, time_ns: Times, values: NDArray) ->
 
 
 def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.TextDocumentView:
-    """List vessels with their shares, most reports first."""
+    """List vessels with the shares of their reports in their own tracks, most reports first."""
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(reports_of(output)):

@@ -1,10 +1,10 @@
-"""Estimates how many things there are, and where, from unordered scans: the Gaussian mixture PHD.
+"""Gaussian mixture PHD filter: estimates the number and positions of targets from unordered scans.
 
 Source: Vo, Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 54(11), 2006,
-table I (recursion), II (pruning, merging), III (extraction). Things appear anywhere alike, as in Beard,
-Vo, Vo, Arulampalam, "A partially uniform target birth model for Gaussian mixture PHD/CPHD filtering",
-IEEE TAES 49(4), 2013: a detection that nothing explains begins a component, and what is born undetected
-is not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
+table I (recursion), II (pruning, merging), III (extraction). Targets are equally likely to appear
+anywhere, as in Beard, Vo, Vo, Arulampalam, "A partially uniform target birth model for Gaussian mixture
+PHD/CPHD filtering", IEEE TAES 49(4), 2013: every detection also begins a component, and undetected
+births are not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
 """
 
 import warnings
@@ -49,22 +49,22 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class PhdParameters(Parameters):
-    """States motion, births and detections of targets; what is none is what the scans' channel states.
+    """Motion, births and detections of targets; missing values are read from the scans' channel.
 
     Attributes:
-        sensor: the sensor to use, such as `network`; without one each sensor has a filter of its own.
+        sensor: the sensor to use, such as `network`; by default each sensor has its own filter.
         sigma_m: standard deviation of a detection, per axis.
-        variance_m2: its square, an older name for it that goes in the next release.
+        variance_m2: variance of a detection, an older form of `sigma_m` that the next release removes.
         detection_probability: probability that a scan detects a target.
         clutter_per_m2: mean number of false detections in a scan, per area.
-        survival_probability: probability that a target is still there at the next scan.
+        survival_probability: probability that a target is still present at the next scan.
         births_per_m2: mean number of new targets in a scan, per area.
         birth_sigma_mps: standard deviation of a new target's velocity, per axis.
         acceleration_sigma_mps2: standard deviation of the acceleration between two scans, per axis.
         gate_probability: probability that the detection of a component is inside its gate.
-        prune_weight: components of less weight are dropped.
-        merge_squared: components whose squared Mahalanobis distance is below this become one.
-        most_components: so many components are kept at most.
+        prune_weight: weight at or below which a component is dropped.
+        merge_squared: squared Mahalanobis distance up to which components are merged.
+        most_components: greatest number of components that are kept.
     """
 
     sensor: str = ""
@@ -89,14 +89,14 @@ Filtering = Given[PhdParameters]
 
 
 def start(given: Filtering) -> tuple[Filtering, Mixture]:
-    """Return a component of weight 1 at each prior; without one nothing is known yet.
+    """Start with a component of weight 1 at each prior, or without components if there are no priors.
 
-    Raises BadInput where there is no room for all.
+    Raises BadInput if there are more priors than components.
     """
     most = given.parameters.most_components
     if len(given) > most:
         raise BadInput(
-            f"{len(given)} priors are more than {most} components; give --set most_components=..."
+            f"{len(given)} priors exceed the limit of {most} components; raise --set most_components=..."
         )
     mixture = no_components(given.runs, most)
     for component, prior in enumerate(given):
@@ -110,7 +110,7 @@ def start(given: Filtering) -> tuple[Filtering, Mixture]:
 
 
 def no_components(runs: int, most: int) -> Mixture:
-    """Make mixtures without components."""
+    """Make empty mixtures for a number of runs."""
     return Mixture(
         used=np.zeros(runs, np.int64),
         time_ns=np.full(runs, -1),
@@ -122,7 +122,7 @@ def no_components(runs: int, most: int) -> Mixture:
 
 
 def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[Mixture, Sets]:
-    """Return the mixtures after the scans, and the sets that each scan leads to."""
+    """Filter the scans: return the mixtures after them, and the set that each scan leads to."""
     columns: Any = before
     mixture = Mixture(*(column.copy() for column in columns))
     runs, most = mixture.weight.shape
@@ -152,7 +152,7 @@ def _work(most: int, detections: int) -> PhdMemory:
 
 
 def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
-    """Make room for the elements: twice the weight that a scan can lead to at most."""
+    """Make empty sets, with room for twice the greatest weight that each scan can lead to."""
     count = len(scans.time_ns)
     bound = np.empty(count)
     passed = (1.0 - settings.detection_probability) * settings.survival_probability
@@ -182,12 +182,12 @@ def advance(given: Filtering, before: Mixture, block: Block) -> tuple[Mixture, l
 
 
 def scans_of(scan: Ragged, detection: Ragged) -> Scans:
-    """Put detections to their scans.
+    """Combine scans with their detections.
 
-    Raises BadInput as `by_scan` does, and where positions are not in the plane.
+    Raises BadInput as `by_scan` does, and if positions have fewer than two coordinates.
     """
     if len(detection) and detection["position_m"].shape[1] < 2:
-        raise BadInput(f"topic {detection.stream.topic}: positions in the plane need two coordinates")
+        raise BadInput(f"topic {detection.stream.topic}: positions must have at least two coordinates")
     order, (first, end) = by_scan(scan, detection)
     ordered = read_vectors(detection.stream, "position_m", PLANE)[order]
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
@@ -196,7 +196,7 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
 def _outputs(
     topic: str, frame: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture
 ) -> list[Ragged]:
-    """Return per scan the set's size and the expected number, its elements, and the runs that failed."""
+    """Make the streams of set sizes, elements, expected numbers and failed runs."""
     reported = np.flatnonzero(sets.is_reported)
     offsets = np.searchsorted(reported, scans.offsets)
     time_ns, elements, expected = (
@@ -217,7 +217,7 @@ def _outputs(
         mean=sets.mean[rows],
         covariance=sets.covariance[rows].reshape(-1, STATES**2),
     )
-    # a PHD knows the number as a Poisson variable, whose variance is its mean
+    # in a PHD filter the number of targets is Poisson, so that its variance equals its mean
     number, spread = expected[:, None], expected[:, None, None]
     things: Components = {"things": "linear"}
     cardinality = state_stream(f"{topic}/cardinality", time_ns, things, None, number, spread)
@@ -230,9 +230,9 @@ def _outputs(
 
 
 def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
-    """Read what the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
+    """Read the settings from the parameters, or from the scans' channel: see `given_or_stated`."""
     if parameters.variance_m2 is not None:
-        notice = "'variance_m2' is called 'sigma_m' now, its root; the old name goes in the next release"
+        notice = "'variance_m2' will be removed in the next release; use 'sigma_m', its square root"
         warnings.warn(f"gm-phd: {notice}", FutureWarning, stacklevel=2)
     elif parameters.sigma_m is not None:
         parameters = parameters.model_copy(update={"variance_m2": parameters.sigma_m**2})
@@ -242,7 +242,7 @@ def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
 
 
 def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Iterator[Binding]:
-    """Find every sensor with scans and detections; priors of things start all filters in their frame."""
+    """Bind a filter to every sensor with scans and detections, with the priors in the sensor's frame."""
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
         found["prior"].name: found["prior"]

@@ -1,4 +1,4 @@
-"""Recurses the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
+"""Recursion of the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
 
 from typing import Any, NamedTuple
 
@@ -22,12 +22,12 @@ STATES = 4
 PLACE = (0, 2)  # x and y; the velocity of each is next to it
 
 
-# A component is taken for a thing from this weight on.
+# A component with more than this weight counts as a target.
 EXTRACTED = 0.5
 
 
 class PhdSettings(NamedTuple):
-    """Holds the parameters as the kernel has them; the gate is in squared sigmas."""
+    """The parameters as the kernel reads them; the gate is in squared sigmas."""
 
     variance_m2: float
     detection_probability: float
@@ -43,9 +43,9 @@ class PhdSettings(NamedTuple):
 
 @varying(2)
 class Mixture(NamedTuple):
-    """Carries the mixture: first axis run, second the components, of which `used` are taken.
+    """The mixtures of all runs: axes are run and component, of which the first `used` are occupied.
 
-    used, time_ns, failure: (runs,); time is below zero before the first scan. weight, mean, covariance:
+    used, time_ns, failure: (runs,); time is negative before the first scan. weight, mean, covariance:
     (runs, most), (runs, most, 4), (runs, most, 4, 4).
     """
 
@@ -58,7 +58,7 @@ class Mixture(NamedTuple):
 
 
 class Scans(NamedTuple):
-    """Holds scans of all runs in time order; scan s has detections first[s]:end[s] of `place` (n, 2)."""
+    """The scans of all runs in time order; scan s has detections first[s]:end[s] of `place` (n, 2)."""
 
     offsets: Integers
     time_ns: Integers
@@ -68,14 +68,14 @@ class Scans(NamedTuple):
 
 
 class PhdInputs(NamedTuple):
-    """Holds what the recursion goes by."""
+    """Inputs of the recursion."""
 
     events: Scans
     settings: PhdSettings
 
 
 class Sets(NamedTuple):
-    """Holds the output of every scan: the expected number of things, and the elements of the set.
+    """Output of every scan: the expected number of targets, and the elements of the set.
 
     Scan s has room for elements from `room[s]` on, and has filled `elements[s]` of them.
     """
@@ -91,11 +91,11 @@ class Sets(NamedTuple):
 
 @varying(1, step=0, shift=0)
 class PhdMemory(NamedTuple):
-    """Holds what one core works in.
+    """Scratch memory of one core.
 
     Attributes:
         weight, mean, covariance: the components after a scan, before they are reduced.
-        factor, is_merged, heaviest, step, shift: what merging needs of them.
+        factor, is_merged, heaviest, step, shift: needed to merge them.
         innovation: of any detection with a component.
         seen_factor, seen_gain, seen_covariance: of each component as if it were detected: the factor L
             of the innovation's covariance S (2, 2), W = C L^-T (4, 2), and the covariance afterwards.
@@ -116,25 +116,25 @@ class PhdMemory(NamedTuple):
 
 
 def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int) -> None:
-    """Write a component down in a row of anything that has these columns.
+    """Write a component into a row of anything with these columns.
 
     Args:
-        weight, mean, covariance: of the component, the latter (4,), (4, 4).
+        weight, mean, covariance: the component, with mean (4,) and covariance (4, 4).
         mixture: a mixture of one run, or the memory.
-        row: which.
+        row: index of the row.
     """
     mixture.weight[row] = weight
     copy_gaussian(mean, covariance, mixture.mean[row], mixture.covariance[row])
 
 
 def prepare(mean: Floats, covariance: Floats, variance: float, work: PhdMemory, parent: int) -> bool:
-    """Fill what all detections share in the update of a component; False where S is singular.
+    """Compute what the updates of a component by all detections share; return False if S is singular.
 
     Args:
         mean, covariance: of the component, (4,), (4, 4).
         variance: of a detection, per axis, in m^2.
-        work: filled.
-        parent: the component's number.
+        work: memory to fill.
+        parent: index of the component.
     """
     factor, gain = work.seen_factor[parent], work.seen_gain[parent]
     for i in range(2):
@@ -162,16 +162,16 @@ def add_detected(
     work: PhdMemory,
     end: int,
 ) -> int:
-    """Append what one detection makes of every component, and a birth; returns the new end.
+    """Append each component updated by one detection, and a birth; return the new end.
 
     Args:
-        run: which.
-        parents: how many components there are.
-        place: of the detection, (2,), in m.
-        mixture: as predicted, its weights before survival.
+        run: index of the run.
+        parents: number of components before the scan.
+        place: position of the detection, (2,), in m.
+        mixture: the predicted mixture, with weights before survival.
         settings: of the filter.
-        work: with what `prepare` filled of each component; its components are appended to.
-        end: how many of these there are.
+        work: memory with what `prepare` filled for each component; components are appended to it.
+        end: number of components in it.
     """
     first = end
     total = settings.clutter_per_m2
@@ -209,7 +209,7 @@ def add_detected(
 def update(
     run: int, scan: int, scans: Scans, mixture: Mixture, settings: PhdSettings, work: PhdMemory
 ) -> int:
-    """Fill `work` with the components after a scan, pruned; returns how many, -1 for a failure."""
+    """Fill `work` with the pruned components after a scan; return their number, or -1 on failure."""
     parents = mixture.used[run]
     missed = settings.survival_probability * (1.0 - settings.detection_probability)
     for parent in range(parents):
@@ -229,7 +229,7 @@ def update(
 
 
 def squared_distance(work: PhdMemory, member: int, other: int) -> float:
-    """Return the Mahalanobis distance, squared, of two means by the member's covariance."""
+    """Compute the squared Mahalanobis distance of two means under the member's covariance."""
     squared = 0.0
     for row in range(STATES):
         value = work.mean[member, row] - work.mean[other, row]
@@ -241,10 +241,10 @@ def squared_distance(work: PhdMemory, member: int, other: int) -> float:
 
 
 def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
-    """Merge what is close to the heaviest component, and so on with the rest; returns how many are left.
+    """Merge components around the heaviest one, and so on with the rest; return the number of groups.
 
-    The merged ones lie in the places of the heaviest of each group, which `heaviest` lists.
-    Returns -1 where a covariance is not positive definite.
+    Each merged component replaces the heaviest of its group; `heaviest` lists their indices. Returns -1
+    if a covariance is not positive definite.
     """
     for component in range(count):
         work.is_merged[component] = False
@@ -266,9 +266,9 @@ def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
 
 
 def merge_group(seed: int, count: int, settings: PhdSettings, work: PhdMemory) -> None:
-    """Replace a component by the one Gaussian with the moments of all that are close to it.
+    """Replace a component by the one Gaussian with the moments of all components close to it.
 
-    Moments are taken about the seed's mean, which stays where it is until all are found.
+    Moments are taken about the seed's mean, which does not move until all members are found.
     """
     work.is_merged[seed] = True
     total = work.weight[seed]
@@ -302,7 +302,7 @@ def merge_group(seed: int, count: int, settings: PhdSettings, work: PhdMemory) -
 
 
 def keep(run: int, groups: int, mixture: Mixture, work: PhdMemory) -> None:
-    """Carry on the heaviest of the merged components, in order of their weights."""
+    """Keep the heaviest of the merged components, in order of their weights."""
     kept = min(groups, mixture.weight.shape[1])
     for place in range(kept):
         best = place
@@ -321,7 +321,7 @@ def keep(run: int, groups: int, mixture: Mixture, work: PhdMemory) -> None:
 def process(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Take the components of a run through a scan; one from before the mixture's time says nothing."""
+    """Process one scan of a run; a scan before the mixture's time has no effect."""
     scans, settings = inputs
     if mixture.time_ns[run] >= 0:
         duration_s = (scans.time_ns[scan] - mixture.time_ns[run]) * 1e-9
@@ -343,7 +343,7 @@ def process(
 def extract(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Fill in a scan's set: a component stands for as many things as its weight rounds to."""
+    """Fill in a scan's set; the rounded weight of a component is its number of targets."""
     row = sets.room[scan]
     for component in range(mixture.used[run]):
         weight = mixture.weight[run, component]

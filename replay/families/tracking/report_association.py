@@ -1,4 +1,4 @@
-"""Associates reports with tracks, and updates the tracks: the kernel of the report tracker."""
+"""Kernel of the report tracker: association of reports with tracks, and updates of the tracks."""
 
 from typing import NamedTuple
 
@@ -11,17 +11,17 @@ from fuselog.replay.families.tracking.association.clusters import AssociationMem
 LEVELS = 4
 
 
-# How fast the usual interval of a track follows what it does.
+# Gain with which the usual interval of a track follows the observed intervals.
 INTERVAL_GAIN = 0.2
 
 
-# Predictions this far out, in squared sigmas of the widest level, are not looked at more closely.
+# Pairs farther apart than this, in squared sigmas of the widest level, are not considered further.
 GATE = 60.0
 NO_TRACK = -1
 
 
 class ReportSettings(NamedTuple):
-    """Holds the parameters as the kernel has them; the levels' (LEVELS,)."""
+    """The parameters as the kernel reads them; those of the levels have shape (LEVELS,)."""
 
     acceleration_density: Floats
     position_variance: Floats
@@ -38,17 +38,17 @@ class ReportSettings(NamedTuple):
 
 @varying(2)
 class Tracks(NamedTuple):
-    """Holds the tracks of all runs: axes run and a place for each track, of which `used` are taken.
+    """The tracks of all runs: axes run and place; the first `used` places are taken.
 
     Attributes:
-        used: (runs,); met: (runs,) how many there ever were, which numbers them.
+        used: (runs,); met: (runs,) number of tracks ever begun, from which tracks are numbered.
         number, time_ns: (runs, places).
         mean: (runs, places, 4) x, vx, y, vy.
         spread: (runs, places, 3) variance of a position, covariance, variance of a velocity, per axis.
         weight: (runs, places, LEVELS).
-        interval_s: (runs, places) the usual one.
+        interval_s: (runs, places) usual time between reports.
         course_rad, speed_mps: (runs, places) as last reported.
-        held: (runs, places, 2) how often a slow one held its course, and how often not, from 1.
+        held: (runs, places, 2) how often a slow vessel repeated its course, and how often not, from 1.
     """
 
     used: Integers
@@ -65,9 +65,9 @@ class Tracks(NamedTuple):
 
 
 class Reports(NamedTuple):
-    """Holds the reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
+    """The reports of all runs in time order; velocities (n, 2) have variances (n,) of their own.
 
-    The variance is large where course or speed is not known.
+    The variance is large if course or speed is unknown.
     """
 
     offsets: Integers
@@ -80,14 +80,14 @@ class Reports(NamedTuple):
 
 
 class ReportInputs(NamedTuple):
-    """Holds what the tracker goes by."""
+    """Inputs of the tracker."""
 
     events: Reports
     settings: ReportSettings
 
 
 class ReportResults(NamedTuple):
-    """Holds the output of every report: its track's number, mean (n, 4) and spread (n, 3)."""
+    """Output for every report: the number of its track, mean (n, 4) and spread (n, 3)."""
 
     number: Integers
     mean: Floats
@@ -96,9 +96,10 @@ class ReportResults(NamedTuple):
 
 @varying(2)
 class ReportMemory(NamedTuple):
-    """Associates reports of one stamp: see `fuselog.replay.families.tracking.association.association`.
+    """Memory for associating the reports of one stamp.
 
-    Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
+    See `fuselog.replay.families.tracking.association.association`; rows are reports, columns tracks. A
+    report that is `missed` by all tracks begins a new one.
     """
 
     weights: Weights
@@ -107,12 +108,12 @@ class ReportMemory(NamedTuple):
 
 
 def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
-    """Return the spread of one axis after a while of constant velocity with white acceleration.
+    """Predict the spread of one axis with constant velocity and white acceleration.
 
     Args:
         spread: (3,), variance of the position, covariance, variance of the velocity.
-        density: of the acceleration's noise, in m^2/s^3.
-        duration_s: how long.
+        density: power spectral density of the acceleration, in m^2/s^3.
+        duration_s: duration of the prediction.
     """
     return (
         spread[0]
@@ -125,13 +126,13 @@ def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, f
 def reported(
     spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: ReportSettings
 ) -> tuple[float, float, float]:
-    """Return the spread of one axis of what is reported after a while, at a level of noise.
+    """Predict the spread of one axis of a report, at one level of noise.
 
     Args:
         spread, duration_s: as for `widened`.
-        level: which of `LEVELS`.
-        velocity_variance: what the report adds to its level's, in (m/s)^2.
-        settings: with the levels' noise.
+        level: the level, below `LEVELS`.
+        velocity_variance: the report's own variance, added to that of the level, in (m/s)^2.
+        settings: with the noise of the levels.
     """
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
     return (
@@ -142,7 +143,7 @@ def reported(
 
 
 def density_at(difference: tuple[float, float, float, float], a: float, b: float, c: float) -> float:
-    """Compute the density of differences (x, vx, y, vy); each axis has the covariance (a, b; b, c)."""
+    """Compute the density at differences (x, vx, y, vy); each axis has the covariance (a, b; b, c)."""
     x, vx, y, vy = difference
     determinant = a * c - b * b
     squared = c * (x * x + y * y) - 2.0 * b * (x * vx + y * vy) + a * (vx * vx + vy * vy)
@@ -152,12 +153,12 @@ def density_at(difference: tuple[float, float, float, float], a: float, b: float
 def differences(
     mean: Floats, position: Floats, velocity: Floats, duration_s: float
 ) -> tuple[float, float, float, float]:
-    """Compute what is reported (x, vx, y, vy) minus what a track predicts.
+    """Compute the difference (x, vx, y, vy) between a report and a track's prediction.
 
     Args:
-        mean: of the track, (4,) x, vx, y, vy.
+        mean: mean of the track, (4,) x, vx, y, vy.
         position, velocity: as reported, (2,) in m, (2,) in m/s.
-        duration_s: from the track's last report to this one.
+        duration_s: time from the track's last report to this one.
     """
     return (
         position[0] - mean[0] - duration_s * mean[1],
@@ -168,12 +169,12 @@ def differences(
 
 
 def mixed(weight: float, settings: ReportSettings) -> float:
-    """Return the weight of a level before the next report."""
+    """Compute the weight of a level before the next report."""
     return (1.0 - settings.forgetting) * weight + settings.forgetting / LEVELS
 
 
 def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> bool:
-    """Tell whether a course is the one before, or both are not available."""
+    """Test whether a course repeats the one before, or both are unavailable."""
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
     turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
@@ -181,16 +182,16 @@ def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> b
 
 
 def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: ReportSettings) -> bool:
-    """Tell whether a track was, and a report is, so slow that the course says little of the motion."""
+    """Test whether track and report are both so slow that the course says little about the motion."""
     return speed_mps < settings.slow_mps and tracks.speed_mps[run, place] < settings.slow_mps
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
-    """Compute how densely vessels not met before report this, per m^2, s and (m/s)^2.
+    """Compute the density of such reports from vessels not met before, per m^2, s and (m/s)^2.
 
     Args:
         velocity: as reported, (2,) in m/s.
-        own_variance: of that, in (m/s)^2.
+        own_variance: variance of that velocity, in (m/s)^2.
         settings: with births, and the speeds of vessels.
     """
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)
@@ -204,7 +205,7 @@ def birth_density(velocity: Floats, own_variance: float, settings: ReportSetting
 def ratio_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> float:
-    """Compute how much likelier a report is of a track than of a vessel not met before."""
+    """Compute the likelihood ratio of a report coming from a track and from a vessel not met before."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     if duration_s <= 0.0:
         return 0.0
@@ -221,7 +222,7 @@ def ratio_of(
         a, b, c = reported(spread, level, duration_s, reports.velocity_variance[event], settings)
         weight = mixed(tracks.weight[run, place, level], settings)
         density += weight * density_at(difference, a, b, c)
-    # the rate of reports rises until half the usual interval is over, and falls with a long silence
+    # the rate of reports rises during half the usual interval, and falls after a long silence
     usual_s = tracks.interval_s[run, place]
     density *= min(1.0, 2.0 * duration_s / usual_s) / (usual_s + duration_s)
     if are_slow(tracks, run, place, reports.speed_mps[event], settings):
@@ -236,7 +237,7 @@ def ratio_of(
 
 
 def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings) -> int:
-    """Begin a track with a report; returns its place."""
+    """Begin a track with a report and return its place."""
     place = tracks.used[run]
     tracks.used[run] = place + 1
     tracks.number[run, place] = tracks.met[run]
@@ -258,7 +259,7 @@ def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Repo
 def update(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> None:
-    """Take a report into a track."""
+    """Update a track by a report."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     mean, spread = tracks.mean[run, place], tracks.spread[run, place]
     weight = tracks.weight[run, place]
@@ -317,7 +318,7 @@ def take_in(
     settings: ReportSettings,
     results: ReportResults,
 ) -> None:
-    """Give a report to a track, or to a new one, and tell what that then says."""
+    """Assign a report to a track, or to a new one, and fill in the result."""
     if place == NO_TRACK:
         place = begin(run, event, reports, tracks, settings)
     else:
@@ -331,7 +332,7 @@ def take_in(
 
 
 def forget(run: int, now_ns: int, tracks: Tracks, settings: ReportSettings) -> None:
-    """Drop the tracks that are silent for too long; the last takes the place of one that goes."""
+    """Drop the tracks that have been silent for too long; the last track fills the gap."""
     place = 0
     while place < tracks.used[run]:
         if (now_ns - tracks.time_ns[run, place]) * 1e-9 <= settings.forget_s:
@@ -356,7 +357,7 @@ def track(
     results: ReportResults,
     memory: ReportMemory,
 ) -> bool:
-    """Take in one run's reports of one stamp, the surest pair of report and track first."""
+    """Process one run's reports of one stamp, the most likely pair of report and track first."""
     (reports, settings), weights, probability = inputs, memory.weights, memory.probability
     count = end - first
     forget(run, reports.time_ns[first], tracks, settings)

@@ -1,16 +1,17 @@
-"""Tracks vessels from reports that do not say whose they are.
+"""Tracker of vessels from reports that do not identify their sender.
 
-Every report goes to the track from which it is most likely, or begins a new one. Tracks are taken for
-independent point processes: what counts is how likely track i reports now (its rate) times how likely
-it reports this (its predictive density), against the rate and density of vessels not met before. Those
-are anywhere; some rest, in harbours close to each other, the others have any velocity.
-Reports of one stamp are of different vessels; the surest pairs are made first.
+Every report goes to the track that most likely sent it, or begins a new one. Tracks are modelled as
+independent point processes. For each track, its rate of reports now times its predictive density of
+this report is compared with the rate and density of vessels that were not met before. New vessels may
+appear anywhere; some are at rest, close to each other in harbours, the others have any velocity.
+Reports with equal stamps come from different vessels; the most likely pairs are made first.
 
-How a track moves is one of a few levels of noise, from a moored hull to a vessel that turns sharply or
-was silent long. The weights of the levels are learnt by Bayes' rule and forgotten a little with every
-report, and the state is the one Gaussian with the mixture's moments: the first-order generalised
-pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 11.6.2). Both axes have the same noise: three numbers are a track's covariance.
+A track moves with one of several levels of noise, from a moored hull to a vessel that turns sharply or
+was silent for a long time. The weights of the levels are learnt by Bayes' rule and move back a little
+towards equal weights with every report. The state is the Gaussian with the moments of the mixture: the
+first-order generalised pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 11.6.2). Both axes have the same noise, so three numbers are
+enough for a track's covariance.
 """
 
 from collections.abc import Iterator, Mapping
@@ -48,22 +49,23 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """States what is assumed of vessels and their receivers; the same for all.
+    """Assumptions about vessels and their receivers, the same for all of them.
 
-    There are several levels of noise, the smallest first, which each track weighs.
+    Each track weighs several levels of noise, the smallest first.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration by level, in m^2/s^3.
         sigma_position_m: standard deviation of a position by level, per axis, in m.
         sigma_velocity_mps: standard deviation of a velocity by level, per axis, in m/s.
         forgetting: share by which a report moves the weights of the levels back to equal ones.
-        births_per_km2_h: new vessels per area and time.
+        births_per_km2_h: number of new vessels per area and time.
         resting_share: share of new vessels that are at rest.
         top_speed_mps: greatest speed of a vessel.
         usual_interval_s: time between a vessel's reports that a new track assumes.
-        slow_mps: a vessel that is slower may be at rest, and then often repeats its last course.
-        course_width_deg: a course that is repeated within this tells a vessel at rest from others.
-        forget_s: a track that is silent for so long ends.
+        slow_mps: speed below which a vessel may be at rest, and then often repeats its last course.
+        course_width_deg: difference within which a course counts as repeated, which distinguishes a
+            vessel at rest from others.
+        forget_s: time without a report after which a track ends.
     """
 
     acceleration_density: FOUR = (1e-6, 1e-4, 1e-2, 1.0)
@@ -91,7 +93,7 @@ def start(given: Reporting) -> tuple[Reporting, Tracks]:
 
 
 def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, list[Ragged]]:
-    """Track a block; see `fuselog.replay.engine.api.functions.recursive`."""
+    """Track vessels over a block; see `fuselog.replay.engine.api.functions.recursive`."""
     settings, topic = given.setup, given.topics["reports"].name
     reports = _reports(block, topic, settings)
     tracks = _with_room(before, int(np.diff(reports.offsets).max(initial=0)))
@@ -114,7 +116,7 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
 
 
 def covariances(spread: Floats) -> Floats:
-    """Return the covariances (n, 4, 4) of spreads (n, 3)."""
+    """Expand spreads (n, 3) to covariances (n, 4, 4)."""
     found = np.zeros((len(spread), 4, 4))
     for axis in (0, 2):
         found[:, axis, axis] = spread[:, 0]
@@ -127,7 +129,7 @@ def _reports(block: Block, topic: str, settings: ReportSettings) -> Reports:
     offsets, time_ns, _, source, _ = block.events
     given = block.streams[topic]
     course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
-    # nothing is known of the direction, or of the speed either: a wide velocity about zero
+    # with an unknown direction, or an unknown speed as well, the velocity is wide about zero
     fastest = settings.top_speed_mps
     unknown = np.isnan(course_rad) | np.isnan(speed_mps)
     variance = np.where(unknown, np.where(np.isnan(speed_mps), fastest, speed_mps) ** 2, 0.0)
@@ -155,7 +157,7 @@ def _no_tracks(runs: int) -> Tracks:
 
 
 def _with_room(tracks: Tracks, more: int) -> Tracks:
-    """Copy the tracks, with places for so many more."""
+    """Copy the tracks, with room for `more` additional tracks in each run."""
 
     def with_room(each: NDArray) -> NDArray:
         room = np.zeros((len(each), more, *each.shape[2:]), each.dtype)
@@ -166,7 +168,7 @@ def _with_room(tracks: Tracks, more: int) -> Tracks:
 
 
 def _trimmed(tracks: Tracks) -> Tracks:
-    """Leave out the places that no run uses."""
+    """Remove the columns that no run uses."""
     most = int(tracks.used.max(initial=0))
     columns: Any = tracks
     return Tracks(*(each if each.ndim == 1 else each[:, :most].copy() for each in columns))
@@ -181,9 +183,9 @@ def _memory(reports: int, places: int) -> ReportMemory:
 
 
 def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
-    """Return the parameters as the kernel has them; births per m^2 and s.
+    """Convert the parameters to the kernel's settings, with births per m^2 and s.
 
-    Raises BadInput where the last level is not the widest: gates are made with that.
+    Raises BadInput if the last level is not the widest, because gates are computed with it.
     """
     for name in ("acceleration_density", "sigma_position_m", "sigma_velocity_mps"):
         levels = getattr(parameters, name)
@@ -212,7 +214,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: ReportTrackerParamete
 
 
 REPORT_TRACKER = recursive(
-    "tracks of vessels from reports of position, course and speed that do not say whose they are",
+    "tracks of vessels from reports of position, course and speed without identities",
     parameters=ReportTrackerParameters,
     find=_find,
     requirements=".../reports (fuselog.CourseFix)",

@@ -1,6 +1,6 @@
-"""Describes the kinds of sensors of unordered scans that a tracker takes.
+"""Kinds of sensors whose unordered scans a tracker can use.
 
-A target is (x_m, vx_mps, y_m, vy_mps) in the plane; `origin` is where the sensor is.
+A target is (x_m, vx_mps, y_m, vy_mps) in the plane; `origin` is the position of the sensor.
 """
 
 from typing import Any
@@ -14,18 +14,18 @@ from fuselog.replay.families.tracking.association.scans import ScanSensor
 
 
 def away(target: Components, origin: Any) -> tuple[Any, Any]:
-    """Compute where a target is from a sensor."""
+    """Compute the position of a target relative to the sensor."""
     return target[0] - origin[0], target[2] - origin[1]
 
 
 def is_within(bearing_rad: Component, begin_rad: Component, end_rad: Component) -> bool:
-    """Tell whether a bearing is in the sector anticlockwise between two angles; NaN is no sector."""
+    """Test whether a bearing is in the anticlockwise sector between two angles; NaN means no sector."""
     turned = (bearing_rad - begin_rad) % (2.0 * np.pi)
     return turned < (end_rad - begin_rad) % (2.0 * np.pi)
 
 
 def between(range_m: Component, near: Component, far: Component, parameters: Any) -> Component:
-    """Interpolate between `near` up to a range and `far` from another one on."""
+    """Interpolate linearly from `near`, up to the near range, to `far`, from the far range on."""
     if range_m <= parameters.near_range_m:
         return near
     if range_m >= parameters.far_range_m:
@@ -35,7 +35,7 @@ def between(range_m: Component, near: Component, far: Component, parameters: Any
 
 
 def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
-    """Compute the probability of a detection: by range, less in one sector, none in the blind one."""
+    """Compute the probability of detection: by range, scaled in one sector, 0 in the blind sector."""
     x, y = away(target, origin)
     bearing_rad = np.arctan2(y, x)
     if is_within(bearing_rad, parameters.blind_from_rad, parameters.blind_to_rad):
@@ -48,7 +48,7 @@ def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
 
 
 def clutter_in_plane(range_m: Component, bearing_rad: Component, parameters: Any) -> Component:
-    """Return the clutter per m^2: by range, and more or less in one sector."""
+    """Compute the clutter per m^2: by range, scaled in one sector."""
     near, factor = parameters.clutter_per_m2, parameters.far_clutter_factor
     density = between(range_m, near, near * factor, parameters)
     if is_within(bearing_rad, parameters.sector_from_rad, parameters.sector_to_rad):
@@ -56,25 +56,25 @@ def clutter_in_plane(range_m: Component, bearing_rad: Component, parameters: Any
     return density
 
 
-# Places
+# Positions
 
 
 def place_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Compute a target's place from a sensor, `lag_s` ago, as one says that is out by its bias."""
+    """Compute the measured position of a target relative to the sensor, with lag and bias."""
     x, y = away(target, origin)
     lag_s = parameters.lag_s
     return x - lag_s * target[1] + parameters.bias_x_m, y - lag_s * target[3] + parameters.bias_y_m
 
 
 def place_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """Return the lower triangle of a place's covariance: wider across the line of sight than along."""
+    """Compute the lower triangle of a position's covariance, wider across the line of sight."""
     x, y = away(target, origin)
     along, across = parameters.sigma_m**2, parameters.sigma_across_rad**2
     return along + across * y * y, -across * x * y, along + across * x * x
 
 
 def place_clutter(detection: Any, parameters: Any) -> Component:
-    """Return the clutter per m^2."""
+    """Compute the clutter per m^2 at a detection."""
     x, y = detection
     return clutter_in_plane(np.hypot(x, y), np.arctan2(y, x), parameters)
 
@@ -82,7 +82,7 @@ def place_clutter(detection: Any, parameters: Any) -> Component:
 def place_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return a target where it was detected."""
+    """Return position, covariance and m^2 per measured unit of a target at a detection."""
     x = detection[0] - parameters.bias_x_m + origin[0]
     y = detection[1] - parameters.bias_y_m + origin[1]
     return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters), 1.0
@@ -92,19 +92,19 @@ def place_birth(
 
 
 def bearing_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Return a bearing anticlockwise from the x axis, as a sensor says that is turned by its bias."""
+    """Compute the biased bearing of a target, anticlockwise from the x axis."""
     x, y = away(target, origin)
     return (np.arctan2(y, x) + parameters.bias_rad,)
 
 
 def bearing_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """Return a bearing's variance; where on a hull it points does not matter much when that is far."""
+    """Compute a bearing's variance; `sigma_across_m` matters less the farther the target is."""
     across = parameters.sigma_across_m / np.hypot(*away(target, origin))
     return (parameters.sigma_rad**2 + across**2,)
 
 
 def bearing_clutter(detection: Any, parameters: Any) -> Component:
-    """Return the clutter per rad."""
+    """Compute the clutter per rad at a bearing."""
     density = parameters.clutter_per_rad
     if is_within(detection[0], parameters.sector_from_rad, parameters.sector_to_rad):
         density *= parameters.sector_clutter_factor
@@ -115,20 +115,20 @@ def bearing_clutter(detection: Any, parameters: Any) -> Component:
 
 
 def polar_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Return range and bearing of where a target was `lag_s` ago, each out by its bias."""
+    """Compute measured range and bearing of a target, with the sensor's lag and biases."""
     x, y = away(target, origin)
     x, y = x - parameters.lag_s * target[1], y - parameters.lag_s * target[3]
     return np.hypot(x, y) + parameters.bias_range_m, np.arctan2(y, x) + parameters.bias_rad
 
 
 def polar_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """Return the variances of range and bearing."""
+    """Compute the variances of range and bearing."""
     (variance,) = bearing_noise(target, origin, parameters)
     return parameters.sigma_m**2, variance
 
 
 def polar_clutter(detection: Any, parameters: Any) -> Component:
-    """Return the clutter per m and rad: a square in the plane, as wide as the range."""
+    """Compute the clutter per m and rad, which is that per m^2 times the range."""
     range_m, bearing_rad = detection
     return range_m * clutter_in_plane(range_m, bearing_rad, parameters)
 
@@ -136,7 +136,7 @@ def polar_clutter(detection: Any, parameters: Any) -> Component:
 def polar_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return a target where it was detected."""
+    """Return position, covariance and m^2 per measured unit of a target at a detection."""
     range_m, bearing_rad = detection[0] - parameters.bias_range_m, detection[1] - parameters.bias_rad
     cosine, sine = np.cos(bearing_rad), np.sin(bearing_rad)
     x, y = origin[0] + range_m * cosine, origin[1] + range_m * sine
@@ -184,7 +184,7 @@ RANGES_BEARINGS = ScanSensor(
 )
 KINDS = (PLACES, BEARINGS, RANGES_BEARINGS)
 SEEN = {(kind.leaf, kind.schema.full_name) for kind in KINDS}  # of topics with detections
-# What a channel need not state, by kind: none of what it does not say is there.
+# Values of what a channel does not state: no such effect.
 UNSTATED: dict[str, float] = {
     "sigma_across_rad": 0.0,
     "lag_s": 0.0,
@@ -212,7 +212,7 @@ UNSTATED: dict[str, float] = {
     "sector_clutter_factor": 1.0,
     "gate_probability": 0.99,
 }
-# What is of other kinds alone.
+# Parameters that apply only to the other kinds of sensors.
 FOREIGN = {
     PLACES.leaf: (
         "sigma_rad",

@@ -1,4 +1,4 @@
-"""Reads scans of unordered detections of one sensor or several: which detections are of which scan."""
+"""Reading of unordered scans of one or more sensors, with the detections that belong to each scan."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,9 +14,9 @@ from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
 
 
 class SensorTopics(NamedTuple):
-    """Names a log's sensors: kinds, topics, and the frames that they measure in.
+    """Kinds, topics and frames of a log's sensors.
 
-    `origins` are the topics of their own positions, empty for a sensor that states none.
+    `origins` are the topics of the sensors' own positions, empty for a sensor that states none.
     """
 
     kinds: tuple[int, ...]
@@ -27,12 +27,12 @@ class SensorTopics(NamedTuple):
 
     @property
     def sensors(self) -> list[str]:
-        """Name the sensors: what their topics begin with."""
+        """Return the names of the sensors, which are the prefixes of their topics."""
         return [scan.rpartition("/")[0].strip("/") for scan in self.scans]
 
 
 class Fix(NamedTuple):
-    """Holds a sensor's own position (2,)."""
+    """A sensor's own position (2,) at a stamp."""
 
     time_ns: int
     place: Floats
@@ -44,8 +44,8 @@ Fixes = dict[str, list[Fix | None]]
 def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fixes: Fixes) -> Scans:
     """Return the scans of all runs and sensors in the order in which their messages are replayed.
 
-    `fixes` are the last own positions of earlier blocks, by topic and run. Raises BadInput as `by_scan`
-    does, and where a sensor's own position is not known yet.
+    `fixes` are the last sensor positions of earlier blocks, by topic and run. Raises BadInput as
+    `by_scan` does, and if the position of a sensor is not known yet.
     """
     starts = np.cumsum([0, *(len(ragged) for ragged in block.streams.values())])
     start_of = dict(zip(block.streams, starts.tolist(), strict=False))
@@ -71,10 +71,10 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
 
 
 def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
-    """Return detections (n,) in the order of their scans, and which of these (2, scans) each has.
+    """Sort detections by scan: return their order (n,) and the bounds (2, scans) of each scan in it.
 
-    Raises BadInput where two scans of a run have one number, a scan has another number of detections
-    than it says, or the scan of a detection is not there.
+    Raises BadInput if two scans of a run have the same number, if a scan does not have the number of
+    detections that it states, or if the scan of a detection is missing.
     """
     keys, known = (
         (run_of_rows(each.offsets) << 32) + each["scan_id"].astype(np.int64)
@@ -84,8 +84,8 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     if (counts > 1).any():
         twice = int(numbers[counts.argmax()]) & 0xFFFFFFFF
         raise BadInput(
-            f"topic {scan.stream.topic}: two scans have the number {twice}; give each a number of its "
-            "own"
+            f"topic {scan.stream.topic}: two scans have the number {twice}; give each scan its own "
+            "scan_id"
         )
     topic, stated = detection.stream.topic, scan["detections"].astype(np.int64)
     order = np.argsort(keys, kind="stable")
@@ -93,17 +93,17 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     there = bounds[1] - bounds[0]
     wrong = np.flatnonzero(there != stated)
     if len(wrong) or len(keys) != stated.sum():
-        problem = "detections of scans that are missing"
+        problem = "some detections belong to scans that are missing"
         if len(wrong):
             row = wrong[0]
             number = scan["scan_id"][row]
-            problem = f"scan {number} states {stated[row]} detections, and has {there[row]}"
-        raise BadInput(f"topic {topic}: {problem}; record every scan with its count")
+            problem = f"scan {number} states {stated[row]} detections, but has {there[row]}"
+        raise BadInput(f"topic {topic}: {problem}; record every scan with its number of detections")
     return order, bounds
 
 
 def _measured(stream: Stream, kind: ScanSensor) -> Floats:
-    """Return the detections (n, 2); a bearing stands first."""
+    """Return the detections (n, 2); a bearing is in the first column."""
     if kind.fields == ("position_m",):
         return read_vectors(stream, "position_m", PLANE)
     measured = np.zeros((len(stream), 2))
@@ -113,7 +113,7 @@ def _measured(stream: Stream, kind: ScanSensor) -> Floats:
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Find where the sensor is at its scans (n, 2): at the last fix until then, or the first known."""
+    """Find the sensor's position (n, 2) at its scans: the last fix, or the first known one."""
     found = np.empty((len(scans), 2))
     places = read_vectors(fixes.stream, "position_m", PLANE)
     for run, before in enumerate(known):
@@ -126,16 +126,16 @@ def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Float
         last = np.searchsorted(time_ns[order], scans.stream.publish_time_ns[rows], side="right") - 1
         if before is None and (last < 0).any():
             raise BadInput(
-                f"topic {scans.stream.topic}: a scan is before the first message of "
-                f"{fixes.stream.topic}, so that the position of its sensor is unknown; begin later, "
-                "with --start"
+                f"topic {scans.stream.topic}: a scan precedes the first message of "
+                f"{fixes.stream.topic}, so the position of its sensor is unknown; start the replay "
+                "later, with --start"
             )
         found[rows] = place[order][np.maximum(last, 0)]
     return found
 
 
 def latest_fixes(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]:
-    """Return the last own position of every run after a block."""
+    """Return the last sensor position of every run after a block."""
     places = read_vectors(fixes.stream, "position_m", PLANE)
     latest = list(known)
     for run in range(fixes.runs):

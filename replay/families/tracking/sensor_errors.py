@@ -1,7 +1,8 @@
-"""Describes errors of sensors that stay: components of every track's state beside the target's.
+"""Persistent errors of sensors, as components of every track's state in addition to the target's.
 
-A registration error is constant and that of all tracks; a correlated one is each track's own, such as
-where on a hull a box lies, and another one after `correlation_s`: a first-order Gauss-Markov process.
+A registration error is constant and shared by all tracks. A correlated error belongs to one track, such
+as the position on a hull that a box marks, and decorrelates with `correlation_s`: a first-order
+Gauss-Markov process.
 """
 
 from collections.abc import Sequence
@@ -25,14 +26,14 @@ BY_SORT = ("registration", "correlated")
 
 
 class Errors(NamedTuple):
-    """Describes the errors of sensors, the registration errors first.
+    """The errors of sensors, the registration errors first.
 
     Attributes:
-        names: of the components.
-        sigma, correlation_s: of each, (errors,); a constant has infinity for the second.
-        shared: how many are registration errors.
-        places: by sensor, where its errors stand among them: of a sort and a measured component, as
-            `registration_at_0`; -1 for nowhere.
+        names: names of the components.
+        sigma, correlation_s: of each error, (errors,); `correlation_s` is infinite for a constant.
+        shared: the number of registration errors.
+        places: by sensor, the indices of its errors, by kind of error and measured component, such as
+            `registration_at_0`; -1 for no error.
     """
 
     names: tuple[str, ...]
@@ -43,7 +44,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
-    """Return the errors that settings give their sensors a sigma for."""
+    """Collect the errors for which the settings give their sensors a sigma."""
     names: list[str] = []
     sigmas, times, shared = [], [], 0
     places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]
@@ -62,21 +63,21 @@ def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Seq
 
 
 def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
-    """Return targets whose state has the errors too.
+    """Extend the state of the targets by the errors.
 
-    Raises BadInput that begins with `where` where the model cannot be joined with them.
+    Raises BadInput, with a message that begins with `where`, if the model cannot be extended.
     """
     if not errors.names:
         return targets
     stage, (mean, covariance, mode) = targets.stage, targets.newborn
     if not is_flat(stage.model.kinds) or any(each.noises for each in stage.modes or (stage.motion,)):
         raise BadInput(
-            f"{where}: errors of sensors need a model without rotations in its state and with additive "
-            "noise; take another"
+            f"{where}: sensor errors require a model with additive noise and without rotations in its "
+            "state; use another model"
         )
     if errors.shared and stage.modes:
         raise BadInput(
-            f"{where}: registration errors need targets of one motion; give mode=..., or "
+            f"{where}: registration errors require targets with one motion; set mode=..., or use "
             "correlated errors"
         )
     size, longer = len(mean), len(mean) + len(errors.names)
@@ -103,7 +104,7 @@ def _longer(stage: Stage, names: tuple[str, ...], lengths: tuple[int, ...]) -> S
 
 
 def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:
-    """Return a motion beside which the errors fade and are renewed; its noise has `noises` numbers."""
+    """Extend a motion by errors that decay and are renewed; its own noise has `noises` numbers."""
     n, is_triangle = model.size, noises > model.size
     move_own, noise_own = motion.move, motion.noise
     assert noise_own is not None

@@ -1,4 +1,4 @@
-"""Chooses a tracker's model of its targets: a registered model with a position, or constant velocity."""
+"""The model of a tracker's targets: a registered model with a position, or constant velocity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """States how targets move that keep their velocity.
+    """Parameters of targets that move at constant velocity.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration, in m^2/s^3.
@@ -44,13 +44,13 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 
 
 def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    """Compute the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
     place, mixed, velocity = noise_moments(parameters.acceleration_density, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
 
 TARGET = Model(
-    "a target in the plane that keeps its velocity",
+    "a target in the plane at constant velocity",
     dict.fromkeys(PLANE_MOTION, "linear"),
     TargetParameters,
     (),
@@ -60,11 +60,11 @@ TARGET = Model(
 
 
 class Targets(NamedTuple):
-    """Describes what targets are taken to be.
+    """Assumptions about the targets.
 
     Attributes:
-        stage: their model, with one motion or all modes.
-        parameters: the model's numbers; NaN where one is not used.
+        stage: their bound model, with one motion or with all modes.
+        parameters: the model's numbers; NaN for a number that is not used.
         newborn: a target of which only the position is known.
     """
 
@@ -74,14 +74,15 @@ class Targets(NamedTuple):
 
 
 def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
-    """Return the targets of a tracker's parameters; what these leave out, the scans' channels state.
+    """Build the targets from a tracker's parameters; the scans' channels state what these leave out.
 
-    Raises BadInput that begins with `where` for a model that cannot be a target's, or lacks a number.
+    Raises BadInput, with a message that begins with `where`, if the model cannot describe a target or if
+    a number is missing.
     """
     name = parameters.model
     if name is None:
         if parameters.motion or parameters.mode:
-            raise BadInput(f"{where}: motion and mode need a model; give model=... too")
+            raise BadInput(f"{where}: motion and mode need a model; set model=... too")
         given: Mapping[str, Any] = {"acceleration_density": parameters.acceleration_density}
         model = TARGET
     else:
@@ -103,7 +104,7 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
             number = stated(scans, each, model.parameters, needed=False)
         if np.isnan(number) and each in traced.read:
             raise BadInput(
-                f"{where}: no channel of {', '.join(topic.name for topic in scans)} states {each}; give "
+                f"{where}: no channel of {', '.join(topic.name for topic in scans)} states {each}; set "
                 f"it with --set motion.{each}=..."
             )
         numbers[each] = float(number)
@@ -117,17 +118,17 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
 def _check(where: str, model: Model) -> None:
     if any(model.state.get(name) != "linear" for name in POSITION):
         raise BadInput(
-            f"{where}: has no position x_m, y_m, which a tracker's sensors measure; take another model"
+            f"{where}: the state has no position x_m, y_m, which sensors measure; use another model"
         )
     if model.control is not None:
         raise BadInput(
-            f"{where}: is driven by {model.control.topic}, which is not recorded for targets; take a "
-            "model without a control"
+            f"{where}: the model is driven by {model.control.topic}, which is not recorded for targets; "
+            "use a model without a control"
         )
 
 
 def _stage_of(where: str, model: Model, mode: str | None) -> Stage:
-    """Return the model with the motion that is named, or all of its modes."""
+    """Bind the model with the motion of the named mode, or with all of its modes."""
     if mode is not None:
         if not model.modes or mode not in model.modes:
             raise BadInput(f"{where}: no mode '{mode}'; {choices(mode, model.modes or ())}")
@@ -147,7 +148,7 @@ def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats
             sigma[row] = sigma_mps
         elif np.isnan(sigma[row]):
             raise BadInput(
-                f"{where}: a detection does not measure {name}, and the model does not say how "
-                "uncertain it is at first; give it a start with its sigma"
+                f"{where}: detections do not measure {name}, and the model states no initial "
+                "uncertainty of it; add its sigma to the start of the model"
             )
     return mean, sigma

@@ -1,10 +1,10 @@
-"""Draws tracks of many targets: what each sensor scans, the tracks in colours of their own.
+"""Timeline of multi-target tracking: the scans of each sensor, and the tracks in their own colours.
 
 The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
-nothing; bearings are rays from where the sensor is. Lines lead from a track to the detections of places
-that were associated with it, the fainter the less probable. Beside it are GOSPA, the number of tracks
-and how probable it is that they exist; below it when tracks are confirmed and end, and when a target
-goes on with another one.
+nothing; bearings are rays from the sensor's position. Lines connect a track to the detections of
+positions that were associated with it; the less probable, the fainter. Next to the map are GOSPA, the
+number of tracks and their probabilities of existence. Below it are events: a track is confirmed or ends,
+or a target switches to another track.
 """
 
 from collections.abc import Iterator, Mapping
@@ -49,13 +49,13 @@ from fuselog.replay.timeline.drawing.plane import (
 )
 from fuselog.replay.timeline.drawing.plots import LINE, POINTS, below_legend, draw_curve, plot_view
 
-# How far rays of bearings are drawn.
+# Length of a drawn bearing.
 RAY_M = 300.0
 SCANS = "scans"
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return a map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
+    """Draw a map with all sensors for each tracker, in tabs, next to plots of all trackers."""
     turn_up(canvas)
     ground, paths, places = f"{ROOT}/ground", [], []
     for topic, place, stroke in _ways(scene):
@@ -91,7 +91,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
-    """Yield what moves with a known position: targets with a truth, and sensors."""
+    """Yield the paths with known positions: true paths of targets, and those of sensors."""
     for topic in scene.source.topics.values():
         if topic.schema_name == schemas.TRUTH_STATE.full_name:
             yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)
@@ -100,14 +100,14 @@ def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
 
 
 def _legend(scene: Scene) -> dict[str, Colour]:
-    """Return the colours of what moves with a known position."""
+    """Return the colours of the true paths and the sensors that the log contains."""
     schemas_of = {topic.schema_name for topic in scene.source.topics.values()}
     known = {"truth": (schemas.TRUTH_STATE, TRUTH), "sensors": (schemas.POSITION_FIX, MUTED)}
     return {name: colour for name, (of, colour) in known.items() if of.full_name in schemas_of}
 
 
 def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
-    """Draw the detections of every sensor, scan by scan; returns the colours by sensor."""
+    """Draw the detections of every sensor, scan by scan; return the colours by sensor."""
     colours: dict[str, Colour] = {}
     scans = [each for each in scene.source.topics.values() if each.name.endswith("/scan")]
     for number, topic in enumerate(scans):
@@ -135,13 +135,13 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
 
 
 def _own_places(scene: Scene, scan: Stream) -> Floats:
-    """Find where the sensor is at its scans, (n, 2)."""
+    """Find the sensor's position at its scans, (n, 2)."""
     topic = scan.metadata.get(ORIGIN, "")
     return places_of_sensor(scan, scene.read(topic) if topic in scene.source.topics else None)
 
 
 def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
-    """Draw the ways of all tracks and their 95 % ellipses; returns the entities of the ways."""
+    """Draw the paths of all tracks and their 95 % ellipses; return the entities of the paths."""
     place, covariance = read_vectors(tracks, "mean", PLANE), covariances_of(tracks, PLANE)
     numbers = tracks["track_id"].astype(np.int64)
     ways = []
@@ -159,7 +159,7 @@ def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
 
 
 def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> None:
-    """Draw lines from tracks to the detections of places that are theirs, in the tracks' colours."""
+    """Draw lines from tracks to their associated detections of positions, in the tracks' colours."""
     for estimator, associations in scene.outputs_of("", schemas.ASSOCIATION):
         sensors = associations.metadata["sensors"].split(",") if estimator == name else []
         for number, sensor in enumerate(sensors):
@@ -181,16 +181,16 @@ def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) 
 
 
 class Joined(NamedTuple):
-    """Holds a sensor's detections as trackers take them: by row of the scan, relative to the sensor."""
+    """A sensor's detections as trackers use them: the row of the scan, and the relative position."""
 
     scan: Integers
     place: Floats
 
 
 def _joined(scan: Stream, seen: Stream) -> Joined:
-    """Take each chain of near detections of a scan as its mean, by its first one.
+    """Replace each chain of near detections of a scan by its mean, in the order of the first ones.
 
-    How near is stated on the channel of the scans; see
+    The channel of the scans states the distance; see
     `fuselog.replay.families.tracking.association.scanning.join_near`.
     """
     row, place = rows_of(scan, seen), read_vectors(seen, "position_m", PLANE)
@@ -212,7 +212,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
 
 
 def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np.bool_]]:
-    """Find where the associations' tracks are then (n, 2), and of which of them that is known."""
+    """Find the positions (n, 2) of the associations' tracks at the time, and which of them are known."""
     keys = [
         np.stack([stream.publish_time_ns, stream["track_id"].astype(np.int64)], axis=1)
         for stream in (tracks, associations)
@@ -238,17 +238,17 @@ def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
 
 
 def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happened]:
-    """Yield when a target goes on with another track than before."""
+    """Yield when a target switches to another track."""
     for target, track in enumerate(errors.kept, start=1):
         followed = np.flatnonzero(track != NONE)
         for row in np.flatnonzero(np.diff(track[followed])):
             before, now = track[followed[row]], track[followed[row + 1]]
-            text = f"target {target} goes on with track {now}, before with {before}"
+            text = f"target {target} switches from track {before} to track {now}"
             yield Happened(name, "WARN", at_ns[followed[row + 1] :][:1], [text])
 
 
 def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers, dict[str, TrackErrors]]:
-    """Return by tracker its errors at instants; none where the log has nothing to judge by."""
+    """Compute each tracker's errors at the judged instants; return no errors without scans or truths."""
     try:
         judged = instants_of(scene.source)
     except BadInput:
@@ -270,7 +270,6 @@ def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers,
 def _draw_gospa(
     canvas: Canvas, scene: Scene, at_ns: Integers, errors: Mapping[str, TrackErrors]
 ) -> rrb.TimeSeriesView:
-    """Plot GOSPA at the instants."""
     for name, of_tracker in errors.items():
         draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
     extent = below_legend([of_tracker.gospa for of_tracker in errors.values()])
@@ -278,7 +277,7 @@ def _draw_gospa(
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
-    """Plot how many tracks there are."""
+    """Plot the number of tracks."""
     drawn = []
     for name, sizes in scene.outputs_of("", schemas.ESTIMATE_SIZE):
         counts = sizes["elements"].astype(float)
@@ -291,7 +290,7 @@ def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
 def _draw_existence(
     canvas: Canvas, scene: Scene, trackers: list[tuple[str, Stream]]
 ) -> rrb.TimeSeriesView:
-    """Plot how probable it is that each track of the first tracker exists."""
+    """Plot the probability of existence of each track of the first tracker."""
     existence = dict(scene.outputs_of("", schemas.EXISTENCE))
     for name, tracks in trackers[:1]:
         numbers = tracks["track_id"].astype(np.int64)

@@ -1,4 +1,4 @@
-"""Writes a tracker's outputs: tracks after every scan, associations, innovations, what was not used."""
+"""Output streams of a tracker: tracks after every scan, associations, innovations, unused data."""
 
 from collections.abc import Iterator
 
@@ -19,8 +19,8 @@ from fuselog.replay.families.tracking.scans import SensorTopics
 from fuselog.replay.inference.model.stage import Stage
 
 UNUSED = (
-    "there is no room for more tracks; give --set most_tracks=...",
-    "the scan came after a younger one; give --late rewind:SECONDS",
+    "there is no room for more tracks; use a larger --set most_tracks=...",
+    "the scan is out of sequence, after a scan with a later stamp; use --late rewind:SECONDS",
 )
 
 
@@ -33,9 +33,10 @@ def track_outputs(
     *,
     repeated: int = 0,
 ) -> list[Ragged]:
-    """Return the streams of the tracker `name` for these scans.
+    """Make the output streams of the tracker `name` for these scans.
 
-    `repeated` is how many scans after a late one, the last of which these are of, were used again.
+    `repeated` is the number of scans after an out-of-sequence scan that were processed again; the last
+    of them is the scan that is given here.
     """
     topic = f"/estimates/{name}"
     return [
@@ -48,12 +49,12 @@ def track_outputs(
 
 
 def _filled(column: NDArray, ends: Integers) -> NDArray:
-    """Return the rows of a column (runs, rows, ...) that each run has filled, end to end."""
+    """Concatenate the rows that each run has filled of a column (runs, rows, ...)."""
     return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
 
 
 def _bounds(ends: Integers) -> Integers:
-    """Find where the rows of each run begin and end (runs + 1,), from how many it has."""
+    """Compute offsets (runs + 1,) from the number of rows of each run."""
     return np.concatenate([[0], np.cumsum(ends)])
 
 
@@ -66,7 +67,7 @@ def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
 def _of_tracks(
     topic: str, found: SensorTopics, stage: Stage, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
-    """Tell after every scan how many tracks there are, which, and how probably each exists."""
+    """Yield the number of tracks, the tracks and their existence after every scan."""
     metadata = {**named(stage.model.state), **in_frame(found.frames[0])}
     ends = tracked.end[:, 0]
     used = np.flatnonzero(tracked.confirmed != NEVER)
@@ -95,7 +96,7 @@ def _of_tracks(
 
 
 def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
-    """Tell how probable the modes of each track are, where there are several."""
+    """Yield the probabilities of each track's modes, if there are several."""
     if not stage.modes:
         return
     ends = tracked.end[:, 0]
@@ -110,7 +111,7 @@ def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Ite
 
 
 def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs) -> Ragged:
-    """Tell which detection of a scan is which track's, and how probably."""
+    """Make the stream of detections associated with tracks, with their probabilities."""
     ends = tracked.end[:, 1]
     track, scan, detection = _filled(tracked.pair, ends).T
     stream = make_stream(
@@ -128,7 +129,7 @@ def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackO
 
 
 def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) -> Iterator[Ragged]:
-    """Tell what was approximated, what was not used, and how many scans were used again."""
+    """Yield what was approximated, what was not used, and how many scans were processed again."""
     approximated = np.flatnonzero(tracked.approximated)
     tracks = tracked.approximated[approximated]
     stream = make_stream(
@@ -150,7 +151,7 @@ def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) ->
 def _innovations(
     topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
-    """Yield by sensor the innovation of a confirmed track's likeliest detection in each of its scans."""
+    """Yield, by sensor, the innovations of confirmed tracks with their most likely detections."""
     ends = tracked.end[:, 1]
     pair, probability = _filled(tracked.pair, ends), _filled(tracked.associated, ends)
     white, factor = _filled(tracked.white, ends), _filled(tracked.factor, ends)

@@ -1,4 +1,4 @@
-"""Smooths a tracker's tracks: says at the end what all detections say of every state."""
+"""Smoothing of a tracker's tracks, so that every state uses all detections of its track."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,27 +12,27 @@ from fuselog.replay.families.tracking.targets import Targets
 
 
 def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
-    """Raise BadInput where tracks cannot be smoothed: of several motions, or with errors of sensors.
+    """Raise BadInput if tracks cannot be smoothed: with several motions, or with errors of sensors.
 
     Args:
-        name: the estimator's.
-        targets: how they move.
+        name: name of the estimator.
+        targets: how targets move.
         errors: the names of sensors' errors in the tracks' states.
     """
     if errors:
         raise BadInput(
-            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
-            "of sensors"
+            f"estimator {name}: tracks with sensor errors cannot be smoothed; remove smoothed or the "
+            "sensor errors"
         )
     if targets.stage.modes or not targets.stage.motion.linear:
         raise BadInput(
-            f"estimator {name}: smoothed tracks need a model with one linear motion; leave "
-            "out smoothed, or take another model, or one of its modes"
+            f"estimator {name}: smoothed tracks require a model with one linear motion; remove "
+            "smoothed, or use another model, or one of its modes"
         )
 
 
 def smoothed(tracks: Ragged, targets: Targets) -> Ragged:
-    """Return the stream of tracks with smoothed states."""
+    """Smooth the states in a stream of tracks."""
     stream, size = tracks.stream, targets.stage.model.size
     run = run_of_rows(tracks.offsets)
     _, track = np.unique(

@@ -1,19 +1,20 @@
-"""Tracks vessels and other targets from the unordered scans of several sensors at once.
+"""Tracker of vessels and other targets from the unordered scans of one or more sensors.
 
-    tracker:nearest     the surest pair of track and detection first
-    tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
-    tracker:jpda        all maps, weighted
-    tracker:jipda       all maps, weighted, and how probable it is that each track exists
-    tracker:pmbm        the same, where any detection may be the first one of a target: the Poisson
-                        multi-Bernoulli mixture, of which after each scan the marginals are kept, the
-                        tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015). Targets
-                        that were never detected are a uniform Poisson process of steady density
+    tracker:nearest     the most likely pair of track and detection first (greedy nearest neighbour)
+    tracker:hungarian   the best assignment of detections to tracks (global nearest neighbour)
+    tracker:jpda        all joint associations, weighted by their probabilities
+    tracker:jipda       as jpda, with a probability of existence for each track
+    tracker:pmbm        as jipda, and any detection may be the first one of a target: the Poisson
+                        multi-Bernoulli mixture. After each scan only the marginals are kept, that is,
+                        the tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015).
+                        Targets that were never detected form a uniform Poisson process of constant
+                        density
 
-Targets keep their velocity but for white acceleration, or move as any registered model with a position
-says; where it has several modes, each track is an interacting multiple model. Sensors are those that
-state what they are like on the channels of their scans, see
-`fuselog.replay.families.tracking.scan_sensors`. Places begin tracks, bearings only sharpen those that
-are confirmed. `fuselog.replay.families.tracking.association.tracking` does the work.
+Targets move at constant velocity with white acceleration noise, or by any registered model with a
+position. If that model has several modes, each track is an interacting multiple model. The channels of
+the scans state the properties of their sensors, see
+`fuselog.replay.families.tracking.scan_sensors`. Detections with a position begin tracks; bearings only
+update confirmed tracks. `fuselog.replay.families.tracking.association.tracking` does the work.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,7 +51,7 @@ from fuselog.replay.families.tracking.tracker_run import (
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.stage import stage_of
 
-# What sets apart the two that go by existence and have the associations of jpda.
+# Defaults of the two associations that estimate existence; they associate as jpda does.
 EXISTING: dict[str, dict[str, float]] = {
     "jipda": {},
     "pmbm": {
@@ -64,90 +65,95 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class TrackerParameters(Parameters):
-    """States how targets move, how tracks begin and end, and what sensors are like.
+    """Parameters of target motion, track management and sensors.
 
-    What is none is what the channel of a sensor's scans states; a value given here holds for all
-    sensors.
+    A sensor parameter without a value is read from the channel of the sensor's scans. A value given here
+    applies to all sensors.
 
-    A track begins with a detection outside all gates that is far enough from all confirmed tracks; with
-    `undetected_per_m2`, with any detection that may be a target that was never detected, by how
-    probable that is. `management` decides which tracks are confirmed: "existence" by the probability
-    that the target exists, "hits" by counting detections, "score" by the log-likelihood ratio of target
-    and clutter.
+    A detection begins a track if it is outside all gates and far enough from all confirmed tracks. With
+    `undetected_per_m2`, any detection begins one that may come from a target that was never detected,
+    with the probability of that as its existence. `management` selects how tracks are confirmed:
+    "existence" by the probability that the target exists, "hits" by counting detections, "score" by the
+    log-likelihood ratio of target and clutter.
 
-    A registration error is constant in all that a sensor measures, and all tracks estimate it together;
-    a correlated error is another one for every track, and lasts for a while. Both are components of the
-    tracks' states.
+    A registration error is a constant error of everything that a sensor measures, and all tracks
+    estimate it together. A correlated error differs between tracks and changes over time. Both are
+    components of the tracks' states.
 
     Attributes:
-        association: which detection is which target's: the nearest, the best of all maps (hungarian), or
-            all maps by their probabilities (jpda, jipda, pmbm).
-        management: how tracks are confirmed and ended; without one jipda and pmbm use existence, the
-            others hits.
-        sensors: the sensors to use, such as ["radar", "lidar"]; without any, all.
-        model: a registered model with a position, by which targets move; without one they keep their
-            velocity.
-        mode: the mode of such a model to use; without one all of them.
-        motion: parameters of such a model, by name.
+        association: how detections are associated with tracks: greedily, the most likely pair first
+            (nearest), by the best assignment (hungarian), or by all joint associations, weighted by
+            their probabilities (jpda, jipda, pmbm).
+        management: how tracks are confirmed and ended; by default existence for jipda and pmbm, and hits
+            for the other associations.
+        sensors: the sensors to use, such as ["radar", "lidar"]; by default all.
+        model: a registered model with a position that describes how targets move; by default they move
+            at constant velocity.
+        mode: the mode of that model to use; by default all modes.
+        motion: parameters of that model, by name.
         acceleration_density: power spectral density of the acceleration of targets without a model, in
             m^2/s^3.
         birth_sigma_mps: standard deviation of a new track's velocity, per axis.
-        birth_distance_m: a track begins so far from all confirmed tracks.
+        birth_distance_m: least distance of a new track from all confirmed tracks.
         birth_existence: existence of a new track; with hits or score, of a track until it is confirmed.
         undetected_per_m2: density of targets that were never detected.
-        confirming_existence: with management by existence, a track is confirmed from this existence on.
-        keeping_existence: a track is no longer confirmed below this existence.
-        ending_existence: a track ends below this existence.
-        survival_s: mean time for which a target is there.
-        hits_needed: with management by hits, so many detections in its first `chances` scans confirm a
-            track.
-        chances: with management by hits, a track without `hits_needed` detections in its first so many
-            scans ends.
+        confirming_existence: with management by existence, the existence from which on a track is
+            confirmed.
+        keeping_existence: existence below which a track is no longer confirmed.
+        ending_existence: existence below which a track ends.
+        survival_s: mean time that a target is present.
+        hits_needed: with management by hits, the number of detections in the first `chances` scans that
+            confirms a track.
+        chances: with management by hits, the number of first scans after which a track ends unless it
+            has `hits_needed` detections.
         false_confirmation: with management by score, probability that clutter is confirmed as a track.
         missed_confirmation: with management by score, probability that a target's track is not
             confirmed.
-        silence_s: a confirmed track ends after so long without a detection.
-        tentative_silence_s: a track that is not confirmed ends after so long without a detection.
-        same_within_m: tracks whose positions are nearer than this are one, if their velocities are near
+        silence_s: time without a detection after which a confirmed track ends.
+        tentative_silence_s: time without a detection after which an unconfirmed track ends.
+        same_within_m: distance below which two tracks count as one target, if their velocities agree
             too.
-        same_within_mps: tracks whose velocities are nearer than this are one, if their positions are
-            near too.
-        most_tracks: room for so many tracks at a time.
-        smoothed: whether tracks are estimated again at the end of the run from all their detections.
+        same_within_mps: difference in velocity below which two tracks count as one target, if their
+            positions agree too.
+        most_tracks: greatest number of tracks at a time.
+        smoothed: whether the tracks are smoothed at the end of the run.
         gate_probability: probability that a target's detection is inside its gate.
         sigma_m: standard deviation of a position along the line of sight, or of a range.
-        sigma_across_rad: standard deviation of a position across the line of sight, per m of range, that
-            is added there.
-        lag_s: detections are where a target was so long ago.
-        bias_x_m: places are too far along x by so much.
-        bias_y_m: places are too far along y by so much.
-        bias_range_m: ranges are too long by so much.
-        near_range_m: up to this range a target is near; beyond it detection and clutter change linearly.
-        far_range_m: from this range on detection and clutter change no further.
-        far_detection_probability: probability that a target is detected from `far_range_m` on.
+        sigma_across_rad: additional standard deviation of a position across the line of sight, per m of
+            range.
+        lag_s: delay of detections, which show where a target was this long before.
+        bias_x_m: bias of measured positions along x.
+        bias_y_m: bias of measured positions along y.
+        bias_range_m: bias of measured ranges.
+        near_range_m: range up to which a target is near; beyond it, detection and clutter change
+            linearly.
+        far_range_m: range beyond which detection and clutter stay constant.
+        far_detection_probability: probability that a target at `far_range_m` or beyond is detected.
         clutter_per_m2: mean number of false detections in a scan, per area, near the sensor.
-        far_clutter_factor: what clutter is multiplied by far from the sensor.
-        sector_from_rad: where a sector begins in which a sensor detects more or less, anticlockwise from
-            the x axis.
-        sector_to_rad: where this sector ends, anticlockwise from the x axis.
-        sector_detection_factor: what the probability of a detection is multiplied by in the sector.
-        sector_clutter_factor: what clutter is multiplied by in the sector.
-        joined_within_m: detections within this of each other count as one target.
+        far_clutter_factor: factor on clutter far from the sensor.
+        sector_from_rad: beginning of a sector with other detection and clutter, anticlockwise from the
+            x axis.
+        sector_to_rad: end of that sector, anticlockwise from the x axis.
+        sector_detection_factor: factor on the probability of detection in the sector.
+        sector_clutter_factor: factor on clutter in the sector.
+        joined_within_m: distance within which detections are joined and count as one target.
         sigma_rad: standard deviation of a bearing.
-        sigma_across_m: standard deviation of a bearing across the line of sight, in m, that is added
-            there.
-        bias_rad: bearings are too large by so much.
+        sigma_across_m: additional standard deviation of a bearing across the line of sight, in m.
+        bias_rad: bias of measured bearings.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         detection_probability: probability that a near target is detected.
-        blind_from_rad: where the sector begins in which a sensor detects nothing, anticlockwise from the
+        blind_from_rad: beginning of the sector in which a sensor detects nothing, anticlockwise from the
             x axis.
-        blind_to_rad: where that sector ends, anticlockwise from the x axis.
-        interval_s: a track uses one detection of a sensor in this time.
-        registration_sigma_m: standard deviation of a registration error of places or ranges; 0 is none.
-        registration_sigma_rad: standard deviation of a registration error of bearings; 0 is none.
-        correlated_sigma_m: standard deviation of a correlated error of places or ranges; 0 is none.
-        correlated_sigma_rad: standard deviation of a correlated error of bearings; 0 is none.
-        correlation_s: for about how long a correlated error lasts.
+        blind_to_rad: end of that sector, anticlockwise from the x axis.
+        interval_s: least time between two detections of one sensor that update a track.
+        registration_sigma_m: standard deviation of the registration error of positions or ranges; 0 for
+            no such error.
+        registration_sigma_rad: standard deviation of the registration error of bearings; 0 for no such
+            error.
+        correlated_sigma_m: standard deviation of a correlated error of positions or ranges; 0 for no
+            such error.
+        correlated_sigma_rad: standard deviation of a correlated error of bearings; 0 for no such error.
+        correlation_s: correlation time of a correlated error.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
@@ -210,17 +216,17 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Fill in what an association says of existence: jipda and pmbm are about it, others count."""
+        """Fill in the management and the probabilities of existence that suit the association."""
         association = values.get("association", "jipda")
         goes_by_existence = association in EXISTING
         given = values.get("management")
         if goes_by_existence and given not in (None, "existence"):
             raise ValueError(
-                f"{association} needs management = existence; management = {given} is for jpda"
+                f"{association} requires management = existence; use management = {given} with jpda"
             )
         management = given or ("existence" if goes_by_existence else "hits")
         if values.get("undetected_per_m2") and management != "existence":
-            raise ValueError("undetected_per_m2 needs management = existence")
+            raise ValueError("undetected_per_m2 requires management = existence")
         likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
         return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
@@ -229,10 +235,10 @@ class TrackerParameters(Parameters):
 
 
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTopics:
-    """Return the sensors with scans and places, bearings, or both range and bearing.
+    """Find the sensors that scan positions, bearings, or ranges with bearings.
 
-    Raises BadInput where one that is wanted is not there, its own position is not, none sees places, or
-    they are in several frames.
+    Raises BadInput if a wanted sensor is missing, the position of a sensor is missing, no sensor
+    measures positions, or the sensors measure in different frames.
     """
     rows = []
     _check_scans(topics, wanted)
@@ -246,51 +252,50 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
             seen = topics.get(f"{prefix}/{kind.leaf}")
             if seen is not None and seen.schema_name == kind.schema.full_name:
                 origin = scan.metadata.get(ORIGIN, "")
-                # a sensor whose own position is known measures along the axes that this is given in
+                # a sensor with a known position measures along the axes of the frame of that position
                 frame = frame_of(topics.get(origin, seen).metadata)
                 rows.append((number, scan.name, seen.name, origin, frame))
     missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
     if missing:
-        raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
+        raise BadInput(f"no scans of sensor {min(missing)}; remove it from sensors")
     found = SensorTopics(*zip(*rows, strict=True)) if rows else SensorTopics((), (), (), (), ())
     for scan_name, origin in zip(found.scans, found.origins, strict=True):
         if origin and (
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
         ):
             raise BadInput(
-                f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
-                "which is "
-                "missing; record the position of the sensor"
+                f"topic {scan_name}: the position of its sensor, topic {origin} (fuselog.PositionFix), "
+                "is missing; record it"
             )
     for seen_name, frame in zip(found.detections, found.frames, strict=True):
         if frame != found.frames[0]:
             raise BadInput(
-                f"topic {seen_name} is in {frame_in_words(frame)}, {found.detections[0]} in "
-                f"{frame_in_words(found.frames[0])}, and tracks are in one frame; name the sensors "
-                "of one frame with --set sensors=..."
+                f"topic {seen_name} is in {frame_in_words(frame)}, but {found.detections[0]} is in "
+                f"{frame_in_words(found.frames[0])}, and all tracks must be in one frame; select "
+                "sensors with the same frame by --set sensors=..."
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
-            "bearings alone begin no tracks, since they do not measure how far a target is; add a "
-            "sensor of positions, or of ranges with bearings"
+            "tracks cannot begin from bearings only, which do not measure the distance of a target; "
+            "add a sensor of positions, or of ranges with bearings"
         )
     return found
 
 
 def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
-    """Raise BadInput where detections are of scans that nobody recorded."""
+    """Raise BadInput if there are detections whose scans were not recorded."""
     for seen in topics.values():
         prefix, _, leaf = seen.name.rpartition("/")
         is_wanted = not wanted or prefix.strip("/") in wanted
         if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
             raise BadInput(
                 f"topic {seen.name}: detections without scans; record {prefix}/scan "
-                f"({schemas.SCAN.full_name}), which states how many each scan has, even if none"
+                f"({schemas.SCAN.full_name}), which states the number of detections, even if it is 0"
             )
 
 
 class TrackerSettings(NamedTuple):
-    """Holds what the loop reads, a row for every sensor, and sensors' errors beside noise."""
+    """Numbers that the tracking loop reads, a row per sensor, and the errors of the sensors."""
 
     names: tuple[str, ...]
     numbers: Floats
@@ -300,7 +305,7 @@ class TrackerSettings(NamedTuple):
 def settings_of(
     topics: Mapping[str, Topic], found: SensorTopics, parameters: TrackerParameters, targets: Targets
 ) -> TrackerSettings:
-    """Read what parameters and channels say of the sensors and targets."""
+    """Read the settings of sensors and targets from the parameters or else the channels."""
     names, own = number_fields(TrackerParameters), targets.parameters._asdict()
     kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
     for kind, scan in zip(kinds, found.scans, strict=True):
@@ -333,7 +338,7 @@ def settings_of(
 
 
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: TrackerSettings) -> Tracker:
-    """Return the parts that the parameters ask for."""
+    """Build the tracker that the parameters describe."""
     stage, shared = targets.stage, settings.errors.shared
     stage = stage_of(*stage, names=settings.names)
     sensors = tuple(measuring(stage.model, kind, settings.names) for kind in KINDS)
@@ -350,7 +355,7 @@ def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Tracke
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> Iterator[Binding]:
-    """Find all sensors, for one tracker."""
+    """Bind one tracker to all sensors."""
     found = find_sensors(topics, parameters.sensors)
     if not found.scans:
         return
@@ -372,18 +377,18 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
 def _out_of_sequence(parameters: TrackerParameters, back_ns: int) -> Advance:
     if parameters.smoothed:
         raise BadInput(
-            "smoothed tracks use later detections in any case; replay them in the order of the stamps, "
-            "or with --late wait:SECONDS"
+            "smoothed tracks cannot be combined with --late rewind; replay in the order of the stamps, "
+            "or use --late wait:SECONDS"
         )
     return partial(advance_out_of_sequence, back_ns=back_ns)
 
 
 TRACKER = recursive(
-    "tracks of many targets from the unordered scans of several sensors",
+    "tracks of many targets from the unordered scans of one or more sensors",
     parameters=TrackerParameters,
     find=_find,
     requirements="per sensor .../scan and .../detection (positions) or .../range_bearing, or "
-    ".../bearing beside those",
+    ".../bearing in addition to those",
     variant="association",
     start=start,
     advance=advance,

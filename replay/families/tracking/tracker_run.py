@@ -1,4 +1,4 @@
-"""Runs a tracker over its scans, in order or going back for late ones, and smooths tracks at the end."""
+"""Runs of a tracker over its scans, in order or with reprocessing, and smoothing at the end."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -21,15 +21,15 @@ from fuselog.replay.families.tracking.track_smoother import smoothed
 
 
 class TrackerSetup(NamedTuple):
-    """Holds a tracker as bound to a log.
+    """A tracker bound to a log.
 
     Attributes:
-        name: the estimator's.
+        name: name of the estimator.
         found: its sensors.
-        tracker: what it is made of.
+        tracker: its parts.
         settings: (sensors, names), the parameters for each sensor.
-        targets: how they move, and what one is like of which only the position is known.
-        most_tracks: room for so many.
+        targets: how targets move, and the state of a target of which only the position is known.
+        most_tracks: greatest number of tracks at a time.
         smoothed: whether tracks are smoothed at the end.
     """
 
@@ -42,28 +42,28 @@ class TrackerSetup(NamedTuple):
     smoothed: bool
 
     def no_tracks(self, runs: int) -> Tracks:
-        """Return the tracks of runs in which nothing was met yet."""
+        """Return empty tracks for a number of runs."""
         first, count = self.tracker.shared
         shared = self.targets.newborn.covariance[first : first + count, first : first + count]
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
     def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-        """Return the tracks after some scans, and what is said of them."""
+        """Return the tracks after some scans, and the outputs of these scans."""
         return track_scans(self.tracker, scans, self.settings, self.targets.newborn, tracks)
 
     def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
-        """Return the streams of what is said of these scans; see `track_outputs`."""
+        """Make the output streams of some scans; see `track_outputs`."""
         return track_outputs(
             self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
         )
 
 
 class OutOfSequenceState(NamedTuple):
-    """Holds one run whose scans may come late.
+    """State of one run with out-of-sequence scans.
 
     Attributes:
-        base: the tracks after all scans that no late one can precede any more.
-        pending: the scans after those, in time order.
+        base: the tracks after all scans that no out-of-sequence scan can precede any more.
+        pending: the later scans, in time order.
         head: the tracks after all scans.
     """
 
@@ -73,13 +73,13 @@ class OutOfSequenceState(NamedTuple):
 
 
 class TrackerState(NamedTuple):
-    """Carries the last own positions and the tracks from block to block.
+    """Last sensor positions and tracks, carried from block to block.
 
     Attributes:
-        fixes: by topic and run.
-        tracks: of all runs, after all scans; where scans may come late as before all of them.
-        late: where scans may come late, what each run carries.
-        outputs: where tracks are smoothed, what is said at the end, by block.
+        fixes: the last sensor positions, by topic and run.
+        tracks: the tracks of all runs after all scans; with out-of-sequence scans, before all scans.
+        late: with out-of-sequence scans, the state of each run.
+        outputs: with smoothing, the outputs that are written at the end, by block.
     """
 
     fixes: Fixes
@@ -89,7 +89,7 @@ class TrackerState(NamedTuple):
 
 
 def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
-    """Start where nothing was met yet."""
+    """Start without tracks."""
     setup, runs = given.setup, given.runs
     unknown: list[Any] = [None] * runs
     fixes: Fixes = {topic: unknown for topic in setup.found.origins if topic}
@@ -97,7 +97,7 @@ def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
 
 
 def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[TrackerState, list[Ragged]]:
-    """Track a block; see `fuselog.replay.engine.api.functions.recursive`."""
+    """Track targets over a block; see `fuselog.replay.engine.api.functions.recursive`."""
     scans, fixes = _scans(state, block, setup)
     tracks, batches = setup.track(state.tracks, scans)
     outputs = _joined([setup.outputs(batch, tracked) for batch, tracked in batches])
@@ -108,7 +108,7 @@ def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[Tra
 
 
 def finish(setup: TrackerSetup, state: TrackerState) -> list[Ragged]:
-    """Return what was kept until the end, with the tracks smoothed."""
+    """Return the outputs kept until the end, with smoothed tracks."""
     outputs = _joined([each for each in state.outputs if each])
     return [
         smoothed(each, setup.targets) if each.stream.topic.endswith("/track") else each
@@ -117,12 +117,12 @@ def finish(setup: TrackerSetup, state: TrackerState) -> list[Ragged]:
 
 
 def _joined(outputs: Sequence[Sequence[Ragged]]) -> list[Ragged]:
-    """Join the topics of one part after the other."""
+    """Join the streams of each topic from successive parts."""
     return [join(parts) for parts in zip(*outputs, strict=True)]
 
 
 def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
-    """Return a block's scans, and the last own positions after it."""
+    """Return a block's scans, and the last sensor positions after it."""
     scans = scans_of(block, setup.found, KINDS, state.fixes)
     fixes = state.fixes.items()
     return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
@@ -131,10 +131,10 @@ def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scan
 def advance_out_of_sequence(
     setup: TrackerSetup, state: TrackerState, block: Block, *, back_ns: int
 ) -> tuple[TrackerState, list[Ragged]]:
-    """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
+    """Track targets in the order of arrival, reprocessing for scans that are late by up to `back_ns`.
 
-    A late scan is put in its place and those after it are used again; what was said stays, and is said
-    again at the latest stamp.
+    A late scan is inserted at its stamp, and the scans after it are processed again. Estimates that were
+    already given stay as they are; the corrected tracks are given again at the latest stamp.
     """
     scans, fixes = _scans(state, block, setup)
     after, outputs = [], []
@@ -153,7 +153,7 @@ def advance_out_of_sequence(
 
 
 def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
-    """Yield every run as it is before its first scan."""
+    """Yield the state of every run before its first scan."""
     none = take_scans(scans, np.empty(0, np.int64))
     for run in range(len(tracks.used)):
         own = of_runs(tracks, slice(run, run + 1))
@@ -161,7 +161,7 @@ def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
-    """Yield rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    """Yield rows of a run's scans that can be processed together: scans in time order, or late ones."""
     known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
     newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
     late = scans.time_ns[first:end] < newest_ns
@@ -172,7 +172,7 @@ def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -
 def _take(
     out_of_sequence: OutOfSequenceState, arrived: Scans, setup: TrackerSetup, back_ns: int
 ) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
-    """Take one run through scans that go on in time, or one that is late; also what is said then."""
+    """Process scans of one run that are in order, or one late scan; also return their outputs."""
     base, pending, head = out_of_sequence
     repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
     pending = in_time(pending, arrived)

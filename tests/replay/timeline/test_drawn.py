@@ -133,7 +133,7 @@ def test_a_shot_has_what_was_heard_its_ellipses_and_its_cone(tmp_path: Path) -> 
         if field == "mean":
             wanted[f"/map/{name}/shooter"] = ellipses(stream, begin, block(stream, *PLANE))
     compare(run.picture.moving, wanted)
-    check_views(run.picture, {*titles, ("Map; the bullet's way ends in its shockwave", "map")})
+    check_views(run.picture, {*titles, ("Map; the bullet's path ends at its shockwave", "map")})
     marks = run.picture.still["/map/sensors"]
     np.testing.assert_allclose(marks["Points2D:positions"][0], places, rtol=1e-5, atol=1e-5)
     assert marks["Points2D:labels"][0] == list("12345")

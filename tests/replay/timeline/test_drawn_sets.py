@@ -34,7 +34,7 @@ def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:
     compare(run.picture.moving, wanted)
     check_views(
         run.picture,
-        {("Map", "map/robot1"), ("Area of the set (m²), at the end 11.2 by one", "plots/robot1/area")},
+        {("Map", "map/robot1"), ("Area of the set (m²), at the end 11.2 for one", "plots/robot1/area")},
     )
 
 

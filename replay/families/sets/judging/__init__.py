@@ -1,1 +1,1 @@
-"""Judges sets of points and regions by the truth; begin with `distances`."""
+"""Comparison of point sets and regions with the truth; begin with `distances`."""

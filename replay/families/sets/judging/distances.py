@@ -1,4 +1,4 @@
-"""Measures distances between sets of points: OSPA and GOSPA with its parts.
+"""Distances between sets of points: OSPA, and GOSPA with its parts.
 
 Sources: Schuhmacher, Vo, Vo, "A consistent metric for performance evaluation of multi-object filters",
 IEEE TSP 56(8), 2008 (OSPA); Rahmathullah, Garcia-Fernandez, Svensson, "Generalized optimal sub-pattern
@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 
 
 class Gospa(NamedTuple):
-    """Holds GOSPA and what it is made of: total**order = localisation + missed + false."""
+    """GOSPA and its parts: total**order = localisation + missed + false."""
 
     total: float
     localisation: float
@@ -33,7 +33,7 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
     Args:
         estimates: (n, d).
         truths: (m, d).
-        cutoff: no distance counts as longer.
+        cutoff: upper limit of a distance.
         order: of the mean, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
@@ -49,21 +49,22 @@ def gospa(
 ) -> Gospa:
     """Compute GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
 
-    With alpha = 2 a pair as far apart as the cutoff is no pair: it counts as one missed and one false.
-    With another alpha only what exceeds the other set in number is missed or false.
+    With alpha = 2, points that are as far apart as the cutoff are not paired: they count as one missed
+    and one false point. With another alpha only the surplus of one set over the other is missed or
+    false.
 
-    Raises BadInput where the points are not finite or have different dimensions, the cutoff is not
+    Raises BadInput if the points are not finite or have different dimensions, the cutoff is not
     positive, the order is below 1, or alpha is not in (0, 2].
 
     Args:
         estimates: (n, d).
         truths: (m, d).
-        cutoff: no distance counts as longer, in the unit of the points.
+        cutoff: upper limit of a distance, in the unit of the points.
         order: of the sum, at least 1.
-        alpha: by which a surplus point costs cutoff^order / alpha.
+        alpha: a surplus point costs cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
-        raise BadInput(f"alpha {alpha:g}: give one above 0 and up to 2")
+        raise BadInput(f"alpha {alpha:g}: alpha must be above 0 and at most 2")
     costs = _assigned_costs(estimates, truths, cutoff, order)
     pairs = costs.pairs
     if alpha == 2.0:
@@ -81,14 +82,14 @@ def gospa(
 def gospa_pairs(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0
 ) -> tuple[Integers, Integers]:
-    """Return the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
+    """Find the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
 
     Raises BadInput as `gospa` does.
 
     Args:
         estimates: (n, d).
         truths: (m, d).
-        cutoff: no pair is farther apart.
+        cutoff: greatest distance of a pair.
         order: of the sum, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
@@ -97,7 +98,7 @@ def gospa_pairs(
 
 
 class _Costs(NamedTuple):
-    """Holds the sizes of the sets, and the best pairs: who, and distances to the power of the order."""
+    """Sizes of the sets, and the best pairs with their distances to the power of the order."""
 
     estimates: int
     truths: int
@@ -107,13 +108,13 @@ class _Costs(NamedTuple):
 
 
 def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
-    """Pair as many points as there are, at the least cost."""
-    from scipy.optimize import linear_sum_assignment  # these take long to import
+    """Form the greatest number of pairs at the least cost."""
+    from scipy.optimize import linear_sum_assignment  # slow to import
     from scipy.spatial.distance import cdist
 
     if not (0.0 < cutoff < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
-            f"cutoff {cutoff:g}, order {order:g}: give a positive cutoff, and an order from 1 on"
+            f"cutoff {cutoff:g}, order {order:g}: the cutoff must be positive, and the order at least 1"
         )
     first, second = _points(estimates, "estimates"), _points(truths, "truths")
     if len(first) == 0 or len(second) == 0:
@@ -121,8 +122,8 @@ def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, orde
         return _Costs(len(first), len(second), np.empty(0), nobody, nobody)
     if first.shape[1] != second.shape[1]:
         raise BadInput(
-            f"estimates have {first.shape[1]} components and truths {second.shape[1]}; give both in "
-            "the same"
+            f"estimates have {first.shape[1]} components and truths {second.shape[1]}; both must have "
+            "the same number"
         )
     costs = np.minimum(cdist(first, second), cutoff) ** order
     estimate, truth = linear_sum_assignment(costs)
@@ -134,7 +135,5 @@ def _points(points: ArrayLike, what: str) -> Floats:
     if found.size == 0:
         return np.empty((0, 0))
     if found.ndim != 2 or not np.isfinite(found).all():
-        raise BadInput(
-            f"{what}: expected finite points (n, d), found shape {found.shape}; leave out NaN"
-        )
+        raise BadInput(f"{what}: expected finite points (n, d), found shape {found.shape}; remove NaN")
     return found

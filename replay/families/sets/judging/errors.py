@@ -1,7 +1,7 @@
-"""Compares estimated sets with true ones, step by step: OSPA and GOSPA with its parts.
+"""Comparison of estimated sets with true ones, step by step: OSPA, and GOSPA with its parts.
 
 A set estimate is a pair of streams: its size, and its elements (see `schemas.ESTIMATE_SIZE`). The true
-set at a time are all targets whose truth has the estimate's components and is known then.
+set at a time consists of all targets with a truth that has the estimate's components and is known then.
 """
 
 from abc import ABC
@@ -31,7 +31,7 @@ ORDER = 2.0
 
 
 class SetErrors(NamedTuple):
-    """Holds a set estimate of an ensemble, judged: one row (n,) per run and step.
+    """Errors of a set estimate over an ensemble: one row (n,) per run and step.
 
     Attributes:
         estimator: the estimator's label.
@@ -39,7 +39,7 @@ class SetErrors(NamedTuple):
         run, time_ns, elapsed_s: the number of the run, the stamp, and the time since the run's epoch.
         ospa, gospa: the distances, in m.
         localisation, missed, false: GOSPA's parts, in m^2.
-        estimated, true: how many targets.
+        estimated, true: numbers of targets.
     """
 
     estimator: str
@@ -64,11 +64,11 @@ def set_errors(
     gap_limit_s: float = 0.2,
     first_run: int = 0,
 ) -> dict[str, SetErrors]:
-    """Judge every set estimate, by its topic, among a replay's outputs, or a block of them.
+    """Judge every set estimate among a replay's outputs, or a block of them, by topic.
 
-    Targets are taken into the frame of the estimates. Left out are those whose targets have no truths in
-    some run, or are in a frame that has no known pose in it (see `unjudged_sets`); `first_run` is the
-    number of the first.
+    Targets are transformed into the frame of the estimates. Estimates are left out if their targets have
+    no truths in some run, or are in a frame without a known pose (see `unjudged_sets`). `first_run` is
+    the number of the first run.
     """
     found = {}
     for topic, sizes in outputs.items():
@@ -105,7 +105,7 @@ def targets_in(source: Source, components: Sequence[str]) -> list[str]:
 
 
 def unjudged_sets(sizes: Stream, sources: Sequence[Source]) -> str:
-    """Explain why sets cannot be compared with the targets of some run; empty if they can."""
+    """Explain why sets cannot be compared with the targets of some run; return "" if they can."""
     reasons = (
         not_comparable(sizes.metadata, targets_in(source, sizes.components), source.topics)
         for source in sources
@@ -122,7 +122,7 @@ def _judge_run(
     cutoff_m: float,
     gap_limit_s: float,
 ) -> Floats:
-    """Return rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
+    """Compute rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
     frame, at_ns = frame_of(sizes.metadata), sizes.publish_time_ns
@@ -146,7 +146,7 @@ def _judge_run(
 
 
 class SetsJudge(KindJudge):
-    """Judges sets of targets, and regions that hold one."""
+    """Judge for sets of targets, and for regions that contain one target."""
 
     def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
         """Judge a block; see `KindJudge`."""
@@ -161,7 +161,7 @@ class SetsJudge(KindJudge):
 
 
 class AnySets(ABC):  # noqa: B024  # named tuples have no base of their own
-    """Stands for what the metrics of sets judge: sets of targets, and regions of one."""
+    """Anything that the metrics of sets judge: sets of targets, and regions of one."""
 
 
 AnySets.register(SetErrors)
@@ -207,7 +207,7 @@ def _means(sums: Sums) -> dict[str, float]:
 
 
 SETS = metric_of_sums(
-    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m; area of regions, and what they hold",
+    "OSPA and GOSPA of estimated sets, cutoff 10 m; area of regions, and whether they hold the truth",
     AnySets,
     _sums,
     _means,

@@ -1,4 +1,4 @@
-"""Judges sets by truth: area, whether the true position is inside, how often there is no set."""
+"""Evaluation of sets against the truth: area, containment of the true position, and empty sets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class JudgedSets:
-    """Holds the sets of one estimator and case, a row per frame.
+    """The sets of one estimator and case, a row per frame.
 
-    `inside` says whether the truth is in the set, where it is `known`, `in_arena` whether it is where
-    the robot was taken to be, and `bound_holds` whether all relative bearings of the frame keep their
-    bound there; an empty set has area 0.
+    `inside` marks sets that contain the truth, if it is `known`; `in_arena` marks frames at which the
+    robot is in its assumed arena; `bound_holds` marks frames whose relative bearings all keep their
+    bound. An empty set has area 0.
     """
 
     estimator: str
@@ -40,12 +40,12 @@ class JudgedSets:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although bounds and arena hold: none if guaranteed."""
+        """Count the sets that miss the truth although bounds and arena hold, 0 for guaranteed sets."""
         return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
 
     @property
     def outside_arena(self) -> int:
-        """Count how often the robot was not where it was taken to be, so that nothing is guaranteed."""
+        """Count how often the robot was outside its assumed arena, so that nothing is guaranteed."""
         return int((self.known & ~self.in_arena).sum())
 
 
@@ -92,7 +92,7 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames).
+    """Test whether the positions are in each frame's arena, and keep its bound: (2, frames).
 
     Args:
         sizes: the sets of one run, a message per frame.
@@ -104,7 +104,7 @@ def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.b
     hold = np.zeros((2, len(places)), bool)
     row_of = {time_ns: row for row, time_ns in enumerate(sizes.publish_time_ns.tolist())}
     for frame in frames(streams[measured], streams["/landmarks"], Known.of(sizes.metadata)):
-        row = row_of.get(frame.time_ns)  # none outside the span that was replayed
+        row = row_of.get(frame.time_ns)  # None outside the replayed span
         if row is not None:
             hold[0, row] = np.all((frame.arena.low <= places[row]) & (places[row] <= frame.arena.high))
             hold[1, row] = np.all(excess_rad(frame.pairs, places[row]) <= 0)

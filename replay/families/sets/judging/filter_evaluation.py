@@ -1,4 +1,4 @@
-"""Judges guaranteed sets over time: where their premises hold, they must hold the robot."""
+"""Evaluation of guaranteed sets over time: if their premises hold, they must contain the robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,17 +33,17 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 @dataclass(frozen=True)
 class JudgedFilter:
-    """Holds the sets of one robot over time, a row per frame of all runs.
+    """The sets of one robot over time, a row per frame of all runs.
 
     Attributes:
         sets: area, and whether the truth is inside.
-        pose: the true pose (n, 3), NaN where it is unknown.
+        pose: the true pose (n, 3), NaN if it is unknown.
         frame_holds: whether bearings and arena keep their bounds at the truth.
-        odometry_holds: whether odometry kept its bounds since the set that this one was moved from.
-        guaranteed: whether the set must hold the truth: an earlier set held it, and since then all
-            bounds have held.
-        growth: how many times larger sets with L = 8 are.
-        finding: numbers in `frames.FINDINGS`, -1 where nothing was wrong.
+        odometry_holds: whether odometry kept its bounds since the set from which this one was moved.
+        guaranteed: whether the set must contain the truth: an earlier set contained it, and all bounds
+            have held since then.
+        growth: factor by which the form L = 8 enlarges sets.
+        finding: indices in `frames.FINDINGS`, -1 if nothing was wrong.
     """
 
     sets: JudgedSets
@@ -56,7 +56,7 @@ class JudgedFilter:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although they must hold it: with guaranteed sets, none."""
+        """Count the sets that miss the truth although they must contain it, 0 for guaranteed sets."""
         return int((self.guaranteed & ~self.sets.inside).sum())
 
 
@@ -91,7 +91,7 @@ def judge_filter(
 def _judge(
     steps: Stream, diagnosed: Stream, source: Source, inside: Booleans, gap_limit_s: float
 ) -> tuple[NDArray, ...]:
-    """Return the columns of JudgedFilter for one run, from `pose` on."""
+    """Compute the columns of JudgedFilter for one run, from `pose` on."""
     pose = reference(Truths(source), steps.metadata["truth"], POSE, steps, gap_limit_s)
     stamps = steps.publish_time_ns
     anchor = np.searchsorted(stamps, steps["anchor_time_ns"])
@@ -111,7 +111,7 @@ def _judge(
     apart = np.abs(wrap_angle(pose[:, 2] - steps["heading_rad"]))
     holds_pose = inside & (apart <= steps["heading_half_width_rad"] + 1e-9)
     guaranteed = np.zeros(len(steps), bool)
-    sound = False  # whether the anchor holds the robot for certain, after the frames since then
+    sound = False  # whether the anchor, cut by the frames since then, must contain the robot
     for step, origin in enumerate(anchor.tolist()):
         if origin == step:
             guaranteed[step] = frame_holds[step]
@@ -131,14 +131,14 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Compute errors (n, 2) of displacements (m) and turns (rad) between true poses (n, 3).
+    """Compute errors (n, 2) of displacements (m) and turns (rad) between true poses.
 
     Args:
         odometry: of the robot.
-        first_ns: (n,), when each span begins.
-        last_ns: (n,), when it ends.
-        first: (n, 3), the true pose then.
-        last: (n, 3), the true pose at the end.
+        first_ns: (n,), beginning of each span.
+        last_ns: (n,), end of each span.
+        first: (n, 3), true pose at the beginning.
+        last: (n, 3), true pose at the end.
     """
     true = relative_pose(first, last)
     stated = relative_pose(odometry.pose_at(first_ns), odometry.pose_at(last_ns))
@@ -147,10 +147,10 @@ def odometry_error(
 
 
 def bearing_errors(seen: Bearings, pose: Floats) -> Floats:
-    """Compute how far single bearings are off at a true pose, (n,) in rad.
+    """Compute the absolute errors of single bearings at a true pose, (n,) in rad.
 
     Args:
-        seen: n bearings, and the places of what they are of.
+        seen: n bearings, and the positions of their landmarks.
         pose: (3,), x, y in m, heading in rad.
     """
     away = seen.place_m - pose[:2]
@@ -158,7 +158,7 @@ def bearing_errors(seen: Bearings, pose: Floats) -> Floats:
 
 
 def _bearings_hold(steps: Stream, source: Source, pose: Floats, bound_rad: float) -> Booleans:
-    """Tell whether the single bearings of each frame keep their bound."""
+    """Test whether the single bearings of each frame keep their bound."""
     measured = steps.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     row_of = {time_ns: row for row, time_ns in enumerate(steps.publish_time_ns.tolist())}

@@ -1,4 +1,4 @@
-"""Judges regions that are told to hold a position: their area, and whether they hold the truth."""
+"""Evaluation of regions that should contain a position: area, and containment of the truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,9 +18,9 @@ PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 
 class Regions(NamedTuple):
-    """Holds the regions (n,) of one estimator and case, of an ensemble or a block of it.
+    """The regions (n,) of one estimator and case, of an ensemble or a block of it.
 
-    `holds` says whether the truth is in the region, where it is `known`; an empty region has area 0.
+    `holds` marks regions that contain the truth, if it is `known`; an empty region has area 0.
     """
 
     estimator: str
@@ -49,7 +49,7 @@ def regions_of(
 
 
 def places_at(sizes: Ragged, truths: Sequence[Truths], gap_limit_s: float) -> Floats:
-    """Return the true places (n, 2) at the stamps of regions; NaN where none is known."""
+    """Find the true positions (n, 2) at the stamps of regions; NaN if unknown."""
     topic = sizes.stream.metadata.get("truth", "")
     return np.concatenate(
         [
@@ -62,7 +62,7 @@ def places_at(sizes: Ragged, truths: Sequence[Truths], gap_limit_s: float) -> Fl
 
 
 def rings_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
-    """Return the rings (n, 2) of every region; none where it is empty."""
+    """Split the vertices into the rings (n, 2) of every region; an empty region has no rings."""
     ends = np.cumsum(sizes["elements"].astype(np.int64))
     ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
     found = []
@@ -73,21 +73,21 @@ def rings_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
 
 
 def areas_of(regions: Sequence[Sequence[Floats]]) -> Floats:
-    """Compute the area (n,) inside the rings of every region; holes run the other way round."""
+    """Compute the area (n,) inside the rings of every region; holes have the opposite orientation."""
     return np.array([abs(sum(map(signed_area, rings))) for rings in regions])
 
 
 def inside(regions: Sequence[Sequence[Floats]], places: Floats) -> NDArray[np.bool_]:
-    """Tell for each region whether the place that belongs to it is in it.
+    """Test for each region whether it contains its position.
 
     Args:
         regions: n lists of rings, (vertices, 2) in m each.
-        places: (n, 2), in m; NaN is in none.
+        places: (n, 2), in m; NaN is in no region.
 
     Returns:
-        (n,) answers.
+        (n,) booleans.
     """
-    from matplotlib.path import Path  # which takes long to import
+    from matplotlib.path import Path  # slow to import
 
     found = np.zeros(len(places), bool)
     for row, rings in enumerate(regions):

@@ -1,4 +1,4 @@
-"""Computes the regions that bounded errors leave: exact sets, pseudo-ellipsoids, sets that move.
+"""Regions from bounded errors: exact sets, pseudo-ellipsoids, sets that move.
 
 Begin with `feasible_sets`.
 """

@@ -1,7 +1,7 @@
-"""Computes exact sets of positions that bounded relative bearings leave: areas, boxes, borders.
+"""Exact sets of positions that bounded relative bearings allow: areas, boxes, borders.
 
 Briechle, Hanebeck, Localization of a Mobile Robot Using Relative Bearing Measurements (2004), (2)-(4),
-(20), (21). Everything is an intersection of generalised discs a |x|^2 + b'x + c <= 0: discs, their
+(20), (21). Every set is an intersection of generalised discs a |x|^2 + b'x + c <= 0: discs, their
 complements, half-planes. With |b|^2 - 4 a c = 1 the left side is the distance near the border.
 """
 
@@ -17,7 +17,7 @@ from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class Pairs(NamedTuple):
-    """Holds relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), bound.
+    """Relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), and bound.
 
     angle = bearing of first - bearing of second, wrong by at most `bound_rad`.
     """
@@ -29,17 +29,17 @@ class Pairs(NamedTuple):
 
 
 class Arena(NamedTuple):
-    """Bounds the rectangle that the robot is known to be in."""
+    """Rectangle that is known to contain the robot."""
 
     low: Floats
     high: Floats
 
 
 class Arcs(NamedTuple):
-    """Holds a set's border as arcs with the set on the left; a set without border is empty.
+    """Border of a set as arcs with the set on the left; a set without a border is empty.
 
-    Each begins at `start` (m, 2) in direction `heading_rad` (m,) and runs `length` (m,) at a constant
-    `curvature` (m,), negative where the set is outside the circle.
+    Each arc begins at `start` (m, 2) in direction `heading_rad` (m,) and has `length` (m,) and constant
+    `curvature` (m,), which is negative if the set is outside the circle.
     """
 
     start: Floats
@@ -48,21 +48,21 @@ class Arcs(NamedTuple):
     length: Floats
 
     def at(self, distance: Floats) -> Floats:
-        """Return the points at `distance` (m,) along the arcs."""
+        """Compute the points at `distance` (m,) along the arcs."""
         pose = (*self.start.T, self.heading_rad)
         return np.stack(drive(pose, (1.0, self.curvature), distance)[:2], axis=-1)
 
 
 def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_rad: float) -> Pairs:
-    """Check and wrap a frame.
+    """Check the relative bearings of a frame.
 
-    Raises BadInput where shapes differ, a number is not finite, two landmarks coincide, or the bound is
-    not above 0 and below pi / 2 (from there on the set is no longer an intersection).
+    Raises BadInput if shapes differ, a number is not finite, two landmarks coincide, or the bound is not
+    above 0 and below pi / 2 (beyond that the set is not an intersection of discs).
 
     Args:
         first: (n, 2), a landmark of each pair, in m.
         second: (n, 2), the other one.
-        angle_rad: (n,), from the first to the second.
+        angle_rad: (n,), bearing of the first minus bearing of the second.
         bound_rad: the largest error of an angle.
     """
     pairs = Pairs(
@@ -72,37 +72,37 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
         float(bound_rad),
     )
     if not 0 < pairs.bound_rad < 0.5 * np.pi:
-        raise BadInput(f"a bound of {bound_rad} rad; give one above 0 and below pi / 2")
+        raise BadInput(f"bound {bound_rad} rad: the bound must be above 0 and below pi / 2")
     if not len(pairs.first) == len(pairs.second) == len(pairs.angle_rad):
         raise BadInput(
             f"{len(pairs.first)} first and {len(pairs.second)} second landmarks for "
-            f"{len(pairs.angle_rad)} angles; give one of each per relative bearing"
+            f"{len(pairs.angle_rad)} angles; expected one of each per relative bearing"
         )
     if not all(np.isfinite(part).all() for part in pairs[:3]):
-        raise BadInput("a landmark or an angle is not finite; leave that relative bearing out")
+        raise BadInput("a landmark or an angle is not finite; remove that relative bearing")
     if np.any(np.all(pairs.first == pairs.second, axis=1)):
         raise BadInput(
-            "the two landmarks of a pair are at one place, so that their angle says nothing; leave it "
-            "out"
+            "the two landmarks of a pair are at the same position, so their angle is undefined; remove "
+            "that pair"
         )
     return pairs
 
 
 def arena_around(points: ArrayLike, margin_m: float) -> Arena:
-    """Return the rectangle around points, larger by a margin on every side.
+    """Return the rectangle around points, enlarged by a margin on every side.
 
     Args:
         points: (n, 2), in m.
-        margin_m: how much larger.
+        margin_m: width of the margin.
     """
     places = np.asarray(points, float)
     return Arena(places.min(axis=0) - margin_m, places.max(axis=0) + margin_m)
 
 
 def excess_rad(pairs: Pairs, points: Floats) -> Floats:
-    """Compute how far each pair's bound is exceeded at points (..., 2): (..., n), feasible where <= 0.
+    """Compute the excess of each pair's error over its bound at points: (..., n), feasible where <= 0.
 
-    The exact membership test, (4). NaN on a landmark itself, where the angle has no value.
+    This is the exact membership test, (4). It is NaN at a landmark itself, where the angle is undefined.
 
     Args:
         pairs: the relative bearings of a frame.
@@ -120,11 +120,11 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
 
 
 def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
-    """Return the discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
+    """Compute the discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
 
-    D(g) holds sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
-    chord, sees it at the angle g. The sign of (20) needs Delta_perp turned by +90 degrees, which the
-    paper does not say. A sine of zero gives the half-plane.
+    In D(g), sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
+    chord, sees the chord at the angle g. The sign of (20) requires Delta_perp to be turned by +90
+    degrees, which the paper does not state. A sine of zero gives the half-plane.
 
     Args:
         pairs: the n relative bearings of a frame.
@@ -142,10 +142,10 @@ def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
 
 
 def discs(pairs: Pairs) -> Floats:
-    """Return the two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
+    """Compute the two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
 
-    Between g1 = angle - bound and g2 = angle + bound: D(g1) without D(g2). That is a lune, a lens where
-    g2 passes pi, the outside of two discs where g1 passes 0; no case needs its own formula.
+    With g1 = angle - bound and g2 = angle + bound, the set is D(g1) without D(g2). That is a lune, a
+    lens if g2 passes pi, and the outside of two discs if g1 passes 0; no case needs its own formula.
     """
     lower = circles(pairs, pairs.angle_rad - pairs.bound_rad)
     upper = circles(pairs, pairs.angle_rad + pairs.bound_rad)
@@ -162,7 +162,7 @@ def half_planes(arena: Arena) -> Floats:
 
 
 def evaluate(constraints: Floats, points: Floats) -> Floats:
-    """Return the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k).
+    """Compute the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k).
 
     Args:
         constraints: (k, 4), a, b_x, b_y, c.
@@ -174,13 +174,13 @@ def evaluate(constraints: Floats, points: Floats) -> Floats:
 
 
 def exact_set(pairs: Pairs, arena: Arena) -> Arcs:
-    """Return the exact feasible set (4) of a frame inside an arena; no arcs where it is empty."""
+    """Compute the exact feasible set (4) of a frame inside an arena; no arcs if it is empty."""
     constraints = np.concatenate([discs(pairs).reshape(-1, 4), half_planes(arena)])
     return intersection(constraints, arena)
 
 
 def intersection(constraints: Floats, arena: Arena) -> Arcs:
-    """Return the border of an intersection of generalised discs (k, 4), the arena's sides among them.
+    """Compute the border of an intersection of generalised discs, the arena's sides among them.
 
     Args:
         constraints: (k, 4), a, b_x, b_y, c.
@@ -192,7 +192,7 @@ def intersection(constraints: Floats, arena: Arena) -> Arcs:
     owner = np.repeat(np.arange(len(constraints)), len(pieces.length) // len(constraints))
     value = evaluate(constraints, middle)
     other = np.arange(len(constraints))
-    # on a border that two constraints share, the first of them owns it
+    # a border that two constraints share belongs to the first of them
     good = (value < -tolerance) | ((value <= tolerance) & (other > owner[:, None]))
     good[np.arange(len(owner)), owner] = True
     kept = good.all(axis=1) & (pieces.length > tolerance)
@@ -200,11 +200,11 @@ def intersection(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _cut(constraints: Floats, arena: Arena) -> Arcs:
-    """Cut all circles where they meet others, circle by circle, 2 k + 1 pieces each.
+    """Cut each circle at its intersections with all others, into 2 k + 1 pieces.
 
-    A circle is run through from its point nearest the arena's centre. With tau = tan(h s) / h, h half
-    its curvature and s the distance run, another constraint along it is a quadratic in tau, whatever
-    is disc or line. Its own is zero all along, whose roots would be rounding.
+    A circle is traversed from its point nearest the arena's centre. With tau = tan(h s) / h, where h is
+    half its curvature and s the distance, another constraint along it is a quadratic in tau, for discs
+    and lines alike. Its own constraint is zero everywhere, so roots of it would only be rounding errors.
     """
     centre = 0.5 * (arena.low + arena.high)
     reach = 4.0 * float(np.linalg.norm(arena.high - arena.low))
@@ -239,7 +239,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
-    """Find both real roots (..., 2) of quadratics, without cancellation; NaN or infinite where none."""
+    """Find both real roots (..., 2) of quadratics, without cancellation; NaN or infinite if missing."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(linear**2 - 4.0 * quadratic * constant)
         half = -0.5 * (linear + np.where(linear < 0, -root, root))
@@ -247,7 +247,7 @@ def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
 
 
 def area(border: Arcs) -> float:
-    """Return the area inside, by Green's theorem: chords and circular segments."""
+    """Compute the area inside by Green's theorem: chords and circular segments."""
     end = border.at(border.length)
     chords = border.start[:, 0] * end[:, 1] - border.start[:, 1] * end[:, 0]
     turn = border.curvature * border.length
@@ -258,13 +258,13 @@ def area(border: Arcs) -> float:
 
 
 def box(border: Arcs) -> Arena:
-    """Return the tightest axis-parallel box; raises BadInput for an empty set."""
+    """Compute the tightest axis-parallel box; raise BadInput for an empty set."""
     if len(border.length) == 0:
-        raise BadInput("the set is empty, so that it has no bounding box")
+        raise BadInput("the set is empty and has no bounding box")
     points = [border.start, border.at(border.length)]
     turn = border.curvature * border.length
     for quarter in range(4):
-        # the distance run until the arc heads along an axis: there it is extreme
+        # the distance after which the arc is parallel to an axis, where a coordinate is extreme
         wanted = quarter * 0.5 * np.pi - border.heading_rad
         ahead = np.where(turn < 0, -((-wanted) % (2 * np.pi)), wanted % (2 * np.pi))
         reached = np.abs(ahead) <= np.abs(turn)
@@ -275,10 +275,10 @@ def box(border: Arcs) -> Arena:
 
 
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
-    """Draw closed polygons (n, 2) around the set, which is on their left.
+    """Compute closed polygons (n, 2) around the set, which is on their left.
 
-    They hold the set: vertices are on arcs that bend inwards and outside of those that bend outwards.
-    Together they are larger than it by no more than the tolerance, in units of its area.
+    The polygons contain the set: vertices are on concave arcs and outside convex ones. Together they are
+    larger than the set by at most the tolerance, in units of its area.
     """
     tolerance_m = relative_tolerance * max(area(border), 1e-12) / max(border.length.sum(), 1e-12)
     end = border.at(border.length)
@@ -301,13 +301,13 @@ def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
 
 
 def signed_area(ring: Floats) -> float:
-    """Return the area inside a polygon (n, 2), positive where it runs anticlockwise."""
+    """Compute the area inside a polygon (n, 2), positive if it runs anticlockwise."""
     following = np.roll(ring, -1, axis=0)
     return float(0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]))
 
 
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """Find a polygon's vertices along an arc, its end left out; tangents meet outside of convex arcs."""
+    """Compute vertices along an arc without its end; tangents meet outside convex arcs."""
     length, curvature = border.length[index], border.curvature[index]
     pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
     pieces = max(pieces, int(np.ceil(abs(length * curvature))))
@@ -325,10 +325,10 @@ def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
 
 
 def to_blame(pairs: Pairs, arena: Arena) -> Integers:
-    """Find the pairs that contradict the others, worst first; none where the exact set is not empty.
+    """Find the pairs that contradict the others, worst first; none if the exact set is not empty.
 
-    They are those violated at the place in the arena where the fewest are; of all places where circles
-    meet, the one with the least excess.
+    They are the pairs that are violated at the point in the arena with the fewest violations. Among all
+    points where circles intersect, this is the one with the least excess.
     """
     if len(exact_set(pairs, arena).length):
         return np.empty(0, np.int64)

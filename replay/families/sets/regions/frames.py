@@ -1,4 +1,4 @@
-"""Reads bounded bearings frame by frame, with what their channels state of the bounds."""
+"""Frames of bounded bearings, with the bounds that their channels state."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,20 +16,20 @@ from fuselog.replay.families.sets.regions.moving_sets import Growth
 
 CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
 FINDINGS = (
-    "the bearings of this frame contradict each other: it is left out",
-    "this frame contradicts what came before it: the sets of both are kept",
-    "this frame contradicts both sets that were kept: they count as one from here on",
-    "the earlier frame that contradicted what came before it was wrong",
-    "what came before the earlier frame that contradicted it was wrong",
+    "the bearings of this frame contradict each other: the frame is not used",
+    "this frame contradicts the frames before it: the sets of both are kept",
+    "this frame contradicts both kept sets: they count as one set from here on",
+    "the frame that contradicted those before it was wrong",
+    "the frames before the one that contradicted them were wrong",
 )
 NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 
 
 class Known(NamedTuple):
-    """Holds what is known beside the bearings: their bound, and where the robot can be.
+    """Bound of the bearings, and where the robot can be.
 
-    `arena_m` is (low x, low y, high x, high y). None where it follows from the sensor's maximum range,
-    which is None where that is the longest that it measured.
+    `arena_m` is (low x, low y, high x, high y), or None if the arena follows from the sensor's maximum
+    range. `maximum_range_m` is None if it is the longest measured range.
     """
 
     bound_rad: float
@@ -38,17 +38,17 @@ class Known(NamedTuple):
     maximum_range_m: float | None
 
     def metadata(self) -> dict[str, str]:
-        """State it as a channel does."""
+        """Return the fields as metadata of a channel."""
         return {name: json.dumps(value) for name, value in self._asdict().items()}
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> "Known":
-        """Read what a channel or parameters state, in the order of STATED."""
+        """Read the fields from the metadata of a channel."""
         return cls(*(json.loads(metadata[name]) for name in cls._fields))
 
 
 class Frame(NamedTuple):
-    """Holds the relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
+    """The relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
 
     time_ns: int
     pairs: Pairs
@@ -57,10 +57,10 @@ class Frame(NamedTuple):
 
 
 def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
-    """Yield the frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
+    """Yield the frames of a bearing, range-bearing or relative-bearing stream with enough landmarks.
 
-    What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
-    where nothing says how far the robot can be from what it sees.
+    Landmarks that are not on the map are left out, and so are pairs of one landmark seen twice. Raises
+    BadInput if the distance between the robot and the landmarks that it sees is not bounded.
     """
     places_m = read_vectors(landmarks, "position_m", PLANE)
     place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
@@ -86,13 +86,13 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
 
 
 def _maximum_range_m(stream: Stream, known: Known) -> float:
-    """Tell how far the sensor sees: as stated, else the longest range that it measured."""
+    """Return the sensor's range as stated, or else the longest range that it measured."""
     if known.maximum_range_m is not None:
         return known.maximum_range_m
     if "range_m" not in stream.columns:
         raise BadInput(
-            f"topic {stream.topic}: nothing bounds the robot's position: the topic has no ranges and "
-            "states no maximum_range_m, and /landmarks states no arena_m; give "
+            f"topic {stream.topic}: the robot's position is not bounded: the topic has no ranges and "
+            "states no maximum_range_m, and /landmarks states no arena_m; use "
             "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
         )
     return float(stream["range_m"].max(initial=0.0))
@@ -103,16 +103,17 @@ def _arena(corners_m: tuple[float, ...]) -> Arena:
 
 
 def _within(places: Floats, range_m: float) -> Arena:
-    """Return the rectangle no farther than a range from any of the places (n, 2).
+    """Return the rectangle of positions no farther than a range from any landmark (n, 2).
 
-    Where there is none one landmark is misidentified, and the robot no farther from one of them.
+    If there are no such positions, a landmark is misidentified; then the rectangle contains all
+    positions within the range of at least one landmark.
     """
     low, high = places.max(axis=0) - range_m, places.min(axis=0) + range_m
     return Arena(low, high) if np.all(low < high) else arena_around(places, range_m)
 
 
 class Bounds(NamedTuple):
-    """Describes how far odometry and bearings err at most."""
+    """Upper bounds of the errors of odometry and bearings."""
 
     position: Growth
     heading: Growth
@@ -120,7 +121,7 @@ class Bounds(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Bounds":
-        """Read what a channel or parameters state, in the order of STATED."""
+        """Make bounds from values in the order of STATED."""
         return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
 
 
@@ -129,7 +130,7 @@ STATED = (*ERRORS, "bearing_bound_rad")
 
 
 class Bearings(NamedTuple):
-    """Holds the bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
+    """The bearings (n,) of one stamp, and the positions (n, 2) of their landmarks."""
 
     place_m: Floats
     bearing_rad: Floats
@@ -138,7 +139,7 @@ class Bearings(NamedTuple):
 def frames_with_bearings(
     stream: Stream, landmarks: Stream, known: Known
 ) -> Iterable[tuple[Frame, Bearings]]:
-    """Yield a stream's frames and the single bearings of each, none of a relative-bearing stream."""
+    """Yield a stream's frames and the single bearings of each; a relative-bearing stream has none."""
     places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
     for frame in frames(stream, landmarks, known):
         bearings = Bearings(np.empty((0, 2)), np.empty(0))

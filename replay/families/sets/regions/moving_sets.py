@@ -1,8 +1,8 @@
-"""Moves sets of positions and headings that hold a robot for certain, by odometry of bounded error.
+"""Motion of sets of positions and headings that contain a robot, by odometry with bounded errors.
 
-A position set is a shapely geometry, which may be in several pieces; headings lie in one interval. What
-is computed holds the exact result: disc offsets are polygons around it, and what rounding could lose is
-added.
+A position set is a shapely geometry, which may have several pieces; headings are in one interval. Every
+computed set contains the exact result: disc offsets are polygons around it, and a margin covers rounding
+errors.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ else:
     shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
 
 ROUNDING_M = 1e-7
-ON_A_LINE_M = 1e-10  # a vertex so near to the line between its neighbours is none
-# Segments of an offset in a quarter of a circle. GEOS rounds their number, so that one may span 1.5
-# times as much, and simplifies what it offsets by up to 1 % of the distance; so offsets are wider.
+ON_A_LINE_M = 1e-10  # a vertex this near to the line between its neighbours is removed
+# Segments of an offset per quarter circle. GEOS rounds their number, so that a segment may span 1.5
+# times the angle, and simplifies its input by up to 1 % of the distance, so offsets are widened.
 QUARTER_SEGMENTS = 8
 WIDER = 1.01 / np.cos(1.5 * 0.25 * np.pi / QUARTER_SEGMENTS)
 L8_NODES = 48
@@ -36,7 +36,7 @@ L8_MOST_GROWTH = 3.0
 
 
 class Headings(NamedTuple):
-    """Holds an interval of headings; all of them where the half width is pi."""
+    """An interval of headings; all headings if the half width is pi."""
 
     middle_rad: float
     half_rad: float
@@ -46,34 +46,35 @@ ALL_HEADINGS = Headings(0.0, np.pi)
 
 
 class Odometry(NamedTuple):
-    """Holds poses (n, 3) that odometry alone leads to, and velocities (n, 2) from their stamps on."""
+    """Poses (n, 3) by odometry only, and velocities (n, 2) from their stamps on."""
 
     time_ns: Integers
     pose: Floats
     velocity: Floats
 
     def pose_at(self, time_ns: Integers) -> Floats:
-        """Return poses (m, 3) at any stamps; before the first the robot stood still."""
+        """Compute poses (m, 3) at any stamps; before the first stamp the robot is at rest."""
         row = np.maximum(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0)
         duration_s = np.maximum((time_ns - self.time_ns[row]) * 1e-9, 0.0)
         return np.stack(drive(self.pose[row].T, self.velocity[row].T, duration_s), axis=1)
 
 
 class Growth(NamedTuple):
-    """Bounds the error of odometry over a span: `offset` + `rate` times its length in s."""
+    """Bound of the error of odometry over a span: `offset` + `rate` times its length in s."""
 
     offset: float
     rate: float
 
     def over(self, span_s: Any) -> Any:
-        """Return the largest error over a span, or over each of several."""
+        """Compute the largest error over a span, or over each of several."""
         return self.offset + self.rate * span_s
 
 
 class Motion(NamedTuple):
-    """Describes how a robot moved from one stamp to another, seen from its pose at the first.
+    """Motion of a robot from one stamp to another, relative to its pose at the first.
 
-    The true `displacement_m` (2,) is within a disc of `position_error_m`, the turn within an interval.
+    The true displacement is within `position_error_m` of `displacement_m` (2,), and the true turn within
+    `turn_error_rad` of `turn_rad`.
     """
 
     displacement_m: Floats
@@ -83,7 +84,7 @@ class Motion(NamedTuple):
 
 
 def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
-    """Compute poses from the origin on, by velocities that each hold until the next stamp.
+    """Integrate poses from the origin, with velocities that are constant until the next stamp.
 
     Args:
         time_ns: (n,), the stamps.
@@ -101,7 +102,7 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
 
 def relative_pose(first: Floats, second: Floats) -> Floats:
-    """Return the second of two poses as seen from the first: displacement and turn, not wrapped.
+    """Compute the second of two poses relative to the first: displacement and turn, not wrapped.
 
     Args:
         first: (..., 3), x, y in m and heading in rad.
@@ -118,9 +119,9 @@ def relative_pose(first: Floats, second: Floats) -> Floats:
 
 
 def common_headings(one: Headings, other: Headings) -> Headings | None:
-    """Return the headings that are in both intervals; None where there are none.
+    """Return the intersection of two intervals of headings; None if it is empty.
 
-    Where wide intervals meet at both ends, the narrower of them holds what they have in common.
+    If wide intervals overlap at both ends, the narrower of them contains the intersection.
     """
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     if one.half_rad + other.half_rad >= 2.0 * np.pi - abs(apart):
@@ -133,7 +134,7 @@ def common_headings(one: Headings, other: Headings) -> Headings | None:
 
 
 def all_headings_of(one: Headings, other: Headings) -> Headings:
-    """Return the least interval that holds both."""
+    """Return the smallest interval that contains both intervals."""
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     low = min(-one.half_rad, apart - other.half_rad)
     high = max(one.half_rad, apart + other.half_rad)
@@ -143,7 +144,7 @@ def all_headings_of(one: Headings, other: Headings) -> Headings:
 
 
 def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
-    """Return headings after a motion, or with the direction -1 before it."""
+    """Compute headings after a motion, or before it with the direction -1."""
     middle = float(wrap_angle(headings.middle_rad + direction * motion.turn_rad))
     return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
 
@@ -151,10 +152,10 @@ def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
 def moved(
     places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
 ) -> shapely.Geometry:
-    """Compute where a robot is after a motion, or with the direction -1 where it was before it.
+    """Compute the positions of a robot after a motion, or before it with the direction -1.
 
-    `headings` are those before the motion. The displacements of all of them lie on an arc, and this in a
-    disc: one around the origin where they span half a circle or more.
+    `headings` are those before the motion. All their displacements are on an arc, which is contained in
+    a disc; if they span half a circle or more, the disc is around the origin.
     """
     half = min(headings.half_rad, 0.5 * np.pi)
     length = float(np.hypot(*motion.displacement_m))
@@ -169,7 +170,7 @@ def moved(
 
 
 def directions(places: shapely.Geometry, target: Floats) -> Headings:
-    """Return directions in which a point is seen from a set; all of them where it is in its hull.
+    """Compute the directions of a point from a set; all directions if the point is in its hull.
 
     Args:
         places: the set.
@@ -188,7 +189,7 @@ def directions(places: shapely.Geometry, target: Floats) -> Headings:
 
 
 def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
-    """Return a set from its borders (n, 2), holes the other way round."""
+    """Make a set from its borders (n, 2); holes have the opposite orientation."""
     places: shapely.Geometry = shapely.Polygon()
     for ring in rings:
         places = places.symmetric_difference(shapely.make_valid(shapely.Polygon(ring)))
@@ -196,12 +197,12 @@ def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
 
 
 def corners_of(places: shapely.Geometry) -> shapely.Geometry:
-    """Return a set without the vertices on its edges, which are there or not as rounding has it."""
+    """Remove a set's vertices that are on straight edges, whose presence depends on rounding."""
     return shapely.simplify(places, ON_A_LINE_M)
 
 
 def to_rings(places: shapely.Geometry) -> list[Floats]:
-    """Return the borders (n, 2) of a set: on their left is the set."""
+    """Return the borders (n, 2) of a set, with the set on their left."""
     found = []
     for part in shapely.get_parts(corners_of(places)):
         if isinstance(part, shapely.Polygon) and not part.is_empty:
@@ -213,11 +214,11 @@ def to_rings(places: shapely.Geometry) -> list[Floats]:
 
 
 def within_l8(places: shapely.Geometry) -> shapely.Geometry:
-    """Return a pseudo-ellipsoid with L = 8 around a set, as a polygon.
+    """Enclose a set in a pseudo-ellipsoid with L = 8, as a polygon.
 
-    It is the level set of the least ellipsoid around the monomials T of the set's points (by
-    Titterington's weights of 1976, which need no step length), grown until it holds the set. A set that
-    is too thin for the grid that borders are drawn on is left as it is.
+    It is the level set of the smallest ellipsoid around the monomials T of the set's points (with the
+    weights of Titterington, 1976, which need no step length), enlarged until it contains the set. A set
+    that is too thin for the grid of the border is returned as it is.
     """
     low, high = np.reshape(places.bounds, (2, 2))
     origin, scale_m = 0.5 * (low + high), 0.5 * float(np.max(high - low))

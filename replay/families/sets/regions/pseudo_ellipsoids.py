@@ -1,9 +1,9 @@
-"""Filters by pseudo-ellipsoids: position sets that are ellipsoids in a space of monomials.
+"""Pseudo-ellipsoids: position sets that are ellipsoids in a space of monomials.
 
-Briechle, Hanebeck (2004), III and IV. A pair's exact set lies between two circles for each of its two
-generalised discs: in u = (z - centre) / half width it is |u| <= 1, and u is linear in the monomials
+Briechle, Hanebeck (2004), III and IV. For each of its two generalised discs, a pair's exact set is
+between two circles: with u = (z - centre) / half width, |u| <= 1, and u is linear in the monomials
 [x, y, x^2, y^2] of L = 4. With L = 8, [x, y, x^2, y^2, xy, x s, y s, s^2] and s = x^2 + y^2, u^2 is
-linear as well and the parabola (u, u^2) lies in an ellipse. Every fused set is {sum of weighted
+linear as well, and the parabola (u, u^2) is inside an ellipse. Every fused set is {sum of weighted
 slacks >= 0}.
 """
 
@@ -26,7 +26,7 @@ ROUNDING = 1e-11
 
 
 class PseudoEllipsoid(NamedTuple):
-    """Represents the set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
+    """The set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
 
     Zero information, the prior of V, is all zeros; a huge covariance would only lose digits.
     """
@@ -39,7 +39,7 @@ class PseudoEllipsoid(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Holds nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
+    """Nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
 
     x: Floats
     y: Floats
@@ -47,7 +47,7 @@ class Grid(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Holds a set's border as closed polygons (n, 2), holes the other way round, and the area inside."""
+    """Border of a set as closed polygons (n, 2), with holes the other way round, and the area."""
 
     rings: list[Floats]
     area_m2: float
@@ -58,7 +58,7 @@ def monomials(points: Floats, order: Order) -> Floats:
 
     Args:
         points: (..., 2), scaled.
-        order: how many monomials there are.
+        order: number of monomials.
     """
     x, y = points[..., 0], points[..., 1]
     squared = x**2 + y**2
@@ -69,10 +69,10 @@ def monomials(points: Floats, order: Order) -> Floats:
 
 
 def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
-    """Return rings u = a |x|^2 + b'x + c with |u| <= 1 on each pair's exact set: (2 n, 4), two a pair.
+    """Compute rings u = a |x|^2 + b'x + c, |u| <= 1 on each pair's exact set: (2 n, 4), two per pair.
 
-    Where the set is bounded these are the rings of (22), (23), clamped at a centre that lies in the set;
-    (23) forgets the offset -d^2/4 of its interval. Where it is not, the arena bounds the values.
+    If the set is bounded, these are the rings of (22), (23), clamped at a centre in the set; (23) omits
+    the offset -d^2/4 of its interval. Otherwise the arena bounds the values.
     """
     flipped = pairs.angle_rad < 0
     first = np.where(flipped[:, None], pairs.second, pairs.first)
@@ -89,7 +89,7 @@ def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
 
 
 def _least_on_axis(pairs: Pairs) -> Floats:
-    """Find both discs' least values over bounded sets, on the chord's bisector, (n, 2).
+    """Find the least values (n, 2) of both discs over bounded sets, on the bisector of the chord.
 
     At height t over the chord of length c, f_g = (sin g (t^2 - c^2/4) - cos g c t) / c; the set spans
     the heights c/2 cot(g/2) of both circles' tops.
@@ -111,7 +111,7 @@ def _least_on_axis(pairs: Pairs) -> Floats:
 
 
 def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
-    """Bound the functions over the arena from below, tightly where they are no discs: (k,)."""
+    """Compute lower bounds (k,) of the functions over the arena, which are tight except for discs."""
     x, y = np.meshgrid(*np.stack(arena, axis=1))
     corners = evaluate(constraints, np.stack([x.ravel(), y.ravel()], axis=1)).min(axis=0)
     with np.errstate(divide="ignore"):
@@ -120,23 +120,23 @@ def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
 
 
 def slack(ring: Floats, points: Floats, order: Order) -> Floats:
-    """Compute the ring's room (...,) at points: 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8.
+    """Compute the ring's slack (...,) at points: 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8.
 
     Args:
         ring: coefficients of u, (4,), see `ring_coefficients`.
         points: (..., 2), in the ring's unit.
-        order: how many monomials there are.
+        order: number of monomials.
     """
     squared = evaluate(ring[None], points)[..., 0] ** 2
     return 1.0 - squared if order == 4 else 2.25 * squared * (1.0 - squared)
 
 
 def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
-    """Return H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T.
+    """Compute H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T.
 
     Args:
         ring: coefficients of u, (4,).
-        order: how many monomials there are.
+        order: number of monomials.
     """
     a, bx, by, c = ring
     row = np.array([bx, by, a, a])
@@ -159,10 +159,10 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """Filter by (18) in information form: one sum per parameter.
+    """Fuse a ring by (18) in information form: one sum per parameter.
 
     Args:
-        prior: before.
+        prior: the set before.
         ring: coefficients of u, (4,), in the prior's scaled positions.
         weight: of the ring, 0 or more.
     """
@@ -176,12 +176,12 @@ def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid
 
 
 def order_of(ellipsoid: PseudoEllipsoid) -> Order:
-    """Count the monomials that it is made of."""
+    """Return the number of monomials."""
     return 4 if len(ellipsoid.vector) == 4 else 8
 
 
 def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
-    """Return the fused slack at points (..., 2): the set is where it is >= 0.
+    """Compute the fused slack at points (..., 2), which is >= 0 in the set.
 
     Args:
         ellipsoid: the set.
@@ -196,15 +196,15 @@ def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
 
 
 def most_room(ellipsoid: PseudoEllipsoid) -> float:
-    """Return the greatest fused slack of any monomials, s of (7), at least its rounding error.
+    """Compute the greatest fused slack over all monomials, s of (7), at least its rounding error.
 
-    Raises BadInput where it is negative by more than that: the sets have no common point.
+    Raises BadInput if it is negative beyond rounding: the sets have no common point.
     """
     centre = np.linalg.lstsq(ellipsoid.information, ellipsoid.vector)[0]
     most = float(ellipsoid.vector @ centre) - ellipsoid.constant
     error = ROUNDING * abs(ellipsoid.constant)
     if most < -error:
-        raise BadInput("the sets of the pairs have no common point; give a larger bound")
+        raise BadInput("the sets of the pairs have no common point; use a larger bound")
     return max(most, error)
 
 
@@ -215,15 +215,15 @@ def fit(
 
     Args:
         pairs: the frame.
-        arena: where the robot is known to be.
+        arena: rectangle that is known to contain the robot.
         order: the number L of monomials, 4 or 8.
-        weighting: "area" minimises the set's area at every step, "batch" over all weights at once,
-            "determinant" that of C^e, from a wide prior, "equal" chooses nothing.
-            The paper says "area" and not how.
-        sweeps: how often the rings are fused; fusing a set again is legitimate.
+        weighting: "area" minimises the set's area at every step, "batch" over all weights together,
+            "determinant" the determinant of C^e, from a wide prior; "equal" uses equal weights. The
+            paper names "area" without a procedure.
+        sweeps: number of times that the rings are fused; fusing a set repeatedly is valid.
 
-    Returns the set; it holds the exact set whatever the weights are.
-    Raises BadInput where the filter finds that the sets have no common point.
+    Returns the set, which contains the exact set for any weights. Raises BadInput if the filter finds
+    that the sets have no common point.
     """
     origin = 0.5 * (arena.low + arena.high)
     scale_m = 0.5 * float(np.max(arena.high - arena.low))
@@ -240,13 +240,13 @@ def fit(
 
 
 def _nothing(order: Order) -> PseudoEllipsoid:
-    """Return zero information: the whole space."""
+    """Make a set with zero information: the whole space."""
     return PseudoEllipsoid(np.zeros((order, order)), np.zeros(order), 0.0, np.zeros(2), 1.0)
 
 
 def _weights(rings: Floats, arena: Arena, order: Order, weighting: Weighting, sweeps: int) -> Floats:
     """Find weights (k,) of the rings, with a sum of one."""
-    from scipy.optimize import minimize, minimize_scalar  # which takes long to import
+    from scipy.optimize import minimize, minimize_scalar  # slow to import
 
     count = len(rings)
     equal = np.full(count, 1.0 / count)
@@ -285,9 +285,9 @@ def _shares(logarithms: Floats) -> Floats:
 
 
 def _area_over(rings: Floats, weights: Floats, arena: Arena, order: Order) -> Size:
-    """Make the area of the fused set a function of the weights near those given.
+    """Make a function that computes the area of the fused set for weights near the given ones.
 
-    It is seen through a window; a set that reaches out of it counts as larger than the window.
+    The area is computed in a window; a set that extends beyond it counts as larger than the window.
     """
     window = _window(lambda points: _fused(rings, weights, points, order), arena, SEARCH_NODES)
     grid = _grid(window, SEARCH_NODES)
@@ -311,12 +311,13 @@ def _fused(rings: Floats, weights: Floats, points: Floats, order: Order) -> Floa
 
 
 def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllipsoid:
-    """Filter by (7), (18) with the lambda that makes the determinant of C^e least.
+    """Fuse by (7), (18) with the lambda that minimises the determinant of C^e.
 
-    Its C^e is s A^-1, with the information A and the most room s, and a weight is lambda times s. Its
-    prior is wide and proper, or the first determinants were infinite; it stays a part of the set.
+    C^e is s A^-1, with the information A and the greatest slack s, and a weight is lambda times s. The
+    prior is wide but proper, because the first determinants would be infinite otherwise; it remains part
+    of the set.
     """
-    from scipy.optimize import minimize_scalar  # which takes long to import
+    from scipy.optimize import minimize_scalar  # slow to import
 
     fused = _nothing(order)._replace(information=np.eye(order) / PRIOR_VARIANCE, constant=-1.0)
     for ring in np.tile(rings, (sweeps, 1)):
@@ -330,7 +331,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
         ) -> float:
             after = fuse(before, ring, most * float(np.exp(logarithm)))
             sizes = np.linalg.eigvalsh(after.information)
-            # a narrow ring beside the prior leaves some of them to rounding
+            # with a narrow ring, some eigenvalues of the wide prior are lost to rounding
             sizes = np.maximum(sizes, np.finfo(float).eps * sizes[-1])
             return float(order * np.log(most_room(after)) - np.log(sizes).sum())
 
@@ -340,7 +341,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
 
 
 def outline(ellipsoid: PseudoEllipsoid, arena: Arena, nodes: int = 400) -> Outline:
-    """Return the part of the set inside the arena, on a grid of nodes x nodes around it."""
+    """Compute the part of the set inside the arena, on a grid of nodes x nodes around it."""
     window = _window(lambda points: room(ellipsoid, points), arena, nodes)
     grid = _grid(window, nodes)
     return _outline(room(ellipsoid, grid.points), grid)
@@ -352,7 +353,7 @@ def _grid(window: Arena, nodes: int) -> Grid:
 
 
 def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Arena:
-    """Zoom in to where the values are not negative, with a margin, from the arena."""
+    """Zoom in from the arena to the area with values >= 0, plus a margin."""
     window = arena
     for _ in range(8):
         grid = _grid(window, nodes)
@@ -371,7 +372,7 @@ def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Are
 
 
 def _outline(values: Floats, grid: Grid) -> Outline:
-    """Draw where the values are not negative, cut off at the grid's border."""
+    """Compute the outline of the area with values >= 0, cut off at the grid's border."""
     tiny = 1e-9 * (grid.x[-1] - grid.x[0])
     x, y = (np.concatenate([[a[0] - tiny], a, [a[-1] + tiny]]) for a in (grid.x, grid.y))
     closed = np.pad(values, 1, constant_values=-float(np.abs(values).max()))

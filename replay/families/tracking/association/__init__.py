@@ -1,5 +1,6 @@
-"""Predicts, associates and updates the tracks of the estimator `tracker`; begin with `tracking`.
+"""Prediction, association and update of the tracks of the estimator `tracker`; begin with `tracking`.
 
-What that estimator reads of a log and writes is in the package above. Of the other two trackers only
-`report_tracker` uses something of this: pairs by the nearest, and sums over joint associations.
+The package above reads that estimator's input from a log and writes its output. Of the other two
+trackers only `report_tracker` uses parts of this package: greedy association, and sums over joint
+associations.
 """

@@ -1,13 +1,13 @@
-"""Associates the detections of a scan with tracks: by the nearest, the best joint map, or all of them.
+"""Association of a scan's detections with tracks: greedy, by the best assignment, or by all of them.
 
-A map sends every track to a detection of its own or to none; the detections left over are clutter. With
-Poisson clutter of density lambda it has the weight
+An assignment gives every track a detection of its own or none; detections without a track are clutter.
+With Poisson clutter of density lambda it has the weight
 
     prod over detected tracks (P_D r_i g_ij / lambda)  *  prod over missed ones (1 - P_D P_G r_i),
 
-where g_ij is the density of detection j about track i's prediction and r_i how probable it is that
-track i exists (1 in JPDA). All of what is here takes these weights, 0 outside a gate, and fills in how
-probable it is that each track has each detection: 0 or 1 where one map is chosen.
+where g_ij is the density of detection j under track i's prediction and r_i the probability that track i
+exists (1 in JPDA). All functions here take these weights, 0 outside a gate, and fill in the probability
+that each track has each detection, which is 0 or 1 if one assignment is chosen.
 
 JPDA: Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Eng. 8(3), 1983. JIPDA: Musicki, Evans, IEEE TAES
 40(3), 2004. Shortest augmenting paths: Crouse, IEEE TAES 52(4), 2016. Belief propagation: Williams, Lau,
@@ -36,15 +36,15 @@ from fuselog.replay.families.tracking.association.clusters import (
 def nearest(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Choose one map: the surest pair first, then the surest of the tracks and detections left.
+    """Choose one assignment greedily: the most likely pair first, then the most likely one of the rest.
 
     Args:
         weights: of pairs and of misses.
-        tracks: how many there are; arrays may be longer.
-        detections: likewise.
-        probability: (tracks, 1 + detections) filled: 1 where a map has a pair, or in the first
-            column no detection.
-        memory: what is worked in.
+        tracks: number of tracks; arrays may be longer.
+        detections: number of detections; arrays may be longer.
+        probability: (tracks, 1 + detections), filled: 1 for an assigned pair, and in the first column
+            for a track without a detection.
+        memory: scratch memory.
 
     Returns:
         0, as no cluster is approximated.
@@ -70,16 +70,16 @@ def nearest(
 def hungarian(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Choose the map of the greatest weight: successive shortest augmenting paths (Crouse, fig. 3).
+    """Choose the assignment of the greatest weight by shortest augmenting paths (Crouse, fig. 3).
 
-    Column j of the assignment is detection j, and column detections + i stands for track i's miss.
+    Column j of the assignment problem is detection j, and column detections + i is a miss of track i.
 
     Args:
         weights: of pairs and of misses.
-        tracks: how many there are; arrays may be longer.
-        detections: likewise.
-        probability: (tracks, 1 + detections) filled, as by `nearest`.
-        memory: what is worked in.
+        tracks: number of tracks; arrays may be longer.
+        detections: number of detections; arrays may be longer.
+        probability: (tracks, 1 + detections), filled as by `nearest`.
+        memory: scratch memory.
 
     Returns:
         0, as no cluster is approximated.
@@ -126,9 +126,9 @@ def hungarian(
 
 
 def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
-    """Compute what a pair costs beside a miss: minus the log of its weight.
+    """Compute the cost of a pair relative to a miss: minus the log of the ratio of their weights.
 
-    Infinity where it cannot be.
+    It is infinite if the pair is impossible.
     """
     if column >= detections:
         return 0.0 if column - detections == row else np.inf
@@ -136,15 +136,15 @@ def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
     return cost
 
 
-# (weights, tracks, detections, probability, memory), as `nearest`.
+# (weights, tracks, detections, probability, memory), as in `nearest`.
 Associate = Callable[[Weights, int, int, Floats, AssociationMemory], int]
 ASSOCIATIONS: dict[str, Associate] = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
 
 
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
-    """Compute how probable it is that a track exists, after a scan that gave it no detection by `none`.
+    """Compute the existence of a track after a scan in which `none` is the probability of a miss.
 
-    Musicki and Evans' (15): a miss counts against it by as much as its detection was probable.
+    Musicki and Evans' (15): a miss lowers it the more, the more probable a detection was.
     """
     missed = 1.0 - detection_probability
     if_missed = missed * existence / (1.0 - detection_probability * existence)
@@ -152,16 +152,16 @@ def existence_after(existence: float, none: float, detection_probability: float)
 
 
 def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda") -> Floats:
-    """Compute the probabilities of associations (tracks, 1 + n): of none, the first, the second ...
+    """Compute the probabilities (tracks, 1 + n) of no detection, the first, the second ...
 
     Args:
         detected: (tracks, n), the weights of pairs; 0 outside a gate.
-        missed: (tracks,), those of misses.
-        association: one of ASSOCIATIONS; "nearest" and "hungarian" choose one map.
+        missed: (tracks,), the weights of misses.
+        association: one of ASSOCIATIONS; "nearest" and "hungarian" choose one assignment.
 
-    Raises BadInput where the weights are none, or there is no such association.
+    Raises BadInput if the weights are invalid, or if there is no such association.
 
-    Two tracks between which a detection lies:
+    A detection between two tracks:
 
     >>> marginals([[3.0], [1.0]], [1.0, 1.0])
     array([[0.4, 0.6],
@@ -172,11 +172,12 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
     finite = np.isfinite(weights.detected).all() and np.isfinite(weights.missed).all()
     if weights.missed.shape != (tracks,) or not finite or (weights.detected < 0.0).any():
         raise BadInput(
-            "weights: give finite ones of shapes (tracks, detections) for pairs and (tracks,) for misses"
+            "weights must be finite, not negative, and of shapes (tracks, detections) for pairs and "
+            "(tracks,) for misses"
         )
     if (weights.missed <= 0.0).any():
         raise BadInput(
-            "weights: those of misses must be positive, since no track is detected for certain"
+            "the weights of misses must be positive, because no track is detected with certainty"
         )
     if association not in ASSOCIATIONS:
         raise BadInput(f"no association '{association}'; {choices(association, ASSOCIATIONS)}")

@@ -1,4 +1,4 @@
-"""Begins tracks at detections that belong to none, and ends those of which nothing is left."""
+"""Beginning of tracks at unassociated detections, and end of tracks."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -27,11 +27,11 @@ from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 
 
 class Births(NamedTuple):
-    """Describes how detections begin tracks, by kind of sensors.
+    """Functions with which detections begin tracks, by kind of sensor.
 
     Attributes:
-        begins: whether those of a kind do.
-        number: of a kind that does, its number in `birth`.
+        begins: whether detections of a kind begin tracks.
+        number: for each such kind, its index in `birth`.
         birth: (number, detection, origin, parameters) -> see `ScanSensor.birth`.
     """
 
@@ -41,7 +41,7 @@ class Births(NamedTuple):
 
 
 def births_of(kinds: Sequence[ScanSensor]) -> Births:
-    """Return the births of these kinds of sensors."""
+    """Collect the births of the given kinds of sensors."""
     begins = tuple(kind.birth is not None for kind in kinds)
     births = [kind.birth for kind in kinds if kind.birth is not None]
     number = tuple(sum(begins[:k]) for k in range(len(kinds)))
@@ -49,7 +49,7 @@ def births_of(kinds: Sequence[ScanSensor]) -> Births:
 
 
 def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
-    """Make `end_tracks(run, tracks, p)`: which tracks are over."""
+    """Make `end_tracks(run, tracks, p)`, which removes tracks that have ended."""
     names = list(tracker.stage.model.state)
     x, y = place_of(tracker.stage.model)
     has_velocity = "vx_mps" in names and "vy_mps" in names
@@ -57,7 +57,7 @@ def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     _, _, is_over = MANAGEMENTS[tracker.management]
 
     def is_another(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-        """Tell whether an older confirmed track is about where this one is, and moves alike."""
+        """Test whether an older confirmed track has about the same position and velocity."""
         for other in range(place if tracks.is_confirmed[run, place] else 0):
             if (
                 tracks.is_confirmed[run, other]
@@ -70,7 +70,7 @@ def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
         return False
 
     def end_tracks(run: int, tracks: Tracks, p: Settings) -> None:
-        """Take out the tracks that are over, and second ones of a target."""
+        """Remove the tracks that have ended, and duplicate tracks of a target."""
         place = 0
         while place < tracks.used[run]:
             if is_over(run, place, tracks, p) or is_another(run, place, tracks, p):
@@ -81,12 +81,12 @@ def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     return end_tracks
 
 
-# (run, scan, count, scans, tracks, newborn, parameters, memory) -> how many had no room.
+# (run, scan, count, scans, tracks, newborn, parameters, memory) -> number of tracks without room.
 BeginTracks = Callable[[int, int, int, Scans, Tracks, Newborn, Settings, ScanMemory], int]
 
 
 def beginning(tracker: Tracker) -> BeginTracks:
-    """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
+    """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`, which begins tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
     begins, birth_number, birth = births_of(kinds)
@@ -99,7 +99,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         correlate = choosing(correlations)
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Settings) -> bool:
-        """Tell whether a confirmed track is too near for another one to begin."""
+        """Test whether a confirmed track is too near for another one to begin."""
         for place in range(tracks.used[run]):
             apart = np.hypot(
                 at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
@@ -117,7 +117,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> float:
-        """Compute the probability that a detection is of a target without a track; 0 to begin none."""
+        """Compute the probability that a detection belongs to a new target; 0 to begin no track."""
         if p.undetected_per_m2 > 0.0:
             share = memory.undetected[detection] / memory.clutter[detection]
             existence = memory.left[detection] * share
@@ -135,7 +135,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> int:
-        """Begin tracks with the detections that may be of no other; returns how many had no room."""
+        """Begin tracks with unassociated detections; return the number of those without room."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
             measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])

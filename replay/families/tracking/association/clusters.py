@@ -1,4 +1,4 @@
-"""Sums over the joint associations of a cluster of tracks: by enumeration, or by message passing."""
+"""Sums over the joint associations of a cluster of tracks, by enumeration or by message passing."""
 
 from typing import NamedTuple
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers, varying
 
-# Clusters in which both tracks and detections are more than this are left to belief propagation.
+# Clusters with more tracks and more detections than this are left to belief propagation.
 MOST_ENUMERATED = 12
-PROPAGATED = 1e-10  # messages that change less have settled
+PROPAGATED = 1e-10  # messages that change less have converged
 MOST_ROUNDS = 1000
 NONE = -1
 
 
 @varying(2)
 class Weights(NamedTuple):
-    """Holds what maps are made of.
+    """Weights of pairs of tracks and detections, and of misses.
 
     Attributes:
         detected: (tracks, detections), the weight of a pair; 0 outside a gate.
@@ -28,17 +28,18 @@ class Weights(NamedTuple):
 
 @varying(2)
 class AssociationMemory(NamedTuple):
-    """Holds what association works in, for so many tracks and detections at most.
+    """Scratch memory of an association, for limited numbers of tracks and detections.
 
     Attributes:
         rows, columns: the tracks and detections of a cluster.
-        is_seen: whether a detection is in a cluster already.
-        pair, alone, spare: weights of items with slots, of items without one, and of slots without one.
-        forward, backward: sums over the maps of the first items, and of the others, by the set of slots
-            that are taken.
+        is_seen: whether a detection is already in a cluster.
+        pair, alone, spare: weights of items with slots, of items without a slot, and of slots without an
+            item.
+        forward, backward: sums over the assignments of the first items, and of the others, by the set of
+            occupied slots.
         message: from detections to tracks.
-        price, row_of, distance, before, is_done: of the columns of an assignment; `potential` and
-            `column_of` of its rows.
+        price, row_of, distance, before, is_done: of the columns of an assignment problem; `potential`
+            and `column_of` of its rows.
     """
 
     rows: Integers
@@ -60,7 +61,7 @@ class AssociationMemory(NamedTuple):
 
 
 def memory_for(tracks: int, detections: int) -> AssociationMemory:
-    """Make memory for scans of so many tracks and detections at most."""
+    """Make memory for scans with up to the given numbers of tracks and detections."""
     items, columns = max(tracks, detections), tracks + detections
     slots = min(tracks, detections, MOST_ENUMERATED)
     return AssociationMemory(
@@ -86,18 +87,18 @@ def memory_for(tracks: int, detections: int) -> AssociationMemory:
 def jpda(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Fill the marginals (tracks, 1 + detections) of all maps; the first column is for no detection.
+    """Fill the marginals (tracks, 1 + detections) of all joint associations; column 0 is for a miss.
 
-    Tracks that share no detection, not even through others, are independent: each cluster is summed on
-    its own, exactly where it has at most MOST_ENUMERATED tracks or as many detections. Returns how many
-    tracks are in larger ones, whose marginals are those of belief propagation.
+    Tracks that share no detection, not even through others, are independent. Each cluster is summed on
+    its own: exactly if it has at most MOST_ENUMERATED tracks or at most as many detections, and by
+    belief propagation otherwise. Returns the number of tracks in clusters with approximated marginals.
 
     Args:
         weights: of pairs and of misses.
-        tracks: how many there are; arrays may be longer.
-        detections: likewise.
-        probability: (tracks, 1 + detections) filled.
-        memory: what is worked in.
+        tracks: number of tracks; arrays may be longer.
+        detections: number of detections; arrays may be longer.
+        probability: (tracks, 1 + detections), filled.
+        memory: scratch memory.
     """
     approximated = 0
     memory.is_seen[:detections] = False
@@ -124,12 +125,12 @@ def gather_cluster(
     probability: Floats,
     memory: AssociationMemory,
 ) -> tuple[int, int]:
-    """List the tracks and detections that are connected with a track; returns how many there are.
+    """List the tracks and detections that are connected with a track; return their numbers.
 
     Args:
-        first: the track.
+        first: index of the track.
         weights: of pairs and of misses.
-        tracks, detections: how many there are; arrays may be longer.
+        tracks, detections: numbers of tracks and detections; arrays may be longer.
         probability: (tracks, 1 + detections), whose first column is NONE for tracks in no cluster yet.
         memory: whose `rows` and `columns` are filled.
     """
@@ -155,15 +156,15 @@ def gather_cluster(
 def enumerate_maps(
     weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
-    """Compute the marginals of one cluster by the sum over all of its maps.
+    """Compute the marginals of one cluster by summing over all of its assignments.
 
-    Of tracks and detections the fewer are slots, which the others, the items, take one after another.
-    What the later items can do depends on the set of slots that are taken, not on who took them: sums
-    over maps are sums over these 2^slots sets.
+    The smaller group, tracks or detections, are slots, which the others, the items, occupy one after
+    another. The choices of the later items depend on the set of occupied slots, not on which items
+    occupy them, so sums over assignments become sums over these 2^slots sets.
 
     Args:
         weights: of pairs and of misses.
-        rows, columns: how many tracks and detections the cluster has.
+        rows, columns: numbers of tracks and detections of the cluster.
         probability: (tracks, 1 + detections), filled for these.
         memory: with the cluster that `gather_cluster` found.
     """
@@ -189,7 +190,7 @@ def enumerate_maps(
             k, j = (slot, item) if tracks_are_slots else (item, slot)
             row, column = memory.rows[k], memory.columns[j]
             probability[row, 1 + column] = paired * memory.pair[item, slot] / total
-        for taken in range(1 << slots):  # sets with more slots, which come later, are still unchanged
+        for taken in range(1 << slots):  # larger sets have larger numbers and are still unchanged
             entry = memory.alone[item] * memory.backward[taken]
             for slot in range(slots):
                 if not taken >> slot & 1:
@@ -198,14 +199,14 @@ def enumerate_maps(
 
 
 def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemory) -> float:
-    """Fill a cluster's sums `forward`, and `backward` behind the last item; returns that of all maps."""
+    """Fill a cluster's sums `forward`, and `backward` after the last item; return the sum of all."""
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
     memory.alone[:items] = 1.0
     memory.spare[:slots] = 1.0
     for k in range(rows):
         row = memory.rows[k]
-        largest = weights.missed[row]  # what all weights of a track have in common cancels out
+        largest = weights.missed[row]  # a common factor of all weights of a track cancels out
         for j in range(columns):
             largest = max(largest, weights.detected[row, memory.columns[j]])
         for j in range(columns):
@@ -233,7 +234,7 @@ def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemor
 
 
 def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory) -> float:
-    """Compute the sum over the maps in which no item takes a slot."""
+    """Compute the sum over the assignments in which no item occupies a slot."""
     found = 0.0
     for taken in range(1 << slots):
         if not taken >> slot & 1:
@@ -244,9 +245,9 @@ def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory)
 def propagate_beliefs(
     weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
-    """Approximate the marginals of one cluster by messages between tracks and detections that settle.
+    """Approximate the marginals of one cluster by belief propagation between tracks and detections.
 
-    They are exact where the cluster is a tree, and more certain than exact ones else.
+    The marginals are exact if the cluster is a tree, and otherwise more certain than the exact ones.
 
     Args:
         weights, rows, columns, probability, memory: as for `enumerate_maps`.
@@ -265,7 +266,7 @@ def propagate_beliefs(
             for j in range(columns):
                 column = memory.columns[j]
                 weight = weights.detected[row, column]
-                # kept where the marginals will be: what a track tells a detection
+                # the message from a track to a detection, kept where the marginals will be
                 rest = total - weight * memory.message[row, column]
                 probability[row, 1 + column] = weight / rest
         for j in range(columns):
@@ -294,13 +295,13 @@ def propagate_beliefs(
 
 
 def choose(row: int, column: int, detections: int, probability: Floats) -> None:
-    """Fill a track's row where its detection is chosen; NONE for none.
+    """Fill a track's row with 1 for the chosen detection and 0 otherwise.
 
     Args:
-        row: the track's.
-        column: of the detection; NONE for none.
-        detections: how many there are.
-        probability: (tracks, 1 + detections), of which the row is filled with 0 and 1.
+        row: index of the track.
+        column: index of the detection; NONE for no detection.
+        detections: number of detections.
+        probability: (tracks, 1 + detections), of which the row is filled.
     """
     for entry in range(1 + detections):
         probability[row, entry] = 1.0 if entry == 1 + column else 0.0

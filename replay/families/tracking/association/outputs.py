@@ -1,4 +1,4 @@
-"""Writes what a tracker puts out after a scan: confirmed tracks, and associations with detections."""
+"""Outputs of a tracker after a scan: confirmed tracks, and associations with detections."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,18 +18,18 @@ from fuselog.replay.inference.model.stage import Stage
 
 @varying(2)
 class TrackOutputs(NamedTuple):
-    """Holds a tracker's outputs after every scan; scan s of run r has the rows of that number.
+    """Outputs of a tracker after every scan; scan s of run r has the rows of that number.
 
     Attributes:
-        end: (runs, 2), how many rows of tracks and of associations a run has filled.
-        confirmed: (scans,), how many tracks there are; NEVER where the scan was too old to be used.
-        approximated: (scans,), tracks in clusters too large to go through.
-        turned_away: (scans,), detections that begin no track because there is no room.
+        end: (runs, 2), number of rows of tracks and of associations that a run has filled.
+        confirmed: (scans,), number of confirmed tracks; NEVER if the scan was too old to be used.
+        approximated: (scans,), number of tracks in clusters too large for enumeration.
+        turned_away: (scans,), number of detections that begin no track because there is no room.
         number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
             `probability` is that of their modes.
-        pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), how probable.
+        pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), their probability.
         white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation in its
-            likeliest mode, and Cholesky's factor of the innovation covariance; a bearing's stand first.
+            likeliest mode, and the Cholesky factor of the innovation covariance; a bearing comes first.
     """
 
     end: Integers
@@ -48,7 +48,7 @@ class TrackOutputs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Holds where one run's estimates go, as `Steps.estimate` fills them in."""
+    """Destination of one run's estimates, as `Steps.estimate` fills them in."""
 
     mean: Floats
     covariance: Floats
@@ -58,12 +58,11 @@ class Rows(NamedTuple):
 def writing_pairs(
     modes: int,
 ) -> Callable[[int, int, int, Tracks, TrackOutputs, ScanMemory], None]:
-    """Make `write_pairs(run, scan, count, tracks, outputs, memory)`: confirmed tracks' associations."""
+    """Make `write_pairs(run, scan, count, tracks, outputs, memory)`, which writes associations."""
 
     def write_pairs(
         run: int, scan: int, count: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
     ) -> None:
-        """Write which detections went to confirmed tracks."""
         for place in range(tracks.used[run]):
             for detection in range(count if tracks.is_confirmed[run, place] else 0):
                 if memory.probability[place, 1 + detection] > 0.0:
@@ -87,13 +86,12 @@ def writing_pairs(
 def writing_tracks(
     stage: Stage,
 ) -> Callable[[int, int, Tracks, TrackOutputs, ScanMemory], None]:
-    """Make `write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
+    """Make `write_tracks(run, scan, tracks, outputs, memory)`, which writes confirmed tracks."""
     belief_of, estimate = believing(stage), moving(stage).estimate
 
     def write_tracks(
         run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
     ) -> None:
-        """Write the confirmed tracks as they are now."""
         belief = belief_of(run, tracks)
         rows = Rows(outputs.mean[run], outputs.covariance[run], outputs.probability[run])
         outputs.confirmed[scan] = 0
@@ -114,7 +112,7 @@ BY_PAIR = ("associated", "white", "factor")
 
 
 def blank_outputs(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> TrackOutputs:
-    """Make memory for all outputs that are possible: pages that are not written take none."""
+    """Make memory for all possible outputs; pages that are not written take no memory."""
     modes, n, t = sizes
     counts = np.diff(scans.offsets)
     detections = np.add.reduceat(np.append(scans.end - scans.first, 0), scans.offsets[:-1])

@@ -1,18 +1,20 @@
-"""Predicts what a scan measures of tracks, and updates them by it: the sensors' part of a tracker.
+"""Predicted measurements of tracks, and updates of tracks by a scan: the sensors' part of a tracker.
 
-A kind of sensors says what it measures of a target, how probable a detection is and how dense clutter.
-With probabilities b_j of a scan's detections and b_0 of none, a track's mean moves by the mean of the
-innovations v_j, and its covariance is
+A kind of sensors states what it measures of a target, the probability of detection and the density of
+clutter. With probabilities b_j of a scan's detections and b_0 of no detection, a track's mean moves by
+the mean of the innovations v_j, and its covariance is
 
     P - (1 - b_0) K S K' + K (sum_j b_j v_j v_j' - v v') K',   v = sum_j b_j v_j
 
-(Bar-Shalom, Fortmann, Tracking and Data Association, 1988, 6.4), which is the Kalman filter's where one
-map is chosen. A track with several modes has a Gaussian for each. A detection's density is the mean of
-theirs, weighed by the modes' probabilities, and given that it is the track's, so is the mode: mode i has
+(Bar-Shalom, Fortmann, Tracking and Data Association, 1988, 6.4). If one assignment is chosen, this is
+the covariance of the Kalman filter. A track with several modes has a Gaussian for each. A detection's
+density is the mean of their densities, weighted by the modes' probabilities, and a detection of the
+track changes these by Bayes' rule: the probability of mode i becomes
 
-    mu_i b_0 + sum_j b_j mu_i g_ij / sum_k mu_k g_kj
+    mu_i b_0 + sum_j b_j mu_i g_ij / sum_k mu_k g_kj,
 
-afterwards, and its Gaussian the shares of this for probabilities (Blom, Bloem, IEEE TAC 45(2), 2000).
+and the terms of this sum, normalised, are the probabilities with which the mode's Gaussian is updated
+(Blom, Bloem, IEEE TAC 45(2), 2000).
 """
 
 from collections.abc import Callable
@@ -39,25 +41,26 @@ from fuselog.replay.inference.model.stage import Stage, traced_sensor
 
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
 class ScanMemory(NamedTuple):
-    """Holds what one core works in; axes are tracks, their modes, and the detections of a scan.
+    """Scratch memory of one core; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
         motion: of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
         step: of the derivatives of sensors.
-        pool: of what all tracks share.
-        place: (detections, 2), those of a scan, joined.
-        group: (detections,), which ones are joined.
-        clutter: (detections,), how dense it is there, with what has never been detected before.
-        undetected: (detections,), how much of that is targets.
+        pool: of the errors that all tracks share.
+        place: (detections, 2), the detections of a scan after joining.
+        group: (detections,), the group in which each detection is joined.
+        clutter: (detections,), density of clutter and of targets that were never detected.
+        undetected: (detections,), density of targets that were never detected.
         difference, spread, cross: (tracks, modes, ...), of innovations; see `Innovation`.
-        predicted: (tracks, modes, 2), what a sensor should measure.
-        detectable: (tracks,), how probable each track's detection is.
+        predicted: (tracks, modes, 2), predicted measurements.
+        detectable: (tracks,), probability that each track is detected.
         white: (tracks, modes, detections, 2), whitened innovations.
-        likelihood: (tracks, modes, detections), of a mode and, in it, a detection; relative to clutter.
+        likelihood: (tracks, modes, detections), joint likelihood of a mode and a detection.
         weights, probability, association: see `association.association`.
-        is_free: (detections,), outside all gates; left: (detections,), how probably of no track.
+        is_free: (detections,), outside all gates; left: (detections,), probability of belonging to no
+            track.
         given: (1 + detections,), a track's associations in one mode.
-        after: (modes,), how probable each mode of a track is after them.
+        after: (modes,), the probability of each mode of a track after them.
         moment: (2, 2), and `shift` (2,), of the weighted innovations.
     """
 
@@ -87,7 +90,7 @@ class ScanMemory(NamedTuple):
 
 
 def memory_of(stage: Stage, motion: CoreMemory, shared: int, places: int, detections: int) -> ScanMemory:
-    """Make memory for so many errors that tracks share, tracks, and detections in a scan."""
+    """Make memory for the given numbers of shared errors, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
     return ScanMemory(
         motion=motion,
@@ -117,7 +120,7 @@ def memory_of(stage: Stage, motion: CoreMemory, shared: int, places: int, detect
 
 
 def target_of(model: Model) -> Callable[[Numbers], Numbers]:
-    """Make `target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
+    """Make `target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state lacks is zero."""
     names = list(model.state)
     places = tuple(names.index(name) if name in names else -1 for name in PLANE_MOTION)
 
@@ -129,7 +132,7 @@ def target_of(model: Model) -> Callable[[Numbers], Numbers]:
 
 @lru_cache(maxsize=64)
 def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
-    """Make a model's sensor of a kind of scan sensors, which may read parameters of these names."""
+    """Make the model's sensor for a kind of scan sensors, which may read parameters with these names."""
     target, inner = target_of(model), kind.measure
 
     def measure(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
@@ -140,9 +143,9 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
 
 
 def errors_at(component: int) -> OfParameters:
-    """Make `errors(parameters)`: where errors of a measured component stand in the state.
+    """Make `errors(parameters)`: the indices in the state of the errors of a measured component.
 
-    -1 for nowhere.
+    An index of -1 means no such error.
     """
     names = (f"registration_at_{component}", f"correlated_at_{component}")
 
@@ -153,7 +156,7 @@ def errors_at(component: int) -> OfParameters:
 
 
 def adding_errors(components: int) -> Callable[[Floats, Floats, Floats, Settings], None]:
-    """Make `add(rows, predicted, mean, parameters)`: it adds the state's errors of the measurement."""
+    """Make `add(rows, predicted, mean, parameters)`, which adds the state's sensor errors."""
     errors = tuple(errors_at(component) for component in range(components))
 
     def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Settings) -> None:
@@ -175,10 +178,10 @@ UpdateTrack = Callable[[int, int, int, Floats, Floats, ScanMemory], None]
 
 
 def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe:
-    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
+    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`, which predicts a scan.
 
-    Fills the prediction of a track's mode and its whitened innovation covariance. Returns the density's
-    factor before exp(-d2 / 2), NaN where the covariance is none.
+    It fills the prediction of a track's mode and its whitened innovation covariance, and returns the
+    density's factor before exp(-d2 / 2), or NaN if the covariance is not positive definite.
     """
     m, read_state, read_origin = len(kind.measured), tuple_of(model.size), tuple_of(2)
     linearise, noise = sensor_derivative(model, measuring(model, kind, names)), kind.noise
@@ -226,8 +229,8 @@ def correlating(
 ) -> Correlate:
     """Make `correlate(mean, covariance, origin, parameters, work)`: adds sensor errors to a new track.
 
-    The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
-    by the position, whose components stand at `corner`.
+    The error db of a detection shifts the position by -H^-1 db. H is the derivative of the measurement
+    by the position, whose components are at the indices `corner`.
     """
     x, y = corner
     read_state, read_origin = tuple_of(model.size), tuple_of(2)
@@ -235,7 +238,7 @@ def correlating(
     linearise = sensor_derivative(model, measuring(model, kind, names))
 
     def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
-        """Move the position by so much of an error."""
+        """Move the position by a multiple of an error."""
         mean[x] += by_x * mean[error]
         mean[y] += by_y * mean[error]
         for k in range(len(covariance)):
@@ -262,7 +265,7 @@ def correlating(
 
 
 def comparing(kind: ScanSensor) -> Callable[[int, int, int, ScanMemory], float]:
-    """Make `compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
+    """Make `compare(track, mode, detection, memory)`: whitens an innovation, and returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
     def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
@@ -280,7 +283,7 @@ def comparing(kind: ScanSensor) -> Callable[[int, int, int, ScanMemory], float]:
 
 
 def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
-    """Make `update(track, mode, detections, mean, covariance, memory)`: by associations in the mode."""
+    """Make `update(track, mode, detections, mean, covariance, memory)`, which updates one mode."""
     m, correct = len(kind.measured), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
 
@@ -323,7 +326,7 @@ def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
 def split_by_mode(
     run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
 ) -> float:
-    """Fill a track's associations in one of its modes; returns how probable the mode is after them."""
+    """Fill a track's associations in one of its modes; return the mode's probability after them."""
     probability, given = memory.probability[track], memory.given
     given[0] = probability[0] * tracks.mode[run, track, mode]
     after: float = given[0]
@@ -342,9 +345,9 @@ def split_by_mode(
 
 
 def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
-    """Fill the detections of a scan, each chain of those within a distance as their mean.
+    """Fill the detections of a scan, with each chain of near detections replaced by its mean.
 
-    Chains are in the order of their first detections.
+    Chains are in the order of their first detections. Returns the number of joined detections.
     """
     count = end - first
     for each in range(count):

@@ -1,4 +1,4 @@
-"""Holds unordered scans of detections in columns, and describes the kinds of sensors that give them."""
+"""Unordered scans of detections in columns, and the kinds of sensors that record them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,22 +18,21 @@ Born = tuple[Numbers, Numbers, float]
 
 @dataclass(frozen=True, eq=False)
 class ScanSensor:
-    """Represents a kind of sensor of unordered scans.
+    """A kind of sensor that records unordered scans.
 
-    Its functions take a target as (x_m, vx_mps, y_m, vy_mps), whatever the model's state is, and
-    `origin`, where the sensor is when it scans.
+    Its functions take a target as (x_m, vx_mps, y_m, vy_mps), for every state of the model, and
+    `origin`, the position of the sensor when it scans.
 
     Attributes:
-        leaf, schema, fields: of the topic with its detections, beside that of its scans.
+        leaf, schema, fields: of the topic with its detections, next to that of its scans.
         measured: the components of a detection.
-        measure: (target, origin, parameters) -> what it measures of a target.
+        measure: (target, origin, parameters) -> the measurement of a target.
         noise: (target, origin, parameters) -> variances, or the rows of a lower triangle.
-        detection: (target, origin, parameters) -> how probable it is that the target is detected.
-        clutter: (detection, parameters) -> how many false detections there are per unit of what is
-            measured.
-        birth: (detection, origin, parameters) -> the position of a target that is there, the rows of
-            the lower triangle of its covariance, and how many m^2 of the plane a unit of what is
-            measured has there; None where a detection does not say enough.
+        detection: (target, origin, parameters) -> the probability that the target is detected.
+        clutter: (detection, parameters) -> density of false detections, per unit of the measurement.
+        birth: (detection, origin, parameters) -> the position of a target at the detection, the rows of
+            the lower triangle of its covariance, and the area in m^2 that a unit of the measurement
+            covers there; None if a detection does not determine a position.
     """
 
     leaf: str
@@ -48,15 +47,15 @@ class ScanSensor:
 
 
 class Scans(NamedTuple):
-    """Holds the scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
+    """The scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
-        time_ns, sensor, kind, number: (scans,), whose each is: of which sensor, of which kind of
-            sensors, and its number there.
-        first, end: (scans,), its detections.
-        origin: (scans, 2), where the sensor is.
-        detection: (detections, 2), what is measured.
+        time_ns, sensor, kind, number: (scans,), stamp, index of the sensor, index of its kind, and the
+            scan's number at that sensor.
+        first, end: (scans,), bounds of its detections.
+        origin: (scans, 2), position of the sensor.
+        detection: (detections, 2), the measurements.
     """
 
     offsets: Integers
@@ -74,11 +73,11 @@ BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
 
 
 def take_scans(scans: Scans, rows: Integers) -> Scans:
-    """Return some of the scans, in this order, as those of one run.
+    """Return some of the scans, in the given order, as those of one run.
 
     Args:
         scans: of any runs.
-        rows: (k,), which of them.
+        rows: (k,), indices of the scans.
     """
     own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
     counts = own["end"] - own["first"]
@@ -89,9 +88,9 @@ def take_scans(scans: Scans, rows: Integers) -> Scans:
 
 
 def in_time(first: Scans, second: Scans) -> Scans:
-    """Merge the scans of two sequences of one run in time order.
+    """Merge two sequences of scans of one run in time order.
 
-    At equal stamps the first's come first.
+    At equal stamps, the scans of the first sequence come first.
     """
     shifted = second._replace(
         first=second.first + len(first.detection), end=second.end + len(first.detection)

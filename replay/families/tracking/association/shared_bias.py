@@ -1,14 +1,14 @@
-"""Estimates errors of sensors that all tracks share, as part of every track's state.
+"""Estimation of sensor errors that all tracks share, as part of every track's state.
 
-Given the errors b, targets are independent: a joint Gaussian of all of them is one of b and, for every
-track, one of its target given b. A track's Gaussian is of its target and of b, whose marginal is the
-same in all. What a scan tells of b adds up over the tracks as information,
+Given the errors b, targets are independent, so a joint Gaussian of all of them consists of one of b and,
+for every track, one of its target given b. A track's Gaussian is of its target and of b, and the
+marginal of b is the same in all tracks. The information of a scan about b is summed over the tracks,
 
     B+^-1 = B^-1 + sum_i (B_i^-1 - B^-1),   B+^-1 b+ = B^-1 b + sum_i (B_i^-1 b_i - B^-1 b),
 
-B_i, b_i those after the update of track i alone; then every track gets the new marginal, and what it
-says of its target given b stays. States are flat. For constant b and certain associations that is the
-joint Kalman filter.
+with B_i, b_i after the update of track i only. Then every track gets the new marginal, and its
+conditional Gaussian of the target given b stays. States are flat. For constant b and certain
+associations this is the joint Kalman filter.
 """
 
 from typing import NamedTuple
@@ -22,9 +22,9 @@ from fuselog.replay.inference.linear_algebra.gaussian import invert
 
 @varying(0, is_updated=1)
 class Pool(NamedTuple):
-    """Holds what sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
+    """Scratch memory for k shared errors: matrices (k, k), vectors (k,), and a track's gain (t, k).
 
-    `is_updated` (tracks,) says which tracks a scan has updated.
+    `is_updated` (tracks,) marks the tracks that a scan has updated.
     """
 
     factor: Floats
@@ -38,7 +38,7 @@ class Pool(NamedTuple):
 
 
 def pool_of(shared: int, tangent: int, places: int) -> Pool:
-    """Make memory for so many errors, tangent components and tracks."""
+    """Make memory for the given numbers of errors, tangent components and tracks."""
     square = (shared, shared)
     return Pool(
         np.empty(square),
@@ -55,8 +55,8 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
     """Fuse the errors that the confirmed tracks of a run have estimated, and give the result to all.
 
-    The errors are the components of every track's state from `first` on, as many as are shared. Where
-    associations were so ambiguous that nothing is left of what is known, all stays as it was.
+    The errors are the components of every track's state from `first` on. If associations are so
+    ambiguous that the fused information is not positive definite, the shared errors stay as they were.
     """
     mean, covariance = tracks.shared_mean[run], tracks.shared_covariance[run]
     size = len(mean)
@@ -88,7 +88,7 @@ def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
 
 
 def conform(run: int, place: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Give a track the shared errors; its conditional estimate of the target given these stays."""
+    """Give a track the shared errors, and keep its conditional estimate of the target given them."""
     shared_mean, shared = tracks.shared_mean[run], tracks.shared_covariance[run]
     mean, covariance = tracks.mean[run, place, 0], tracks.covariance[run, place, 0]
     size, t = len(shared_mean), len(covariance)

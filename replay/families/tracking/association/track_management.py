@@ -1,11 +1,11 @@
-"""Confirms and ends tracks, by counts or by probabilities of existence, for any association.
+"""Confirmation and end of tracks, by counts or by probabilities of existence, for any association.
 
-    existence   how probable it is that the target exists (Musicki, Evans, IEEE TAES 40(3), 2004)
+    existence   the probability that the target exists (Musicki, Evans, IEEE TAES 40(3), 2004)
     hits        detected in M of its first N chances, see Bar-Shalom, Li, Kirubarajan, 2001, 7.8
-    score       the log-likelihood ratio of a target and clutter, tested as Wald does: Blackman, Popoli,
-                Design and Analysis of Modern Tracking Systems, 1999, 6.2
+    score       the log-likelihood ratio of a target and clutter in Wald's sequential test: Blackman,
+                Popoli, Design and Analysis of Modern Tracking Systems, 1999, 6.2
 
-All end a track that has been silent for too long.
+All of them end a track that has been silent for too long.
 """
 
 from collections.abc import Callable
@@ -18,16 +18,16 @@ from fuselog.replay.families.tracking.association.association import existence_a
 from fuselog.replay.families.tracking.association.clusters import Weights
 from fuselog.replay.families.tracking.association.tracks import Tracks
 
-# A miss says nothing of a young track where the sensor detects less than every second target.
+# A miss does not count against a young track if its detection was less probable than this.
 CHANCE = 0.5
 
 
 class Management(NamedTuple):
-    """Holds a way to manage tracks.
+    """Functions that manage tracks.
 
     Attributes:
-        wait: (run, place, duration_s, tracks, parameters), what time alone changes.
-        judge: (run, place, evidence, tracks, parameters), what a scan changes; it may confirm a track.
+        wait: (run, place, duration_s, tracks, parameters), the change due to elapsed time.
+        judge: (run, place, evidence, tracks, parameters), the change due to a scan; may confirm a track.
         is_over: (run, place, tracks, parameters) -> whether a track ends.
     """
 
@@ -37,10 +37,10 @@ class Management(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Holds the evidence of a scan for one track.
+    """Evidence of a scan for one track.
 
     Attributes:
-        detectable: how probable its detection in the gate is, if the target exists.
+        detectable: probability of a detection in the gate, if the target exists.
         probability: (1 + detections,), of no detection and of each, see
             `fuselog.replay.families.tracking.association.association`.
         weights: of all tracks.
@@ -52,7 +52,7 @@ class Evidence(NamedTuple):
 
 
 def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Tell whether no sensor that begins tracks has seen a track for too long."""
+    """Test whether no sensor that begins tracks has detected a track for too long."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
     longest_s: float = p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s
     is_over: bool = silent_s > longest_s
@@ -60,12 +60,12 @@ def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
 
 
 def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
-    """Do nothing: time alone changes nothing."""
+    """Leave a track unchanged by elapsed time."""
     return
 
 
 def confirm(run: int, place: int, tracks: Tracks) -> None:
-    """Take a track for that of a target, for certain."""
+    """Confirm a track, with existence 1."""
     tracks.is_confirmed[run, place], tracks.existence[run, place] = True, 1.0
 
 
@@ -73,12 +73,12 @@ def confirm(run: int, place: int, tracks: Tracks) -> None:
 
 
 def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
-    """Let targets vanish at a steady rate."""
+    """Lower the existence by the probability that the target vanished meanwhile."""
     tracks.existence[run, place] *= np.exp(-duration_s / p.survival_s)
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Judge by Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
+    """Update the existence by Bayes' rule; a confirmed track stays so down to `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
     needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
@@ -86,7 +86,7 @@ def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p:
 
 
 def does_not_exist(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Tell whether it is silent, or improbable."""
+    """Test whether a track is silent or improbable."""
     return is_silent(run, place, tracks, p) or tracks.existence[run, place] < p.ending_existence
 
 
@@ -94,7 +94,7 @@ def does_not_exist(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
 
 
 def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Count chances and hits; a miss counts only where a detection was to be expected."""
+    """Count chances and hits; a miss counts only if a detection was probable."""
     is_hit = evidence.probability[0] < 0.5
     if is_hit or evidence.detectable >= CHANCE:
         tracks.chances[run, place] += 1
@@ -105,7 +105,7 @@ def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Sett
 
 
 def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Tell whether it is silent, or was not hit often enough in its first chances."""
+    """Test whether a track is silent, or had too few hits in its first chances."""
     is_young = not tracks.is_confirmed[run, place]
     return is_silent(run, place, tracks, p) or (is_young and tracks.chances[run, place] >= p.chances)
 
@@ -116,7 +116,8 @@ def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Settings) -> boo
 def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
     """Add sum_j b_j log(w_j / b_j), with the weights w of a target that exists.
 
-    Where one map is chosen that is the log of its weight; with all maps of one track, log sum_j w_j.
+    For a single assignment this is the log of its weight; for all assignments of one track, log sum_j
+    w_j.
     """
     weights, existence = evidence.weights, tracks.existence[run, place]
     gain = 0.0
@@ -135,7 +136,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Set
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Tell whether it is silent, or clutter explains it better since its birth or highest score."""
+    """Test whether a track is silent, or its score has fallen too far from its birth or best."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

@@ -1,8 +1,8 @@
-"""Smooths tracks backwards: each estimate of a track, given later detections too.
+"""Backward smoothing of tracks, so that each estimate uses later detections too.
 
-Which detections are a track's stays as the tracker found it; given that, its states are a chain of
-Gaussians that one motion ties together, and `fuselog.replay.inference.smoothing.backward_pass` goes back
-over them.
+The association of detections with tracks stays as the tracker found it. Given that association, a
+track's states are a chain of Gaussians connected by one motion, and
+`fuselog.replay.inference.smoothing.backward_pass` smooths them.
 """
 
 from functools import partial
@@ -34,14 +34,13 @@ def smooth_tracks(
 ) -> tuple[Floats, Floats]:
     """Smooth the filtered estimates of tracks: means (n, size) and covariances (n, size, size).
 
-    `track` (n,) says whose each is; the estimates of a track are in time order. The motion of the
-    stage is linear, and nothing controls it.
+    The motion of the model must be linear and without a control.
 
     Args:
-        stage: the model of the targets.
+        stage: the bound model of the targets.
         parameters: the numbers that its functions read.
-        track: (n,), whose each estimate is.
-        time_ns: (n,), rising in each track.
+        track: (n,), index of the track of each estimate.
+        time_ns: (n,), increasing in each track.
         mean: (n, size), filtered.
         covariance: (n, size, size), filtered.
     """
@@ -71,9 +70,9 @@ def _nodes(
     mean: Floats,
     covariance: Floats,
 ) -> Nodes:
-    """Make nodes of estimates, with how each comes from the one before.
+    """Make the nodes of the estimates, with the transition from each node's predecessor.
 
-    A track's first comes from none.
+    The first node of a track has no predecessor.
     """
     duration_s = np.diff(time_ns, prepend=time_ns[:1]) * 1e-9
     duration_s[offsets[:-1]] = 0.0
@@ -97,7 +96,7 @@ def _nodes(
 def _motion(
     stage: Stage, parameters: Settings, mean: Floats, duration_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the matrices (n, size, size) of a linear motion over so long each, and of its noise."""
+    """Compute the matrices (n, size, size) of a linear motion over each duration, and of its noise."""
     size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
     assert stage.motion.noise is not None
     transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))
@@ -105,7 +104,7 @@ def _motion(
         moved = stage.motion.move(tuple(unit), (), duration_s, parameters)
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
-    noise_of: ModelFunction = stage.motion.noise  # of many durations at once
+    noise_of: ModelFunction = stage.motion.noise  # of many durations together
     lower = noise_of(state, duration_s, parameters)
     rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
     for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):

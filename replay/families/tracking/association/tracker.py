@@ -1,4 +1,4 @@
-"""Puts a tracker together: the model of its targets, the kinds of its sensors, how tracks move."""
+"""Assembly of a tracker: the model of its targets, its kinds of sensors, and the motion of tracks."""
 
 from collections.abc import Callable
 from typing import Concatenate, NamedTuple, ParamSpec, TypeVar, cast
@@ -17,15 +17,15 @@ from fuselog.replay.inference.modes.mixture import ModeBelief
 
 
 class Tracker(NamedTuple):
-    """Holds a tracker put together.
+    """A tracker as an assembly of its parts.
 
     Attributes:
-        stage: the targets' model, with one of its motions or all modes.
-        kinds: of sensors.
+        stage: the targets' bound model, with one of its motions or with all modes.
+        kinds: the kinds of sensors.
         association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
         names: the parameters that the parts read, in the order of the columns of the settings.
-        shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
-            `fuselog.replay.families.tracking.association.shared_bias`.
+        shared: index in the state of the first sensor error, and the number of errors that all tracks
+            share, see `fuselog.replay.families.tracking.association.shared_bias`.
     """
 
     stage: Stage
@@ -37,15 +37,15 @@ class Tracker(NamedTuple):
 
     @property
     def sizes(self) -> tuple[int, int, int]:
-        """Count how many modes the model has, and how many components its state and tangent space."""
+        """Return the number of modes, the size of the state, and that of its tangent space."""
         return max(1, len(self.stage.modes)), self.stage.model.size, self.stage.model.tangent
 
 
 class Newborn(NamedTuple):
-    """Holds a target of which only the position is known.
+    """A target of which only the position is known.
 
     Attributes:
-        mean, covariance: (n,), (t, t); their entries of the position stand for none.
+        mean, covariance: (n,), (t, t); their entries of the position are placeholders.
         mode: (modes,), the modes' probabilities.
     """
 
@@ -55,19 +55,22 @@ class Newborn(NamedTuple):
 
 
 def moving(stage: Stage) -> Steps:
-    """Describe how tracks move: those of several modes as interacting multiple models do."""
+    """Make the prediction of tracks; tracks with several modes move as interacting multiple models."""
     if not stage.modes:
         return gaussian_filter(stage, linear_motion(stage), ())
     alone = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
     return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
 
 
-# (run, tracks) -> the tracks of a run as the filters have them, first axis = place.
+# (run, tracks) -> the tracks of a run as the filters' belief, first axis = place.
 BeliefOf = Callable[[int, Tracks], Belief]
 
 
 def believing(stage: Stage) -> BeliefOf:
-    """Make `belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
+    """Make `belief(run, tracks)`, which returns the tracks of a run as the filters' belief.
+
+    The first axis of the belief is the place of the track.
+    """
 
     def of_one(run: int, tracks: Tracks) -> Gaussian:
         return Gaussian(tracks.mean[run, :, 0], tracks.covariance[run, :, 0])
@@ -87,7 +90,7 @@ Result = TypeVar("Result")
 def choosing(
     functions: list[Callable[Arguments, Result]],
 ) -> Callable[Concatenate[int, Arguments], Result]:
-    """Make `call(kind, ...)`: the function of this number."""
+    """Make `call(kind, ...)`, which calls the function with the index `kind`."""
 
     def call(kind: int, *arguments: AnyArgument) -> AnyArgument:
         for number in range_of(1, len(functions)):
@@ -99,12 +102,12 @@ def choosing(
 
 
 def place_of(model: Model) -> tuple[int, int]:
-    """Find where the position stands in the state."""
+    """Return the indices of the position in the state."""
     names = list(model.state)
     return names.index("x_m"), names.index("y_m")
 
 
 def corner_of(model: Model) -> tuple[int, int]:
-    """Find where the position stands in the tangent space."""
+    """Return the indices of the position in the tangent space."""
     tangent = [name for name, _ in tangent_components(list(model.state), model.kinds)]
     return tangent.index("x_m"), tangent.index("y_m")

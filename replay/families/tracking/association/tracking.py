@@ -1,9 +1,9 @@
-"""Tracks many targets: predicts, associates, updates, begins and ends tracks scan by scan.
+"""Multi-target tracking: prediction, association, update, beginning and end of tracks, scan by scan.
 
-A model's motion moves every track, that of each mode where it has several (an IMM inside); sensors say
-what a scan measures of a track (see `association.scanning`); an association
-says how probable it is that each track has each detection (`association`); what is left over may begin
-tracks; and a management says which tracks are those of targets, and which end (`track_management`).
+A model's motion moves every track; with several modes, each track is an IMM. Sensors predict what a
+scan measures of a track (see `association.scanning`). An association computes the probability that each
+track has each detection (`association`), and unassociated detections may begin tracks. A management
+decides which tracks are confirmed, and which end (`track_management`).
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ from fuselog.replay.inference.run.loops import Follow, over_events
 
 
 class ScanInputs(NamedTuple):
-    """Holds what a tracker goes by: scans, parameters (sensors, names), and a new target."""
+    """Inputs of a tracker: scans, parameters (sensors, names), and a new target."""
 
     events: Scans
     settings: Floats
@@ -76,7 +76,7 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
         outputs: TrackOutputs,
         memory: ScanMemory,
     ) -> int:
-        """Take the tracks of a run through a scan; one from before their time says nothing."""
+        """Process one scan of a run; a scan before the tracks' time has no effect."""
         scans = inputs.events
         p = read(inputs.settings, scans.sensor[scan])
         if scans.time_ns[scan] < tracks.time_ns[run]:
@@ -111,12 +111,11 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
 
 
 def advancing(tracker: Tracker) -> Callable[[int, int, Tracks, Settings, ScanMemory], None]:
-    """Make `advance(run, time_ns, tracks, p, memory)`: the prediction of all tracks."""
+    """Make `advance(run, time_ns, tracks, p, memory)`, which predicts all tracks."""
     belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
     def advance(run: int, time_ns: int, tracks: Tracks, p: Settings, memory: ScanMemory) -> None:
-        """Predict all tracks."""
         duration_s = (time_ns - tracks.time_ns[run]) * 1e-9
         if tracks.time_ns[run] != NEVER and duration_s > 0.0:
             belief = belief_of(run, tracks)
@@ -129,12 +128,12 @@ def advancing(tracker: Tracker) -> Callable[[int, int, Tracks, Settings, ScanMem
     return advance
 
 
-# (run, scan, count, scans, tracks, parameters, memory): takes the detections of a scan.
+# (run, scan, count, scans, tracks, parameters, memory): processes the detections of a scan.
 TakeDetections = Callable[[int, int, int, Scans, Tracks, Settings, ScanMemory], None]
 
 
 def association_weights(tracker: Tracker) -> TakeDetections:
-    """Make `weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
+    """Make `weigh(run, scan, count, scans, tracks, p, memory)`, which computes the weights of pairs."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
     compare = choosing([comparing(kind) for kind in kinds])
@@ -146,7 +145,7 @@ def association_weights(tracker: Tracker) -> TakeDetections:
     def detectable(
         run: int, place: int, kind: int, origin: Numbers, tracks: Tracks, p: Settings
     ) -> float:
-        """Compute how probable it is that a sensor detects a track's target."""
+        """Compute the probability that a sensor detects a track's target."""
         total = 0.0
         for mode in range(modes):
             target = target_in(read_state(tracks.mean[run, place, mode]))
@@ -156,7 +155,7 @@ def association_weights(tracker: Tracker) -> TakeDetections:
     def weigh(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Settings, memory: ScanMemory
     ) -> None:
-        """Fill the weights of all pairs, and which detections are outside all gates."""
+        """Fill the weights of all pairs, and mark the detections that are outside all gates."""
         kind, weights, origin = scans.kind[scan], memory.weights, read_pair(scans.origin[scan])
         for detection in range(count):
             measured = read_pair(memory.place[detection])
@@ -196,7 +195,7 @@ def association_weights(tracker: Tracker) -> TakeDetections:
 
 
 def processing(tracker: Tracker) -> TakeDetections:
-    """Make `process(run, scan, count, scans, tracks, p, memory)`: updates by a scan's associations."""
+    """Make `process(run, scan, count, scans, tracks, p, memory)`, which updates the tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
@@ -218,7 +217,7 @@ def processing(tracker: Tracker) -> TakeDetections:
     def process(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Settings, memory: ScanMemory
     ) -> None:
-        """Update all tracks by the associations, and what is known of their targets' existence."""
+        """Update the states and the management of all tracks by the associations."""
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
         for place in range(tracks.used[run]):
             probability = memory.probability[place, : 1 + count]
@@ -239,7 +238,7 @@ def processing(tracker: Tracker) -> TakeDetections:
     return process
 
 
-# So many scans of a run go through the loop at once, which bounds the room for what is said of them.
+# Scans of a run per pass of the loop, which bounds the memory for their outputs.
 BATCH = 1000
 
 
@@ -252,17 +251,17 @@ def _compiled(tracker: Tracker) -> OverRuns:
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
 ) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-    """Track scans, all runs at once.
+    """Track targets over scans of all runs in parallel.
 
     Args:
-        tracker: how.
+        tracker: the assembled tracker.
         scans: of all runs.
         settings: (sensors, names), the parameters for each sensor.
-        newborn: how tracks begin.
+        newborn: the state of a new target.
         before: the tracks before these scans.
 
     Returns:
-        The tracks after them; and by batch, its scans and their outputs.
+        The tracks after the scans, and the scans and outputs of each batch.
     """
     columns: Columns = before
     tracks = Tracks(*(column.copy() for column in columns))

@@ -1,7 +1,7 @@
-"""Holds the tracks of many targets in columns, and takes one out.
+"""Tracks of many targets in columns.
 
-A track is a Gaussian for each of its model's modes, with the modes' probabilities; a model of one motion
-has one mode, which is certain.
+A track is a Gaussian for each of its model's modes, with the modes' probabilities; a model with one
+motion has one mode of probability 1.
 """
 
 from typing import NamedTuple
@@ -16,19 +16,20 @@ NEVER = -1
 
 @varying(2)
 class Tracks(NamedTuple):
-    """Holds the tracks of all runs, the oldest first: axes run and place, of which `used` are taken.
+    """The tracks of all runs, the oldest first: axes run and place; the first `used` places are taken.
 
     Attributes:
-        used, met: (runs,), how many there are, and ever were, which numbers them.
+        used, met: (runs,), number of tracks now, and ever begun, from which tracks are numbered.
         time_ns: (runs,), of all states; NEVER before the first scan.
         number, existence, is_confirmed: (runs, places).
         mean, covariance: (runs, places, modes, ...).
         mode, log_mode: (runs, places, modes), the modes' probabilities, and their logarithms.
-        hits, chances: (runs, places), scans since its birth in which it was, or could have been, seen.
-        score, best_score: (runs, places), the log-likelihood ratio since its birth, and its highest.
-        seen_ns: (runs, places), when a sensor that begins tracks saw it last.
-        updated_ns: (runs, places, sensors), when each sensor updated it last.
-        shared_mean, shared_covariance: (runs, ...), of what all share:
+        hits, chances: (runs, places), scans since its birth in which it was, or could have been,
+            detected.
+        score, best_score: (runs, places), the log-likelihood ratio since its birth, and its maximum.
+        seen_ns: (runs, places), when a sensor that begins tracks last detected it.
+        updated_ns: (runs, places, sensors), when each sensor last updated it.
+        shared_mean, shared_covariance: (runs, ...), of the errors that all tracks share:
             `fuselog.replay.families.tracking.association.shared_bias`.
     """
 
@@ -55,20 +56,17 @@ class Tracks(NamedTuple):
 def no_tracks(
     runs: int, places: int, sizes: tuple[int, int, int], sensors: int, shared: Floats
 ) -> Tracks:
-    """Return runs in which nothing was met yet, with room for so many tracks.
-
-    `sizes` are those of the modes, of the state and of its tangent space; `shared` (k, k) is how
-    uncertain what all tracks share is at first.
+    """Make empty tracks.
 
     Args:
-        runs: how many.
-        places: for how many tracks of each run there is room.
-        sizes: of the modes, of the state and of its tangent space.
-        sensors: how many there are.
-        shared: (k, k), the covariance of what all tracks share.
+        runs: number of runs.
+        places: greatest number of tracks of each run.
+        sizes: number of modes, and sizes of the state and of its tangent space.
+        sensors: number of sensors.
+        shared: (k, k), the initial covariance of the errors that all tracks share.
 
     Returns:
-        The tracks, of which none is used.
+        The tracks, none of them used.
     """
     modes, n, t = sizes
     return Tracks(
@@ -94,7 +92,7 @@ def no_tracks(
 
 
 def drop(run: int, place: int, tracks: Tracks) -> None:
-    """Take a track out; those after it move up."""
+    """Remove a track and move up those after it."""
     tracks.used[run] -= 1
     for at in range(place, tracks.used[run]):
         for counts in (tracks.number, tracks.hits, tracks.chances, tracks.seen_ns):
@@ -112,7 +110,7 @@ def drop(run: int, place: int, tracks: Tracks) -> None:
 
 
 def expected(run: int, place: int, component: int, tracks: Tracks) -> float:
-    """Return a linear component of a track's mean over all modes."""
+    """Compute the mean of a linear component of a track over all modes."""
     total = 0.0
     for mode in range(tracks.mode.shape[2]):
         total += tracks.mode[run, place, mode] * tracks.mean[run, place, mode, component]
@@ -122,7 +120,7 @@ def expected(run: int, place: int, component: int, tracks: Tracks) -> float:
 def are_near(
     run: int, place: int, other: int, components: tuple[int, int], within: float, tracks: Tracks
 ) -> bool:
-    """Tell whether two components of two tracks' means, together, differ by less."""
+    """Test whether two tracks are closer than a limit in two components of their means."""
     x, y = components
     is_near: bool = (
         np.hypot(

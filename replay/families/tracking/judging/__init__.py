@@ -1,1 +1,1 @@
-"""Judges tracks by the targets that they should follow; begin with `tracks`."""
+"""Comparison of tracks with the targets that they should follow; begin with `tracks`."""

@@ -1,8 +1,8 @@
-"""Pairs targets with tracks as CLEAR MOT does: a pair is kept for as long as it is within the cutoff.
+"""Pairs of targets and tracks as in CLEAR MOT: a pair is kept while it is within the cutoff.
 
 Source: Bernardin, Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT
-metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. A target remembers its track
-while it is missed, too, as in motmetrics: a target that comes back with its track has not switched.
+metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. As in motmetrics, a target
+remembers its track while it is missed, so that a target that returns with its track has not switched.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff:
     """Pair the targets with tracks at k instants.
 
     Args:
-        tracks: at each instant the numbers (n,) of the tracks, and where they are (n, axes).
-        truths: (targets, k, axes), NaN where a target is not there.
-        cutoff: no pair is farther apart, in the unit of the points.
+        tracks: at each instant, the numbers (n,) of the tracks and their positions (n, axes).
+        truths: (targets, k, axes), NaN when a target is absent.
+        cutoff: greatest distance of a pair, in the unit of the points.
 
     Returns:
         (targets, k), the number of the track of each target, or NONE.
     """
-    from scipy.optimize import linear_sum_assignment  # this takes long to import
+    from scipy.optimize import linear_sum_assignment  # slow to import
 
     targets, instants, _ = truths.shape
     pairs = np.full((targets, instants), NONE)
@@ -40,7 +40,7 @@ def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff:
                 is_near[target], is_near[:, kept] = False, False
         rows, columns = np.flatnonzero(is_near.any(axis=1)), np.flatnonzero(is_near.any(axis=0))
         left = np.ix_(rows, columns)
-        # as many pairs as there can be, and of these the nearest
+        # the greatest number of pairs, and among these the smallest distances
         costs = np.where(is_near[left], away[left], 2.0 * cutoff * (1 + min(left[0].size, left[1].size)))
         for row, column in zip(*linear_sum_assignment(costs), strict=True):
             if is_near[left][row, column]:
@@ -50,11 +50,11 @@ def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff:
 
 
 def switches_and_breaks(pairs: Integers, present: Booleans) -> tuple[int, int]:
-    """Count how often targets go on with another track than before, and how often they are lost between.
+    """Count how often targets switch to another track, and how often they are lost in between.
 
     Args:
-        pairs: (targets, k), of `clear_mot`.
-        present: (targets, k), whether the target is there; while it is not, it is not lost.
+        pairs: (targets, k), from `clear_mot`.
+        present: (targets, k), whether the target is present; an absent target is not lost.
     """
     switches = breaks = 0
     for track, is_there in zip(pairs, present, strict=True):

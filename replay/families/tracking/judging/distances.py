@@ -1,4 +1,4 @@
-"""Measures how far tracks are from targets' trajectories: trajectory GOSPA, HOTA and IDF1.
+"""Distances between tracks and targets' trajectories: trajectory GOSPA, HOTA and IDF1.
 
 Tracks and trajectories are (targets, steps, axes), NaN at the steps at which one is absent.
 
@@ -20,13 +20,13 @@ from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 
-# More assignments of estimates to truths at one step are not gone through one by one.
+# Limit on the assignments of estimates to truths at one step that are enumerated.
 MOST_ASSIGNMENTS = 500
 THRESHOLDS = np.arange(1, 20) / 20.0
 
 
 class TrajectoryGospa(NamedTuple):
-    """Holds trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
+    """Trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
 
     total: float
     localisation: float
@@ -36,7 +36,7 @@ class TrajectoryGospa(NamedTuple):
 
 
 class Hota(NamedTuple):
-    """Holds HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
+    """HOTA and its parts, (thresholds,): hota**2 = detection * association."""
 
     hota: Floats
     detection: Floats
@@ -54,30 +54,30 @@ def trajectory_gospa(
 ) -> TrajectoryGospa:
     """Compute trajectory GOSPA of tracks and trajectories, and its parts.
 
-    Two estimates that swap their truths cost the switch penalty to the power of the order each, one that
-    begins or ceases to be paired half of that. By default it is the metric's linear programme, in which
-    estimates may be shared out among truths; `exactly` goes through all assignments step by step, which
-    is for small cases.
+    Two estimates that swap their truths cost the switch penalty to the power of the order each; an
+    estimate that begins or ceases to be paired costs half of that. By default the metric is computed by
+    linear programming, in which an estimate may be split among truths; `exactly` goes through all
+    assignments step by step, which is feasible for small cases.
 
-    Raises BadInput where the shapes do not agree, a cutoff or penalty is not positive, the order is
-    below 1, or there are more than MOST_ASSIGNMENTS to go through.
+    Raises BadInput if the shapes do not agree, a cutoff or penalty is not positive, the order is below
+    1, or there are more than MOST_ASSIGNMENTS assignments to go through.
 
     Args:
-        estimates: (n, steps, axes), NaN where a track is not there.
-        truths: (m, steps, axes), NaN where a target is not there.
-        cutoff: no distance counts as longer, in the unit of the points.
+        estimates: (n, steps, axes), NaN when a track is absent.
+        truths: (m, steps, axes), NaN when a target is absent.
+        cutoff: upper limit of a distance, in the unit of the points.
         switch_penalty: in the same unit.
         order: of the sum, at least 1.
-        exactly: whether all assignments are gone through.
+        exactly: whether to go through all assignments.
     """
     if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
-            f"cutoff {cutoff:g}, switch penalty {switch_penalty:g}, order {order:g}: give a positive "
-            "cutoff and penalty, and an order from 1 on"
+            f"cutoff {cutoff:g}, switch penalty {switch_penalty:g}, order {order:g}: cutoff and penalty "
+            "must be positive, and the order at least 1"
         )
     first, second = _tracks(estimates, truths)
     distance = _distances(first, second)
-    near = distance < cutoff  # what is as far apart as the cutoff is as good as not paired
+    near = distance < cutoff  # at the cutoff, a pair costs as much as two unpaired points
     gain = np.where(near, np.where(near, distance, 0.0) ** order - cutoff**order, 0.0)
     half_switch = 0.5 * switch_penalty**order
     pair = _paired_exactly(gain, half_switch) if exactly else _paired(gain, half_switch)
@@ -93,10 +93,10 @@ def trajectory_gospa(
 
 
 def _paired(gain: Floats, half_switch: float) -> Floats:
-    """Find the weights (steps, n, m) of pairs by a linear programme.
+    """Find the weights (steps, n, m) of pairs by linear programming.
 
-    Weights w >= 0 whose rows and columns sum up to 1 at most minimise sum w * gain, which is negative,
-    and half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
+    Weights w >= 0, whose rows and columns sum to at most 1, minimise sum w * gain, which is negative,
+    plus half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
     """
     steps, n, m = gain.shape
     row, column = np.nonzero((gain < 0.0).any(axis=0))
@@ -113,13 +113,13 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
     cost = np.append(gain[:, row, column].ravel(), np.full((steps - 1) * pairs, half_switch))
     found = linprog(cost, bounds, limits, method="highs")
     if not found.success:
-        raise BadInput(f"the linear programme of trajectory GOSPA has no solution: {found.message}")
+        raise BadInput(f"the linear program of trajectory GOSPA has no solution: {found.message}")
     weights[:, row, column] = found.x[: steps * pairs].reshape(steps, pairs)
     return weights
 
 
 def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
-    """Find the best pairs (steps, n, m), 0 or 1: the shortest way through all steps' assignments."""
+    """Find the best pairs (steps, n, m), 0 or 1: the shortest path through all steps' assignments."""
     steps, n, m = gain.shape
     choices = _assignments(n, m)
     changes = np.abs(choices[:, None] - choices[None]).sum(axis=(2, 3)) * half_switch
@@ -140,7 +140,7 @@ def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
 
 
 def _assignments(n: int, m: int) -> Floats:
-    """List all ways (ways, n, m) to pair some of n with some of m."""
+    """List all assignments (ways, n, m) of some of n to some of m."""
     found = []
     for count in range(min(n, m) + 1):
         for rows in combinations(range(n), count):
@@ -151,7 +151,7 @@ def _assignments(n: int, m: int) -> Floats:
                 if len(found) > MOST_ASSIGNMENTS:
                     raise BadInput(
                         f"{n} estimates and {m} truths have more than {MOST_ASSIGNMENTS} assignments; "
-                        "take the linear programme, exactly=False"
+                        "use the linear program, exactly=False"
                     )
     return np.array(found)
 
@@ -166,20 +166,20 @@ def hota(
 ) -> Hota:
     """Compute HOTA of tracks and trajectories, at every threshold.
 
-    Two points are similar by 1 - distance / cutoff, and at least by 0; they match from the threshold on.
-    Of a step, those pairs match that are best over the whole span. The usual single figure is the mean
-    over the thresholds .05, .10, ..., .95. Raises BadInput where the shapes do not agree or the cutoff
-    is not positive.
+    The similarity of two points is 1 - distance / cutoff, and at least 0; they match if it reaches the
+    threshold. The pairs of a step are those with the best match over the whole span. The usual single
+    figure is the mean over the thresholds 0.05, 0.10, ..., 0.95. Raises BadInput if the shapes do not
+    agree or the cutoff is not positive.
 
     Args:
-        estimates: (n, steps, axes), NaN where a track is not there.
-        truths: (m, steps, axes), NaN where a target is not there.
-        cutoff: points as far apart are not similar, in their unit.
+        estimates: (n, steps, axes), NaN when a track is absent.
+        truths: (m, steps, axes), NaN when a target is absent.
+        cutoff: distance from which on two points are not similar, in their unit.
         thresholds: of the similarity, 0 to 1.
-        others: how many points further tracks have, none of which is ever within the cutoff.
+        others: number of points of further tracks, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
+        raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
     levels = np.atleast_1d(np.asarray(thresholds, float))
     first, second = _tracks(estimates, truths)
     similarity = np.nan_to_num(np.maximum(0.0, 1.0 - _distances(first, second) / cutoff))
@@ -203,17 +203,18 @@ def hota(
 def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float, *, others: int = 0) -> float:
     """Compute IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
 
-    IDTP is how many points of the trajectories are nearer than the cutoff to the one track that each is
-    assigned to, so that they are most; NaN where there is no point. Raises BadInput as `hota`.
+    IDTP is the number of trajectory points that are nearer than the cutoff to the one track that each
+    trajectory is assigned to; the assignment maximises it. NaN if there are no points. Raises BadInput
+    as `hota` does.
 
     Args:
-        estimates: (n, steps, axes), NaN where a track is not there.
-        truths: (m, steps, axes), NaN where a target is not there.
-        cutoff: no pair is farther apart, in the unit of the points.
-        others: how many points further tracks have, none of which is ever within the cutoff.
+        estimates: (n, steps, axes), NaN when a track is absent.
+        truths: (m, steps, axes), NaN when a target is absent.
+        cutoff: greatest distance of a pair, in the unit of the points.
+        others: number of points of further tracks, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
+        raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
     first, second = _tracks(estimates, truths)
     together = (_distances(first, second) < cutoff).sum(axis=0)
     points = int(_present(first).sum() + _present(second).sum()) + others
@@ -225,19 +226,19 @@ def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
     first, second = np.asarray(estimates, float), np.asarray(truths, float)
     if first.ndim != 3 or second.ndim != 3 or first.shape[1:] != second.shape[1:]:
         raise BadInput(
-            f"tracks {first.shape} and trajectories {second.shape}: give (targets, steps, axes) of the "
-            "same steps and axes, NaN where one is absent"
+            f"tracks have shape {first.shape} and trajectories {second.shape}; both must be (targets, "
+            "steps, axes) with the same steps and axes, NaN where a target is absent"
         )
     return first, second
 
 
 def _present(tracks: Floats) -> NDArray[np.bool_]:
-    """Tell at which steps each target is there, (targets, steps)."""
+    """Test at which steps each target is present, (targets, steps)."""
     return np.asarray(np.isfinite(tracks).all(axis=2))
 
 
 def _distances(first: Floats, second: Floats) -> Floats:
-    """Compute distances (steps, n, m), infinity where one is absent."""
+    """Compute distances (steps, n, m), infinite if either is absent."""
     difference = first[:, None] - second[None]
     distance = np.sqrt((difference**2).sum(axis=3))
     return np.where(np.isnan(distance), np.inf, distance).transpose(2, 0, 1)

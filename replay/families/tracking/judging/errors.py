@@ -1,13 +1,13 @@
-"""Compares tracks with the trajectories of targets, at instants that no sensor sets.
+"""Comparison of tracks with the trajectories of targets, at instants that do not depend on sensors.
 
-At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
-alpha 2). The pairs say how far a track is from its target, and for how much of the time a target is
-followed. How often it is followed by another track than before (switch), or after a gap (break), is
-counted by the pairs of CLEAR MOT, which are kept while they are within the cutoff.
+At every instant the tracks, predicted to it, are paired with the targets that are present (GOSPA with
+alpha 2). The pairs give the distance of a track from its target, and the share of the time for which a
+target is followed. Switches to another track, and breaks, are counted with the pairs of CLEAR MOT, which
+are kept while they are within the cutoff.
 
 By default every track counts. If the metadata of a truth says that truths cover some of the targets
 (`COVERS`), a track of another target is not a false track: tracks farther than a limit from all targets
-with a truth are counted separately, as unreferenced, and figures without them have names of their own.
+with a truth are counted separately, as unreferenced, and figures without them have their own names.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,35 +26,35 @@ from fuselog.replay.judging.errors.truths import COVERS, SOME_TARGETS
 
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
-# The first instant, when tracks have had time to begin, and how far apart the others are.
+# Time of the first instant, which lets tracks begin, and the period of the instants.
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
 SOME_ARE_KNOWN = (
-    "the truths say that they cover some of the targets: a track more than "
-    f"{UNREFERENCED_M:g} m from all of them counts as unreferenced, not as false, and referenced_hota "
-    f"and referenced_idf1 leave out tracks that never come within {CUTOFF_M:g} m of one"
+    "the truths cover only some of the targets: a track more than "
+    f"{UNREFERENCED_M:g} m from all truths counts as unreferenced, not as false, and referenced_hota "
+    f"and referenced_idf1 exclude tracks that never come within {CUTOFF_M:g} m of a truth"
 )
 VELOCITY = ("vx_mps", "vy_mps")
 
 
 class TracksAt(NamedTuple):
-    """Holds the tracks at one instant: their numbers (n,), and where they are (n, 2)."""
+    """The tracks at one instant: their numbers (n,) and positions (n, 2)."""
 
     number: Integers
     place: Floats
 
 
 class TrackErrors(NamedTuple):
-    """Holds tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
+    """Tracks of one run compared with truths at k instants; distances in m, GOSPA's parts in m^2.
 
     Attributes:
         gospa_all: (k,), of all tracks.
-        gospa, localisation, missed, false: (k,), without those that have no reference.
-        unreferenced: (k,), how many these are; None if the truths cover all targets.
-        track: (targets, k), the track that each target is paired with by GOSPA, or NONE.
-        distance: (targets, k), NaN where it is not.
-        present: (targets, k), whether the target is there.
-        kept: (targets, k), the track that each target is paired with by CLEAR MOT, or NONE.
+        gospa, localisation, missed, false: (k,), without unreferenced tracks.
+        unreferenced: (k,), number of unreferenced tracks; None if the truths cover all targets.
+        track: (targets, k), the track that GOSPA pairs each target with, or NONE.
+        distance: (targets, k), NaN if a target has no track.
+        present: (targets, k), whether the target is present.
+        kept: (targets, k), the track that CLEAR MOT pairs each target with, or NONE.
     """
 
     gospa_all: Floats
@@ -70,10 +70,10 @@ class TrackErrors(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """Holds the instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2).
+    """The instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2).
 
-    `unreferenced_m` is how far from all of them a track is of a target without a truth; infinite if
-    they cover all targets.
+    `unreferenced_m` is the distance from all truths beyond which a track belongs to a target without a
+    truth; infinite if the truths cover all targets.
     """
 
     time_ns: Integers
@@ -82,12 +82,12 @@ class Judged(NamedTuple):
 
     @property
     def is_partial(self) -> bool:
-        """Tell whether there may be targets without a truth."""
+        """Test whether there may be targets without a truth."""
         return bool(np.isfinite(self.unreferenced_m))
 
 
 def target_topics(topics: Mapping[str, Topic]) -> list[str]:
-    """Return the truths that are positions of targets; the pose of a sensor that scans is not one."""
+    """List the truths that are positions of targets, not poses of sensors that scan."""
     return [
         topic
         for topic in topics_of(topics, schemas.TRUTH_STATE)
@@ -97,17 +97,17 @@ def target_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
-    """Return instants from a while after the epoch to the scans' end or that of the first truth to end.
+    """Choose instants from a burn-in after the epoch to the earliest end of scans and truths.
 
-    Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
-    they are over before the first instant.
+    Truths are interpolated linearly. Raises BadInput if there are no scans or no truths of positions, or
+    if they end before the first instant.
     """
     scans = source.read(topics_of(source.topics, schemas.SCAN))
     truths = source.read(target_topics(source.topics))
     if not scans or not truths:
         raise BadInput(
-            f"{source.name}: has no scans or no truths, and tracks are judged by both; give a log with "
-            "them"
+            f"{source.name}: tracks are judged with scans and truths, and one of them is missing; use a "
+            "log with both"
         )
     last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
     last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
@@ -115,7 +115,7 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
     at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
     if not len(at_ns):
         raise BadInput(
-            f"{source.name}: ends within {burn_in_s:g} s, and tracks are judged after these; give a "
+            f"{source.name}: the log ends within the first {burn_in_s:g} s, which are not judged; use a "
             "longer log"
         )
     places = [
@@ -127,22 +127,22 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
 
 
 def unreferenced_m(truths: Iterable[Stream]) -> float:
-    """Return from where on a track is of a target without a truth, by the metadata of all truths."""
+    """Return the distance beyond which a track is unreferenced, from the metadata of all truths."""
     covered = {truth.metadata.get(COVERS, "") for truth in truths}
     return UNREFERENCED_M if SOME_TARGETS in covered else np.inf
 
 
 def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
-    """Return a run's tracks at instants: the last told until then, moved on by their velocities.
+    """Return a run's tracks at instants: the last estimates before each, predicted by their velocities.
 
-    `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
-    of each one `delay_ns` after its stamp. Tracks that have no velocities stay where they are.
+    `sizes` gives the number of messages in `tracks` for each scan. A tracker that waits for late scans
+    reports each one `delay_ns` after its stamp. Tracks without velocities are not moved.
 
     Args:
         sizes: of the sets of tracks, a message per scan.
         tracks: all tracks after each scan.
         at_ns: (k,), the instants.
-        delay_ns: how long after its stamp a scan is told of.
+        delay_ns: time from a scan's stamp to its report.
     """
     names = tracks.components
     moving = VELOCITY if {*VELOCITY} <= {*names} else ()
@@ -166,13 +166,13 @@ def track_errors(
     cutoff_m: float = CUTOFF_M,
     unreferenced_m: float = np.inf,
 ) -> TrackErrors:
-    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there.
+    """Compare the tracks at k instants with the truths (targets, k, 2).
 
     Args:
-        tracks: those at each of the k instants.
-        truths: (targets, k, 2), in m.
+        tracks: the tracks at each of the k instants.
+        truths: (targets, k, 2), in m, NaN when a target is absent.
         cutoff_m: of GOSPA.
-        unreferenced_m: a track farther from all targets is of none that has a truth.
+        unreferenced_m: distance from all targets beyond which a track is unreferenced.
     """
     targets_in_all, instants, _ = truths.shape
     present = np.asarray(np.isfinite(truths).all(axis=2))
@@ -207,10 +207,10 @@ def track_errors(
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """Return the means over the instants, and of each target, from 1 on, RMSE and coverage.
+    """Return the means over the instants, and RMSE and coverage of each target, numbered from 1.
 
-    Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed. GOSPA of
-    all tracks and the number of those without a reference are given if the truths cover some targets.
+    Missed and false are numbers of targets. The RMSE of a target that is never followed is NaN. If the
+    truths cover some targets, GOSPA of all tracks and the number of unreferenced ones are included.
     """
     alone = cutoff_m**2 / 2.0
     figures = {"gospa_m": float(errors.gospa.mean())}
@@ -238,17 +238,17 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 def figures_of_whole_tracks(
     tracks: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
 ) -> dict[str, float]:
-    """Return HOTA and IDF1 with cutoff 20 m.
+    """Compute HOTA and IDF1 with cutoff 20 m.
 
-    Of all tracks; if truths cover some targets, of those that are ever within the cutoff of a target,
-    under names of their own.
+    They are of all tracks. If truths cover some targets, they are of the tracks that are ever within the
+    cutoff of a target, under their own names.
 
     Args:
-        tracks: those at each of k instants.
-        truths: (targets, k, 2), in m, NaN where a target is not there.
+        tracks: the tracks at each of k instants.
+        truths: (targets, k, 2), in m, NaN when a target is absent.
         unreferenced_m: see `Judged`.
     """
-    from fuselog.replay.families.tracking.judging.distances import (  # whose assignments import SciPy
+    from fuselog.replay.families.tracking.judging.distances import (  # imports SciPy, which is slow
         hota,
         idf1,
     )
@@ -266,11 +266,11 @@ def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int
     """Find the tracks that are ever within the cutoff of a target.
 
     Args:
-        tracks: those at each of k instants.
-        truths: (targets, k, 2), in m, NaN where a target is not there.
+        tracks: the tracks at each of k instants.
+        truths: (targets, k, 2), in m, NaN when a target is absent.
 
     Returns:
-        These tracks (tracks, k, 2), NaN where one is absent, and how many points all others have.
+        These tracks (tracks, k, 2), NaN where one is absent, and the number of points of all others.
     """
     near: set[int] = set()
     for at, true in zip(tracks, truths.transpose(1, 0, 2), strict=True):
@@ -285,7 +285,7 @@ def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
-    """Return the tracks at k instants as (tracks, k, 2), NaN where absent; see `judging.distances`."""
+    """Arrange the tracks at k instants as (tracks, k, 2), NaN where absent; see `judging.distances`."""
     numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
     found = np.full((len(numbers), len(tracks), 2), np.nan)
     for instant, at in enumerate(tracks):

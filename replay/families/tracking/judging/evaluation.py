@@ -1,8 +1,8 @@
-"""Evaluates the tracks of a replay by the targets that its log has truths of, block by block.
+"""Evaluation of a replay's tracks against the truths of targets in its log, block by block.
 
-Instants, pairs and distances are those of `errors`, by which experiments judge trackers, too. A target
-is there from the first to the last stamp of its truth. Judged is what the tracker tells of: from a while
-after the log's begin to the last scan that it took.
+Instants, pairs and distances are those of `errors`, with which experiments judge trackers too. A target
+is present from the first to the last stamp of its truth. The judged span begins a while after the start
+of the log and ends with the last scan that the tracker processed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,12 +38,12 @@ from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
 from fuselog.replay.judging.metrics.measuring import Metric
 
-# Of a run that is shorter than four burn-ins, tracks have a quarter to begin.
+# Greatest burn-in as a share of the run: in short runs, tracks have less time to begin.
 BURN_IN_SHARE = 0.25
 
 
 class TrackBlock(NamedTuple):
-    """Holds a block of a tracker's sets of tracks: their sizes, the tracks, and each run's targets."""
+    """A block of a tracker's sets of tracks: their sizes, the tracks, and each run's targets."""
 
     estimator: str
     case: str
@@ -54,7 +54,7 @@ class TrackBlock(NamedTuple):
 
 
 def targets_of(source: Source, frame: str) -> Judged | None:
-    """Return a run's targets in a frame at its instants, NaN where one is not there; None without any.
+    """Return a run's targets in a frame at its instants, NaN where absent; None if there are no targets.
 
     Instants are PERIOD_S apart, from BURN_IN_S after the epoch to the end of the last truth.
     """
@@ -75,7 +75,7 @@ def targets_of(source: Source, frame: str) -> Judged | None:
 
 
 def unjudged_tracks(tracks: Stream, sources: Sequence[Source]) -> str:
-    """Explain why tracks cannot be compared with the targets of some run; empty if they can."""
+    """Explain why tracks cannot be compared with the targets of some run; return "" if they can."""
     reasons = (
         not_comparable(tracks.metadata, target_topics(source.topics), source.topics)
         for source in sources
@@ -84,7 +84,7 @@ def unjudged_tracks(tracks: Stream, sources: Sequence[Source]) -> str:
 
 
 def _places(truth: Stream, at_ns: Integers) -> Floats:
-    """Find where a target is at instants, (k, 2); NaN before its first stamp and after its last one."""
+    """Interpolate a target's position (k, 2); NaN before its first stamp and after its last one."""
     place, begin_ns = read_vectors(truth, "state", PLANE), truth.publish_time_ns[0]
     stamps = truth.publish_time_ns - begin_ns
     axes = [np.interp(at_ns - begin_ns, stamps, axis, left=np.nan, right=np.nan) for axis in place.T]
@@ -94,10 +94,9 @@ def _places(truth: Stream, at_ns: Integers) -> Floats:
 def track_blocks(
     outputs: Mapping[str, Ragged], targets: Mapping[str, Sequence[Judged | None]], first_run: int
 ) -> dict[str, TrackBlock]:
-    """Return the sets of tracks among a replay's outputs, or a block of them, by the topic of tracks.
+    """Collect the sets of tracks among a replay's outputs or a block of them, by topic of the tracks.
 
-    `targets` are those of the runs, by the frame that they are seen in; tracks in no such frame are left
-    out.
+    `targets` are those of the runs, by frame; tracks in other frames are left out.
     """
     found = {}
     for topic, tracks in outputs.items():
@@ -111,7 +110,7 @@ def track_blocks(
 
 
 class TracksJudge(KindJudge):
-    """Judges sets of tracks by the targets of each run, which are read once for every frame."""
+    """Judge for sets of tracks, which reads the targets of each run once for every frame."""
 
     def __init__(self, runs: JudgedRuns) -> None:
         super().__init__(runs)
@@ -126,7 +125,7 @@ class TracksJudge(KindJudge):
         return [*track_blocks(outputs, self._targets, self.runs.first_run).items()]
 
     def _find_targets(self, topic: str, tracks: Stream) -> None:
-        """Find what new tracks are judged by, and whether they can be judged."""
+        """Find the targets for new tracks, and whether the tracks can be judged."""
         self.unjudged[topic] = unjudged_tracks(tracks, self.runs.sources)
         frame = frame_of(tracks.metadata)
         if self.unjudged[topic] or frame in self._targets:
@@ -138,12 +137,12 @@ class TracksJudge(KindJudge):
 
 @dataclass
 class Followed:
-    """Holds the tracks of one run as they were told at its instants.
+    """The tracks of one run as reported at its instants.
 
     Attributes:
-        targets: the instants, and where the targets are then.
-        sets: the tracks at the first of these.
-        first: how many instants were over before the first set of tracks; they are not judged.
+        targets: the instants, and the positions of the targets.
+        sets: the tracks at the instants so far.
+        first: number of instants before the first set of tracks, which are not judged.
         last: the last set of tracks.
     """
 
@@ -153,14 +152,14 @@ class Followed:
     last: tuple[Stream, Stream] | None = None
 
     def add(self, sizes: Stream, tracks: Stream) -> None:
-        """Take in the next sets of tracks."""
+        """Add the next sets of tracks."""
         if not len(sizes):
             return
         at_ns = self.targets.time_ns
         if self.first is None:
             self.first = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
         begin = self.first + len(self.sets)
-        # an instant before the block is told by the last set before it
+        # instants before the block use the last set before it
         before = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
         if self.last is not None:
             self.sets += tracks_at(*self.last, at_ns[begin:before])
@@ -174,7 +173,7 @@ class Followed:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Return what the tracks are worth, at the instants told of; {} without tracks or a target."""
+        """Return figures of the tracks at the instants so far; {} without tracks or targets."""
         begin = self.first or 0
         truths = self.targets.truths[:, begin : begin + len(self.sets)]
         if not self.sets or not np.isfinite(truths).any():
@@ -184,7 +183,7 @@ class Followed:
         found = {
             name: value
             for name, value in track_figures(errors).items()
-            if not name.startswith("target")  # one by one they are of an experiment's own targets
+            if not name.startswith("target")  # only experiments report targets one by one
         }
         followed = errors.track != NONE
         squared = errors.distance[followed] ** 2
@@ -195,7 +194,7 @@ class Followed:
         }
 
 
-# What is kept of a run: its tracks while there may be more, then their figures alone.
+# State of a run: its tracks while more may follow, then only their figures.
 State = dict[int, Followed | dict[str, float]]
 
 
@@ -217,7 +216,7 @@ def _figures(state: State) -> dict[int, dict[str, float]]:
 
 
 def _finish(state: State) -> dict[str, float]:
-    """Return the means over the runs of which they are known."""
+    """Return the means of the figures over the runs in which they are known."""
     runs = [figures for figures in _figures(state).values() if figures]
     found = {}
     for name in dict.fromkeys(name for figures in runs for name in figures):

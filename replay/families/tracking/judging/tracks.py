@@ -1,7 +1,7 @@
-"""Judges tracks by the targets they should follow: which reports of a target went to one track.
+"""Comparison of tracks with targets by reports: the share of a target's reports in one track.
 
-A target's own track is found by assigning tracks to targets one to one, so that as many reports as can
-be are in the track of their target: a track that swallows two targets counts for one of them.
+Tracks are assigned to targets one to one, so that the greatest number of reports is in the track of
+their target. A track that contains two targets counts for one of them.
 """
 
 import operator
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 Integers = NDArray[np.int64]
 IDENTITY = "identity"
-# Targets with more reports than that are judged: a few reports say little of a track.
+# Only targets with more reports are judged, because a few reports say little about a track.
 MANY_REPORTS = 50
-# A target has kept its track with this share of its reports.
+# Share of its reports from which on a target has kept its track.
 KEPT_SHARE = 0.95
 
 
 class KeptTracks(NamedTuple):
-    """Holds how many targets are judged, what share of them kept a track, and their mean share in it."""
+    """Number of judged targets, share of them that kept a track, and mean share of reports in it."""
 
     targets: int
     kept_share: float
@@ -34,16 +34,17 @@ class KeptTracks(NamedTuple):
 
 
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
-    """Return one row per target of reports, most reports first.
+    """Make a table with one row per target of reports, most reports first.
 
-    Columns: target, reports; track, its own, -1 for none; share of its reports in that; largest_share in
-    any track; tracks, how many have a report of it; switches, how often successive reports of it are in
-    different ones; others, how many reports of other targets its own track has.
+    Columns: target; reports, their number; track, its own, -1 if it has none; share of its reports in
+    that track; largest_share in any track; tracks, the number of tracks with a report of it; switches,
+    the number of successive reports in different tracks; others, the number of reports of other targets
+    in its track.
 
     Args:
-        targets, tracks: of every report, in order of time, the numbers of its target and track, (n,).
+        targets, tracks: (n,), the numbers of target and track of every report, in order of time.
     """
-    import pandas as pd  # these take long to import
+    import pandas as pd  # slow to import
     from scipy.optimize import linear_sum_assignment
 
     target, of_target = np.unique(targets, return_inverse=True)
@@ -74,7 +75,7 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
 
 
 def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> KeptTracks:
-    """Return how the targets with more than so many reports kept their tracks."""
+    """Summarise how the targets with more than `reports` reports kept their tracks."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
         return KeptTracks(0, np.nan, np.nan)
@@ -82,14 +83,12 @@ def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPOR
 
 
 def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:
-    """Count the numbers that spoke within the last `live_s`: times (m,) of changes, counts (m,).
-
-    Times (n,) are sorted.
+    """Count the senders heard within the last `live_s`: times (m,) of changes, counts (m,).
 
     Args:
         time_ns: (n,), sorted.
-        numbers: (n,), who spoke.
-        live_s: how long one counts after it spoke.
+        numbers: (n,), number of the sender.
+        live_s: time for which a sender counts after it was heard.
     """
     order = np.lexsort((time_ns, numbers))
     sorted_ns, sorted_numbers = time_ns[order], numbers[order]
@@ -107,10 +106,10 @@ Reports = dict[int, list[tuple[Integers, Integers]]]
 
 
 def reports_of(output: Output) -> Reports:
-    """Return every run's true targets and tracks (n,) of its reports; {} where that is not known.
+    """Return every run's true targets and tracks (n,) of its reports; {} if identities are unknown.
 
-    The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
-    Raises BadInput where the log is not the one that these are estimates of.
+    The rows of the stream correspond to the reports in the replayed span, and so to the identities.
+    Raises BadInput if the estimates do not belong to the log.
     """
     stream = output.rows.stream
     topic = f"{stream.metadata.get('reports', '').rpartition('/')[0]}/{IDENTITY}"
@@ -129,7 +128,7 @@ def reports_of(output: Output) -> Reports:
         if len(targets) != len(tracks):
             raise BadInput(
                 f"{source.name}: {len(targets)} identities for {len(tracks)} reports on {stream.topic}; "
-                "give the log that these are estimates of"
+                "use the log from which these estimates were made"
             )
         both = targets.astype(np.int64), tracks["track_id"].astype(np.int64)
         found[output.first_run + run].append(both)
@@ -137,7 +136,7 @@ def reports_of(output: Output) -> Reports:
 
 
 def track_tables(reports: Reports) -> "list[pd.DataFrame]":
-    """Return a table per run; none where a run has no reports."""
+    """Make a table per run; return no tables if a run has no reports."""
     if not all(reports.values()):
         return []
     return [
@@ -173,7 +172,7 @@ def _finish(reports: Reports) -> dict[str, float]:
 
 
 TRACKS = Metric(
-    "how targets with more than 50 reports kept one track of their own",
+    "how well targets with more than 50 reports kept a track of their own",
     Output,
     dict,
     _add,

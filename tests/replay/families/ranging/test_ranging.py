@@ -212,7 +212,7 @@ def test_a_pose_is_found_in_the_first_ranges_whatever_its_heading() -> None:
 
 def test_a_start_that_ranges_do_not_tell_is_refused_with_what_is_needed() -> None:
     source = recorded(duration_s=5.0, anchors_m=[[0, 5, 2], [5, 0, 2]])
-    with pytest.raises(BadInput, match=r"/trolley/ranges: no span of 1 s has the ranges of 3 pairs"):
+    with pytest.raises(BadInput, match=r"/trolley/ranges: no span of 1 s has ranges of 3 pairs"):
         find_position(maps(source), RangingParameters(**FOUND))
 
 

@@ -226,7 +226,7 @@ def test_inconsistent_sets_are_refused_by_the_filter():
 @pytest.mark.parametrize(
     ("second", "angle", "bound", "said"),
     [
-        ([[1.0, 0.0]], [0.5], 0.1, "at one place"),
+        ([[1.0, 0.0]], [0.5], 0.1, "at the same position"),
         ([[0.0, 0.0]], [0.5], 0.0, "bound"),
         ([[0.0, 0.0]], [0.5], np.pi, "bound"),
         ([[0.0, 0.0]], [np.nan], 0.1, "finite"),

@@ -69,7 +69,7 @@ def test_parts_make_the_whole(estimates, truths):
     [
         (([(np.nan, 0)], THREE, 10), "finite"),
         (([(1, 2, 3)], THREE, 10), "3 components"),
-        ((THREE, THREE, 0), "positive cutoff"),
+        ((THREE, THREE, 0), "cutoff must be positive"),
         ((THREE, THREE, 10, 0.5), "order"),
         ((THREE, THREE, 10, 2, 3), "alpha"),
     ],

@@ -270,5 +270,5 @@ def test_two_landmarks_at_one_place_are_refused():
         **source.streams,
         "/landmarks": replace(landmarks, columns={**landmarks.columns, "position_m": places}),
     }
-    with pytest.raises(BadInput, match="at one place"):
+    with pytest.raises(BadInput, match="at the same position"):
         judged([replace(source, streams=streams)], ("exact",))

@@ -111,7 +111,7 @@ def test_a_sensor_states_its_noise_as_sigma_or_variance_to_every_estimator() -> 
         assert scanning_of({"/scan": scan_of(stated)}, "/scan").variance_m2 == pytest.approx(0.5)
         assert channels.stated([scan_of(stated)], "sigma_m") == pytest.approx(0.5**0.5)
     assert settings_of(PhdParameters(sigma_m=3.0), scan_of(STATED)).variance_m2 == 9.0
-    with pytest.warns(FutureWarning, match="'variance_m2' is called 'sigma_m' now"):
+    with pytest.warns(FutureWarning, match="'variance_m2' will be removed in the next release"):
         old = settings_of(PhdParameters(variance_m2=4.0), scan_of(STATED))
     assert old.variance_m2 == 4.0
     with pytest.raises(BadInput, match=r"topic /scan: parameter 'sigma_m' is -1\.0"):
@@ -221,7 +221,7 @@ def test_bad_input_is_named():
         settings_of(PhdParameters(), scan_of({}))
     with pytest.raises(BadInput, match="'detection_probability' is 0"):
         settings_of(PhdParameters(), scan_of({**STATED, "detection_probability": "0"}))
-    with pytest.raises(BadInput, match="priors are more than 2 components"):
+    with pytest.raises(BadInput, match="priors exceed the limit of 2 components"):
         collect(replay([good], bind("gm-phd", [good], {"most_components": 2})))
     line = make_stream(
         "/sensor/detection", schemas.DETECTION, scan.publish_time_ns, scan_id=[0, 1, 2],

@@ -134,7 +134,7 @@ def test_the_birth_of_a_range_with_a_bearing_has_its_error(uncompiled: None):
 def test_errors_that_cannot_be_estimated_are_said(uncompiled: None):
     source = log(sensor("radar", {**CLEAR, "registration_sigma_m": "5"}, [0], [[]]))
     motion = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
-    with pytest.raises(BadInput, match="registration errors need targets of one motion; give mode="):
+    with pytest.raises(BadInput, match="registration errors require targets with one motion; set mode="):
         replay(source, model="vehicle", motion=motion)
-    with pytest.raises(BadInput, match="errors of sensors cannot be smoothed"):
+    with pytest.raises(BadInput, match="tracks with sensor errors cannot be smoothed"):
         replay(source, smoothed=True)

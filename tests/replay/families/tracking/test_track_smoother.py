@@ -58,7 +58,7 @@ def test_with_certain_association_a_track_is_smoothed_as_its_target_alone(
 
 def test_smoothed_tracks_do_not_go_back_for_late_scans(uncompiled: None):
     source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
-    with pytest.raises(BadInput, match="smoothed tracks use later detections in any case"):
+    with pytest.raises(BadInput, match="smoothed tracks cannot be combined with --late rewind"):
         replay_late(source, "rewind:1", smoothed=True)
 
 
@@ -71,5 +71,5 @@ def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
 
 def test_modes_are_not_smoothed(uncompiled: None):
     source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
-    with pytest.raises(BadInput, match="smoothed tracks need a model with one linear motion"):
+    with pytest.raises(BadInput, match="smoothed tracks require a model with one linear motion"):
         replay(source, smoothed=True, model="vehicle", motion=MOTION)

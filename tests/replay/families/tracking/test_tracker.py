@@ -532,14 +532,14 @@ def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
 @pytest.mark.parametrize(
     ("streams", "settings", "said"),
     [
-        (sensor("camera", CAMERA, [0], [[0.5]]), {}, "bearings alone begin no tracks"),
+        (sensor("camera", CAMERA, [0], [[0.5]]), {}, "cannot begin from bearings only"),
         (
             sensor("radar", {**RADAR, "origin": "/own/fix"}, [0], [[(1, 2)]]),
             {},
-            r"that of /own/fix \(fuselog.PositionFix\), which is missing",
+            r"topic /own/fix \(fuselog.PositionFix\), is missing",
         ),
         (_numbered(sensor("radar", RADAR, [0, 1], [[], []]), [4, 4]), {}, "two scans have the number 4"),
-        (_numbered(sensor("radar", RADAR, [0], [[(1, 2)]]), [7]), {}, "states 1 detections, and has 0"),
+        (_numbered(sensor("radar", RADAR, [0], [[(1, 2)]]), [7]), {}, "states 1 detections, but has 0"),
         (
             _without(sensor("radar", RADAR, [0], [[(1, 2)]]), "/radar/scan"),
             {},
@@ -552,13 +552,17 @@ def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
             {"model": "vehicle"},
             "states turn_rate_radps; .*--set motion.",
         ),
-        (sensor("radar", RADAR, [0], [[]]), {"model": "robot"}, "robot: is driven by odometry"),
+        (
+            sensor("radar", RADAR, [0], [[]]),
+            {"model": "robot"},
+            "robot: the model is driven by odometry",
+        ),
         (sensor("radar", RADAR, [0], [[]]), {"model": "batch-reactor"}, "has no position x_m, y_m"),
-        (sensor("radar", RADAR, [0], [[]]), {"management": "hits"}, "management = hits is for jpda"),
+        (sensor("radar", RADAR, [0], [[]]), {"management": "hits"}, "management = hits with jpda"),
         (
             sensor("radar", RADAR, [0], [[]]),
             {"motion": {"turn_rate_radps": 0.0}},
-            "need a model; give model=",
+            "need a model; set model=",
         ),
     ],
 )

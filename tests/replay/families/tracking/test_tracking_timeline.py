@@ -121,7 +121,7 @@ def test_associations_and_what_happened(tmp_path: Path, uncompiled: None):
         f"hungarian: track {first} is confirmed",
         f"hungarian: track {first} ends",
         f"hungarian: track {second} is confirmed",
-        f"hungarian: target 1 goes on with track {second}, before with {first}",
+        f"hungarian: target 1 switches from track {first} to track {second}",
     ]
     strips = found["/map/hungarian/associations/radar"]["LineStrips2D:strips"]
     lines = np.array([strip for row in strips for strip in row])
