@@ -61,7 +61,7 @@ def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> St
     if not len(increment) == len(measurement) == offsets[-1]:
         raise BadInput(
             f"{len(increment)} increments and {len(measurement)} measurements for {offsets[-1]} steps; "
-            "give a row of each for every step, NaN for none"
+            "give one row of each for every step, NaN if there is no value"
         )
     return Steps(offsets, _unit_or_nan(increment, "increment"), _unit_or_nan(measurement, "measurement"))
 

@@ -145,7 +145,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
             ) from None
         if len(found[name].diagonal) != d:
             raise BadInput(
-                f"{name}: {len(found[name].diagonal)} numbers for {d} components; give one for each"
+                f"{name} has {len(found[name].diagonal)} numbers for {d} components; give one for each"
             )
     return Distributions(**found)
 
@@ -158,7 +158,7 @@ def as_bingham(noise: DirectionalNoise) -> Bingham:
     try:
         return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
     except BadInput as error:
-        raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
+        raise BadInput(f"Gaussian noise with the variances {noise.diagonal}: {error}") from None
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
@@ -279,8 +279,8 @@ def _unscented(parameters: UnscentedTorusParameters) -> HeadingFilter:
     return partial(run_unscented_filter, wrapped=parameters.wrapped)
 
 
-_BINGHAM = "recursive Bingham filter of "
-_KALMAN = "Kalman filter, modified for unit vectors, of "
+_BINGHAM = "recursive Bingham filter for "
+_KALMAN = "Kalman filter, modified for unit vectors, for "
 _AXIS, _ORIENTATION = (schemas.AXIS, AXIS_KINDS), (schemas.ORIENTATION, ORIENTATION_KINDS)
 BINGHAM_AXIS = _of_unit_vectors(f"{_BINGHAM}an axis", BinghamParameters, *_AXIS, _start_bingham)
 KALMAN_AXIS = _of_unit_vectors(f"{_KALMAN}an axis", KalmanParameters, *_AXIS, _start_kalman)
@@ -290,5 +290,7 @@ BINGHAM_ORIENTATION = _of_unit_vectors(
 KALMAN_ORIENTATION = _of_unit_vectors(
     f"{_KALMAN}an orientation", KalmanParameters, *_ORIENTATION, _start_kalman
 )
-TORUS = _of_headings("recursive toroidal filter of two headings", TorusParameters, _toroidal)
-UKF_TORUS = _of_headings("unscented Kalman filter of two headings", UnscentedTorusParameters, _unscented)
+TORUS = _of_headings("recursive toroidal filter for two headings", TorusParameters, _toroidal)
+UKF_TORUS = _of_headings(
+    "unscented Kalman filter for two headings", UnscentedTorusParameters, _unscented
+)

@@ -90,7 +90,9 @@ def make_heading_model(
     Raises BadInput if a covariance is not positive definite or a number is not finite.
     """
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
-        raise BadInput("coupling and drift of a heading model must be finite, and the drift two numbers")
+        raise BadInput(
+            "coupling and drift of a heading model must be finite; give two numbers for the drift"
+        )
     covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
     return HeadingModel(
         float(coupling_rad), np.array(drift_rad, float), *map(np.ascontiguousarray, covariances)
@@ -163,7 +165,7 @@ def _run(
     option: float | bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     if measurement.shape != (offsets[-1], 2):
-        raise BadInput(f"heading measurements of shape {measurement.shape}; give ({offsets[-1]}, 2)")
+        raise BadInput(f"heading measurements have shape {measurement.shape}; give ({offsets[-1]}, 2)")
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
     rows = HeadingRows(offsets, np.ascontiguousarray(measurement))

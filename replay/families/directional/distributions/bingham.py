@@ -48,13 +48,13 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
     d = z.shape[-1] if z.ndim else 0
     if d not in (2, 4) or axes.shape[-2:] != (d, d):
         raise BadInput(
-            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d) and (..., d) with "
-            "d = 2 or 4"
+            f"Bingham axes have shape {axes.shape} and concentrations {z.shape}; give (..., d, d) and "
+            "(..., d) with d = 2 or 4"
         )
     if not np.isfinite(z).all():
-        raise BadInput("Bingham concentrations must be finite; give finite numbers, 0 for none")
+        raise BadInput("Bingham concentrations must be finite; use 0 for a uniform distribution")
     if not np.allclose(axes @ np.swapaxes(axes, -1, -2), np.eye(d), rtol=0.0, atol=1e-9):
-        raise BadInput("Bingham axes must be orthonormal columns; give such a matrix")
+        raise BadInput("Bingham axes must be an orthogonal matrix; give orthonormal columns")
     shape = np.broadcast_shapes(axes.shape[:-1], z.shape)
     order = np.argsort(np.broadcast_to(z, shape), axis=-1, kind="stable")
     z = np.take_along_axis(np.broadcast_to(z, shape), order, -1)
@@ -131,7 +131,9 @@ def fit(second_moment: ArrayLike) -> Bingham:
     moment = _symmetric(second_moment, "second moment of a Bingham distribution")
     shape, d = moment.shape[:-2], moment.shape[-1]
     if not np.allclose(np.trace(moment, axis1=-2, axis2=-1), 1.0, rtol=0.0, atol=1e-9):
-        raise BadInput("the second moment of unit vectors has trace 1; divide the matrix by its trace")
+        raise BadInput(
+            "the second moment of unit vectors must have trace 1; divide the matrix by its trace"
+        )
     axes, z = np.empty((*shape, d, d)), np.empty((*shape, d))
     converged = kernels.fit_each(
         moment.reshape(-1, d, d).copy(), axes.reshape(-1, d, d), z.reshape(-1, d)
@@ -140,8 +142,8 @@ def fit(second_moment: ArrayLike) -> Bingham:
         index = np.unravel_index(int(np.argmin(converged)), shape)
         place = f" at {tuple(map(int, index))}" if shape else ""
         raise BadInput(
-            f"no Bingham distribution has the second moment{place}: an eigenvalue "
-            "is not positive and its concentration diverges; give a positive definite matrix"
+            f"no Bingham distribution has the second moment{place}: an eigenvalue is not positive, "
+            "so its concentration diverges; give a positive definite matrix"
         )
     return Bingham(axes, z)
 
@@ -221,7 +223,7 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
     """
     variance, axes = np.linalg.eigh(_symmetric(gaussian_covariance, "Gaussian covariance"))
     if variance[0] < -1e-12 * variance[-1]:
-        raise BadInput("a Gaussian covariance must have no negative eigenvalues; give such a matrix")
+        raise BadInput("a Gaussian covariance must have no negative eigenvalues")
     variance = np.maximum(variance, 0.0)
     along = np.asarray(mean, float) @ axes
     log_t, step = np.linspace(-40.0, 80.0, 1201, retstep=True)
@@ -254,5 +256,5 @@ def _symmetric(matrix: ArrayLike, what: str) -> NDArray[np.float64]:
         raise BadInput(f"{what} has shape {matrix.shape}; give (..., d, d) with d = 2 or 4")
     transposed = np.swapaxes(matrix, -1, -2)
     if not np.isfinite(matrix).all() or not np.allclose(matrix, transposed, rtol=1e-9, atol=1e-12):
-        raise BadInput(f"{what} is not a finite symmetric matrix; give a symmetric one")
+        raise BadInput(f"{what} must be a finite symmetric matrix")
     return 0.5 * (matrix + transposed)

@@ -81,7 +81,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
     """
     if len(angles) < 10 * components:
         raise BadInput(
-            f"{len(angles)} pairs of angles for {components} components; give at least 10 for each"
+            f"{len(angles)} pairs of angles for {components} components; give at least 10 per component"
         )
     embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
     with extra("papers", "a mixture on the torus"):

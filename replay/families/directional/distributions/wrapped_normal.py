@@ -61,18 +61,15 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
-            f"wrapped normal with mean {mean.shape}, covariance {covariance.shape}; "
-            "give (..., 2) and (..., 2, 2)"
+            f"a wrapped normal has a mean of shape {mean.shape} and a covariance of shape "
+            f"{covariance.shape}; give (..., 2) and (..., 2, 2)"
         )
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        raise BadInput("mean and covariance of a wrapped normal must be finite; give finite numbers")
+        raise BadInput("the mean and covariance of a wrapped normal must be finite")
     if not np.allclose(
         covariance[..., 0, 1], covariance[..., 1, 0], rtol=1e-9, atol=0.0
     ) or not _is_definite(covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]):
-        raise BadInput(
-            "the covariance of a wrapped normal must be symmetric and positive definite; give such a "
-            "matrix"
-        )
+        raise BadInput("the covariance of a wrapped normal must be symmetric and positive definite")
     return WrappedNormal(wrap_angle(mean), covariance)
 
 
@@ -114,7 +111,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
     """
     require_central_weight(central_weight)
     if not np.all(np.abs(moments.correlation) <= 1.0):
-        raise BadInput("a circular correlation must lie in [-1, 1]; check the moments")
+        raise BadInput("a circular correlation must be in [-1, 1]; check the moments")
     a, b, w1, w3 = kernels.diracs(
         moments.variance[..., 0], moments.variance[..., 1], moments.correlation, central_weight
     )
@@ -126,7 +123,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 def require_central_weight(central_weight: float) -> None:
     """Raise BadInput if w5 is outside [0, 1/2], where real positions exist for every m_1."""
     if not 0.0 <= central_weight <= 0.5:
-        raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, such as 0.2, the paper's")
+        raise BadInput(f"central weight {central_weight:g} is not in [0, 0.5]; the paper uses 0.2")
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:
@@ -138,8 +135,8 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
     c11, c22 = moments.variance[..., 0], moments.variance[..., 1]
     if not np.all((moments.variance > 0.0) & (moments.variance <= kernels.UNIFORM)):
         raise BadInput(
-            "a circular variance -2 ln|m| is not in (0, 80]: a first moment has the length 0, or 1 or "
-            "more; check the moments"
+            "a circular variance -2 ln|m| is not in (0, 80]: the length |m| of a first moment must be "
+            "above 0 and below 1; check the moments"
         )
     c12 = kernels.covariance_of(moments.correlation, c11, c22)
     if not _is_definite(c11, c12, c22):

@@ -241,7 +241,7 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     try:
         from vqf import VQF
     except ImportError:
-        raise BadInput("estimator vqf needs the package vqf: pip install vqf") from None
+        raise BadInput("estimator vqf needs the package vqf; run pip install vqf") from None
     samples = streams["inertial"]
     is_last = (
         np.diff(samples.publish_time_ns, append=-1) != 0
@@ -272,12 +272,15 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
 
 MADGWICK = of_nine_axes(
     of_inertial_samples(
-        "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+        "Madgwick's gradient-descent filter for orientation",
+        MadgwickParameters,
+        start,
+        follow=follow_madgwick,
     )
 )
 MAHONY = of_nine_axes(
     of_inertial_samples(
-        "Mahony's complementary filter of orientation and bias",
+        "Mahony's complementary filter for orientation and gyro bias",
         MahonyParameters,
         start,
         follow=follow_mahony,
@@ -285,7 +288,7 @@ MAHONY = of_nine_axes(
 )
 VQF = with_magnetometer(
     batch(
-        "VQF of Laidig and Seel, by the package vqf",
+        "VQF by Laidig and Seel, from the package vqf",
         parameters=VqfParameters,
         streams={"inertial": schemas.INERTIAL_SAMPLE},
         static={},

@@ -131,7 +131,7 @@ def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel,
 
 BINGHAM_INERTIAL = of_nine_axes(
     of_inertial_samples(
-        "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
+        "recursive Bingham filter for gyro increments and averaged TRIAD attitudes",
         InertialParameters,
         _start_bingham,
         follow_all=_follow_all,
@@ -139,7 +139,7 @@ BINGHAM_INERTIAL = of_nine_axes(
 )
 GYRO = of_nine_axes(
     of_inertial_samples(
-        "the gyro alone, from the attitude of the rest at the start on",
+        "dead reckoning with the gyro only, from the attitude of the initial rest",
         GyroParameters,
         _start_gyro,
         follow_all=_follow_all,
@@ -147,7 +147,7 @@ GYRO = of_nine_axes(
 )
 TRIAD = with_magnetometer(
     of_inertial_samples(
-        "the TRIAD attitude of every sample's accelerometer and magnetometer",
+        "TRIAD attitude from the accelerometer and magnetometer of every sample",
         InertialParameters,
         _start_triad,
         follow_all=_follow_all,

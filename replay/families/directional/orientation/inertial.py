@@ -187,11 +187,13 @@ def prepared(
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
         raise BadInput(
-            "inertial samples: give for each a time, and turn rate, specific force and magnetic field "
-            "of 3 numbers"
+            "every inertial sample needs a time, and 3 numbers each for turn rate, specific force and "
+            "magnetic field"
         )
     if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
-        raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
+        raise BadInput(
+            "block_s, gap_s and the standard deviations of an inertial filter must be positive"
+        )
     if estimates is None:
         estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
     return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates

@@ -33,8 +33,8 @@ from fuselog.replay.engine.streams.blocks import (
 
 FIELD = "magnetic_field_ut"
 REFUSAL = (
-    "has no magnetic field, by which the heading is found, and no topic magnetic_field has it; import "
-    "it, as fields.magnetic_field_ut = [...] in the mapping"
+    "has no magnetic field, which the heading needs, and there is no topic magnetic_field; import "
+    "the field with fields.magnetic_field_ut = [...] in the mapping"
 )
 
 

@@ -119,9 +119,9 @@ def _find(
         rests_s.append(1e-9 * float(np.ptp(stamps_ns)) if len(stamps_ns) else 0.0)
         if len(own) and rests_s[-1] < LEAST_S:
             raise BadInput(
-                f"topic {topic}: the unit moves within {LEAST_S:g} s of its first sample, and the "
-                "gyro's bias is its mean over a rest; cut the log so that it begins at rest, or state "
-                "with --set rest_s=SECONDS how long the unit rests"
+                f"topic {topic}: the unit moves within {LEAST_S:g} s of its first sample, but the bias "
+                "of the gyro is estimated at rest; cut the log so that it begins at rest, or give the "
+                "duration of the rest with --set rest_s=SECONDS"
             )
     firsts_ns = np.array([_first_ns(samples.of_run(run)) for run in range(samples.runs)], np.int64)
     for rest_s in dict.fromkeys(round(each, 2) for each in rests_s if each):
