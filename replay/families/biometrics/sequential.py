@@ -98,7 +98,7 @@ def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, mos
 
 
 def page_sums(ratios: Floats) -> Floats:
-    """Compute Page's cumulative sums (..., n) of ratios (..., n), which restart when they are negative."""
+    """Compute Page's cumulative sums (..., n) of ratios (..., n), reset to zero when negative."""
     total = np.cumsum(ratios, axis=-1)
     return total - np.minimum(np.minimum.accumulate(total, axis=-1), 0.0)
 

@@ -65,7 +65,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """Compute the smallest total errors; the topology measures one combination, a free pose all but 3."""
+    """Compute the smallest total errors; the topology measures 1 combination, a free pose all but 3."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

@@ -207,7 +207,7 @@ def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generat
 
 
 def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) -> Floats:
-    """Compute the log likelihood (particles,) of all unordered fixes by one permanent, or one per axis."""
+    """Compute the log likelihood (particles,) of unordered fixes by a permanent, or one per axis."""
     places = positions(setup.motion, mean)
     squared = (seen - places[:, :, None]) ** 2 / setup.network.variance_m2
     if method.kind == "set":

@@ -215,7 +215,7 @@ def _poses(scene: Scene) -> list[Floats]:
 
 
 def _placed(scene: Scene, points: Points) -> Points:
-    """Transform points from the sensor's frame to the map by its true pose; drop them if it is unknown."""
+    """Transform points from the sensor's frame to the map; drop them if its true pose is unknown."""
     poses = _poses(scene)
     if not poses:
         return Points(points.time_ns[:0], points.places[:0])
