@@ -1,8 +1,9 @@
-"""Fuses biometric scores: rules, classifiers and mixture models, as batch estimators.
+"""Batch estimators that fuse biometric scores: rules, classifiers and mixture models.
 
 Zheng & Blasch, "An exploration of the impacts of three factors in multimodal biometric score fusion",
-JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case each, into the stream
-`/estimates/NAME/CASE/fused`, and learns from other users than those that it judges.
+JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), one case per subset, into the
+stream `/estimates/NAME/CASE/fused`. An estimator that learns never scores users that it has learned
+from.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -50,22 +51,22 @@ LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
 
 
 class Subsets(Parameters):
-    """States what is fused.
+    """The subsets of matchers to fuse.
 
     Attributes:
-        subsets: names of the subsets of matchers to fuse; without any, all there are.
+        subsets: names of the subsets of matchers to fuse; all subsets if empty.
     """
 
     subsets: list[str] = []
 
 
 class RuleParameters(Subsets):
-    """States how scores are normalised and fused.
+    """How scores are normalized and fused.
 
     Attributes:
-        normalisation: how scores are normalised, over all comparisons or, column-min-max, per gallery
+        normalisation: normalization of scores, over all comparisons or, with column-min-max, per gallery
             entry.
-        rule: what of the normalised scores is taken.
+        rule: function of the normalized scores that gives the fused score.
     """
 
     normalisation: Literal["none", "z", "min-max", "tanh", "column-min-max"] = "column-min-max"
@@ -73,15 +74,15 @@ class RuleParameters(Subsets):
 
 
 class LearnerParameters(Subsets):
-    """States what a fusion learns from, and what it judges.
+    """What a fusion learns from, and what it scores.
 
     Attributes:
         seed: seed of folds and impostors.
-        folds: number of parts of the users for cross validation.
+        folds: number of folds of users for cross-validation.
         pairs: the paper's trimmed database (all genuine, two random impostors per user), or all pairs.
-        failures: whether failures to enrol count as scored, as in the paper, or as missing.
-        logarithmic: modalities whose scores go through log(1 + score) first.
-        impostor_limit: impostor pairs that a fusion learns from at most.
+        failures: whether failures to enrol keep their scores, as in the paper, or are missing.
+        logarithmic: modalities whose scores are replaced by log(1 + score).
+        impostor_limit: largest number of impostor pairs that a fusion learns from.
     """
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -93,12 +94,12 @@ class LearnerParameters(Subsets):
 
 
 class ClassifierParameters(LearnerParameters):
-    """Chooses a classifier of scikit-learn.
+    """The classifier of scikit-learn, and what it learns from.
 
     Attributes:
-        classifier: which one.
+        classifier: name of the classifier.
         neighbours: number of neighbours of knn.
-        calibrated: whether a logistic curve is put over its output.
+        calibrated: whether the output is calibrated by a logistic curve.
     """
 
     classifier: Literal["qda", "lda", "knn", "svm", "logistic"] = "qda"
@@ -107,16 +108,16 @@ class ClassifierParameters(LearnerParameters):
 
 
 class MixtureParameters(LearnerParameters):
-    """Chooses HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
+    """The model HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
     Attributes:
-        topology: how states follow one another; joint is one state, with all scores as its vector.
+        topology: transitions between states; joint is a single state whose vector has all scores.
         genuine_components: Gaussians per state of genuine pairs.
         impostor_components: Gaussians per state of impostor pairs.
-        components_of: Gaussians per state of both, by the name of a subset.
-        covariance_floor: what is added to the diagonal of every covariance, in z units squared.
-        iterations: steps of expectation maximisation at most.
-        tolerance: expectation maximisation ends where a step gains less log-likelihood.
+        components_of: Gaussians per state of both kinds of pairs, by the name of a subset.
+        covariance_floor: value added to the diagonal of every covariance, in squared z units.
+        iterations: largest number of steps of expectation maximization.
+        tolerance: gain in log-likelihood below which expectation maximization ends.
     """
 
     topology: Literal["left-right", "ergodic", "joint"] = "left-right"
@@ -134,17 +135,18 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """Return a classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
+    """Fit a classifier whose score is above zero for genuine pairs; a missing score counts as the mean.
 
-    QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
+    QDA, LDA, logistic regression and all calibrated classifiers give a log-likelihood ratio for equal
+    priors.
 
     Args:
-        parameters: which classifier.
-        vectors: the training scores (rows, matchers), in z units, NaN where missing.
-        genuine: (rows,) which of them are of the same user.
-        rng: for the classifiers that draw.
+        parameters: the classifier and its settings.
+        vectors: the training scores (rows, matchers), in z units, NaN if missing.
+        genuine: (rows,), which of them compare the same user.
+        rng: random numbers for classifiers that need them.
 
-    Raises BadInput where it cannot be fitted to these.
+    Raises BadInput if the classifier cannot be fitted to these scores.
     """
     with extra("papers", f"classifier {parameters.classifier}"):
         from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
@@ -171,7 +173,7 @@ def learn_classifier(
 
 
 def _log_odds(probabilities: Floats) -> Floats:
-    """Return those of the second class, from the probabilities (n, 2) of both; finite."""
+    """Compute the finite log odds of the second class from the probabilities (n, 2) of both classes."""
     logarithms = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
     return logarithms[:, 1] - logarithms[:, 0]
 
@@ -202,15 +204,15 @@ def learn_mixture(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """Learn the log-likelihood ratio of two HMMs, eq. 5 with eta 0.
+    """Fit the log-likelihood ratio of two HMMs, eq. 5 with eta 0.
 
     Args:
         parameters: how the models are fitted.
         components: Gaussians per state of the genuine and of the impostor model.
-        sequence: (n, m), what a vector of n * m scores is cut into.
+        sequence: (n, m), the shape of the sequence that a vector of n * m scores contains.
         vectors: the training scores, (rows, n * m).
-        genuine: (rows,) which of them are of the same user.
-        rng: for the k-means.
+        genuine: (rows,), which of them compare the same user.
+        rng: random numbers for k-means.
     """
     models = []
     for of_class, count in zip((genuine, ~genuine), components, strict=True):
@@ -258,7 +260,7 @@ def _by_mixture(
 def _sequence(
     matchers: tuple[Matcher, ...], chosen: list[int], parameters: MixtureParameters
 ) -> tuple[int, int]:
-    """Return (n, m) of a subset; raises BadInput where modalities have different numbers of matchers."""
+    """Return (n, m) of a subset; raise BadInput if modalities have different numbers of matchers."""
     modalities = [matchers[index].modality for index in chosen]
     counts = {modalities.count(each) for each in modalities}
     if parameters.topology == "joint":
@@ -278,7 +280,7 @@ def _learnt(
     learner: Learner,
     is_ratio: bool,
 ) -> Stream:
-    """Return the cross-validated fusion of the chosen matchers."""
+    """Fuse the chosen matchers with cross-validation."""
     users = len(compared.scores)
     rng = np.random.default_rng(parameters.seed)
     fold = user_folds(users, parameters.folds, rng)
@@ -288,7 +290,7 @@ def _learnt(
     vectors = scores[pairs.probe, pairs.gallery]
     with extra("papers", "a learnt fusion"):
         import sklearn.cluster  # noqa: F401  # only libraries that are loaded are limited below
-    # the problems are small: on a busy machine, threads of the libraries only wait for one another
+    # the problems are small: on a busy machine, the libraries' threads would only wait for each other
     with threadpool_limits(1):
         fused = cross_validate(vectors, pairs, learner, parameters.impostor_limit, rng)
     metadata = {"fold_of_user": ",".join(map(str, fold)), "threshold": "0"}
@@ -298,7 +300,7 @@ def _learnt(
 
 
 def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
-    """Return scores (users, users, matchers) in global z units, some modalities as logarithms."""
+    """Return scores (users, users, matchers) in global z units, with some modalities as logarithms."""
     scores = compared.scores
     if parameters.failures == "missing":
         scores = np.where(compared.failed, np.nan, scores)
@@ -318,13 +320,13 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
 def fused_stream(
     compared: Comparisons, pairs: Pairs, fused: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Make score vectors of one of fused scores, in arrival order; topic and name come later.
+    """Make a stream of fused scores as score vectors with one component, in arrival order.
 
     Args:
-        compared: the comparisons, for the probes' arrivals.
+        compared: the comparisons, for the arrival times of the probes.
         pairs: the n pairs that were fused.
         fused: (n,), their scores.
-        metadata: what the channel states beside its component.
+        metadata: metadata of the channel in addition to its component.
     """
     order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
     return make_stream(
@@ -339,7 +341,7 @@ def fused_stream(
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: Subsets) -> Iterator[Binding]:
-    """Find the scores, and which matchers are fused, by case; none where there is nothing to fuse."""
+    """Find the scores and the matchers to fuse, by case; yield nothing if there is nothing to fuse."""
     if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
         return
     subsets = subsets_of(matchers_of(topics[TOPIC].metadata))
@@ -352,7 +354,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: Subsets) -> Iterat
 
 
 def _solve(fuse: Callable[..., Stream], given: Given[Any]) -> list[Ragged]:
-    """Fuse all chosen subsets."""
+    """Fuse all chosen subsets of matchers."""
     compared = [comparisons_of(given[TOPIC].of_run(run)) for run in range(given.runs)]
     users = {len(each.scores) for each in compared}
     if len(users) > 1:

@@ -1,8 +1,9 @@
-"""Fits hidden Markov models with Gaussian mixtures by Baum-Welch to many short sequences.
+"""Hidden Markov models with Gaussian mixtures, fitted to many short sequences by Baum-Welch.
 
-Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) takes a sequence of n vectors of m scores; every state has
-a mixture of g Gaussians. With one state it is a mixture; left to right it is a product of mixtures, one
-per vector. Recursions: Rabiner, Proc. IEEE 1989; all sequences at once, probabilities as logarithms.
+Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) takes a sequence of n vectors of m scores; every state has a
+mixture of g Gaussians. A model with one state is a mixture; a left-to-right model is a product of
+mixtures, one per vector. The recursions are those of Rabiner, Proc. IEEE 1989, for all sequences in
+parallel and with probabilities as logarithms.
 """
 
 from typing import NamedTuple
@@ -13,11 +14,11 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.extras import extra
 from fuselog.replay.engine.arrays import Floats
 
-UNEVEN = 1e-9  # far more than rounding, and far less than scores say
+UNEVEN = 1e-9  # far above rounding and far below differences of scores
 
 
 class MixtureHmm(NamedTuple):
-    """Holds a model of s states with g components of m dimensions.
+    """A model with s states of g components in m dimensions.
 
     `initial` (s,), `transition` (s, s), `weights` (s, g), `means` (s, g, m), `covariances`
     (s, g, m, m).
@@ -31,7 +32,7 @@ class MixtureHmm(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Describes how a model is fitted: every covariance gets `floor` on its diagonal."""
+    """Settings of a fit; `floor` is added to the diagonal of every covariance."""
 
     components: int
     left_right: bool
@@ -41,16 +42,16 @@ class Fit(NamedTuple):
 
 
 def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
-    """Fit to sequences (count, n, m); those with a missing score (NaN) are left out.
+    """Fit a model to sequences (count, n, m), without those that have a missing score (NaN).
 
-    The means start at the k-means of the vector that has the state's number.
+    The means start from k-means of the vectors at the state's position in the sequence.
 
-    Raises BadInput where there are fewer sequences than components.
+    Raises BadInput if there are not more sequences than components.
 
     Args:
-        sequences: (count, n, m), NaN where a score is missing.
+        sequences: (count, n, m), NaN if a score is missing.
         how: the model's sizes, and how it is fitted.
-        rng: of the k-means.
+        rng: random numbers for k-means.
     """
     whole = sequences[~np.isnan(sequences).any(axis=(1, 2))]
     if len(whole) <= how.components:
@@ -69,14 +70,14 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
-    """Compute the log-likelihood (count,) of sequences; missing (NaN) scores integrate out.
+    """Compute the log-likelihood (count,) of sequences, integrated over missing (NaN) scores.
 
     Args:
         model: the fitted model.
-        sequences: (count, n, m), NaN where a score is missing.
+        sequences: (count, n, m), NaN if a score is missing.
 
     Returns:
-        (count,).
+        The log-likelihoods (count,).
     """
     count, length, size = sequences.shape
     vectors = sequences.reshape(-1, size)
@@ -95,7 +96,7 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
 
 
 def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
-    """Make states in the order of the vectors: k-means of each, one step at a time, or any after any."""
+    """Initialize a model by k-means of each state's vectors, with left-right or equal transitions."""
     with extra("papers", "a mixture of scores"):
         from sklearn.cluster import KMeans  # which takes long to import
 
@@ -115,17 +116,17 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def _uneven(vectors: Floats) -> Floats:
-    """Return vectors (count, m) on scales that are bent a little, each otherwise.
+    """Return vectors (count, m) with slightly distorted scales, different in each dimension.
 
-    Scores that are whole numbers are often as far from one mean as from another; here the lower one is
-    the nearer, where rounding would decide.
+    Whole-number scores are often equally far from two means. The distortion makes the lower mean the
+    nearer one, where otherwise rounding would decide.
     """
     bend = UNEVEN * np.arange(1, vectors.shape[1] + 1)
     return vectors + bend * (vectors - vectors.min(axis=0)) ** 2
 
 
 def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[MixtureHmm, float]:
-    """Do one step of Baum-Welch; returns the mean log-likelihood of the model before it."""
+    """Take one step of Baum-Welch; also return the mean log-likelihood of the model before the step."""
     count, length, size = sequences.shape
     emission = _log_components(model, sequences.reshape(-1, size)).reshape(
         count, length, *model.weights.shape
@@ -140,7 +141,7 @@ def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[Mixtur
         pairs = forward[:, time, :, None] + _log(model.transition) + arriving
         moved += np.exp(pairs - likelihood[:, None, None]).sum(axis=0)
     left = moved.sum(axis=1, keepdims=True)
-    # A state that is never left keeps its row, whatever that is.
+    # A state that is never left keeps its transition probabilities.
     transition = np.where(left > 0, moved / np.where(left > 0, left, 1.0), model.transition)
     responsibility = occupied[..., None] * np.exp(emission - states[..., None])
     by_state = responsibility.transpose(2, 0, 1, 3).reshape(len(left), count * length, -1)
@@ -150,7 +151,7 @@ def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[Mixtur
 
 
 def _mixtures(model: MixtureHmm, vectors: Floats, responsibility: Floats, floor: float) -> MixtureHmm:
-    """Fit the model's mixtures to vectors (s, count, m) of responsibilities (s, count, g)."""
+    """Fit the model's mixtures to vectors (s, count, m) with responsibilities (s, count, g)."""
     mass = responsibility.sum(axis=1) + np.finfo(float).tiny
     share = responsibility.swapaxes(1, 2)
     means = share @ vectors / mass[..., None]
@@ -163,7 +164,7 @@ def _mixtures(model: MixtureHmm, vectors: Floats, responsibility: Floats, floor:
 
 
 def _log_components(model: MixtureHmm, vectors: Floats) -> Floats:
-    """Return log of weight times density (count, s, g) of vectors (count, m); m may be zero."""
+    """Compute the log of weight times density (count, s, g) of vectors (count, m); m may be zero."""
     size = vectors.shape[-1]
     whiten = np.linalg.inv(np.linalg.cholesky(model.covariances))
     shape = (len(vectors), *model.weights.shape, size)
@@ -186,7 +187,7 @@ def _forward(model: MixtureHmm, states: Floats) -> Floats:
 
 
 def _backward(model: MixtureHmm, states: Floats) -> Floats:
-    """Compute the log of the probability (count, n, s) of the vectors to come, given the state."""
+    """Compute the log of the probability (count, n, s) of the later vectors, given the state."""
     backward = np.zeros_like(states)
     transition = _log(model.transition)
     for time in range(states.shape[1] - 2, -1, -1):
@@ -196,13 +197,13 @@ def _backward(model: MixtureHmm, states: Floats) -> Floats:
 
 
 def _log(probability: Floats) -> Floats:
-    """Return the logarithm, minus infinity for what cannot be."""
+    """Compute the logarithm; minus infinity for zero."""
     with np.errstate(divide="ignore"):
         return np.log(probability)
 
 
 def _log_sum(values: Floats, axis: int) -> Floats:
-    """Compute the log of the sum of exponentials; SciPy's takes several times as long."""
+    """Compute the log of the sum of exponentials, several times faster than SciPy."""
     top = np.max(values, axis=axis, keepdims=True)
     top[np.isneginf(top)] = 0.0
     return _log(np.exp(values - top).sum(axis=axis)) + np.squeeze(top, axis)

@@ -1,4 +1,4 @@
-"""Makes pairs of probes and gallery entries: normalised scores, rules, and folds of users."""
+"""Pairs of probes and gallery entries: normalized scores, fusion rules, and folds of users."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,9 +20,9 @@ IMPOSTORS_PER_USER = 2
 
 
 class Pairs(NamedTuple):
-    """States which comparisons are fused: probe and gallery user (n,) of each, and their fold (users,).
+    """The comparisons to fuse: probe and gallery user (n,) of each, and the folds (users,) of users.
 
-    Without folds (None) nothing is learnt.
+    If the fold is None, nothing is learned.
     """
 
     probe: Integers
@@ -31,13 +31,14 @@ class Pairs(NamedTuple):
 
 
 def normalise(scores: Floats, how: str) -> Floats:
-    """Bring scores to a common scale; missing ones (NaN) stay missing.
+    """Convert scores to a common scale; missing scores (NaN) stay missing.
 
-    `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
-    column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
+    `tanh` is that of Jain, Nandakumar & Ross 2005, with mean and standard deviation instead of Hampel's
+    estimates. A gallery column with equal scores becomes 0. Raises BadInput if a standard deviation is
+    zero or not finite.
 
     Args:
-        scores: (users, users, matchers), NaN where missing.
+        scores: (users, users, matchers), NaN if missing.
         how: the name of the normalisation.
     """
     match how:
@@ -53,7 +54,7 @@ def normalise(scores: Floats, how: str) -> Floats:
 
 
 def _deviations(scores: Floats) -> Floats:
-    """Compute the standard deviation (matchers,) of each matcher's scores, missing ones left out."""
+    """Compute the standard deviation (matchers,) of each matcher's scores, ignoring missing scores."""
     with np.errstate(over="ignore", invalid="ignore"):
         deviations = np.nanstd(scores, axis=(0, 1), ddof=1)
     unusable = ~(np.isfinite(deviations) & (deviations > 0))
@@ -76,14 +77,15 @@ RULES: dict[str, Callable[..., Floats]] = {
 
 
 def all_pairs(users: int) -> Pairs:
-    """Return every probe with every gallery entry."""
+    """Pair every probe with every gallery entry."""
     return Pairs(np.repeat(np.arange(users), users), np.tile(np.arange(users), users))
 
 
 def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
-    """Draw the paper's trimmed database: genuine comparisons, two random other probes per gallery user.
+    """Draw the paper's trimmed database: genuine pairs, and two random other probes per gallery user.
 
-    The probe is the same for all matchers: one for each would inflate the results.
+    The probes are the same for all matchers; different probes for each matcher would inflate the
+    results.
     """
     gallery = np.repeat(np.arange(users), IMPOSTORS_PER_USER)
     step = np.argsort(rng.random((users, users - 1)), axis=1)[:, :IMPOSTORS_PER_USER] + 1
@@ -94,7 +96,7 @@ def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
 
 
 def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
-    """Return the fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
+    """Assign users to folds (users,); raise BadInput if a fold would have fewer than two users."""
     if users < 2 * folds:
         fewer = f", or at most {users // 2} folds" if users >= 4 else ""
         raise BadInput(
@@ -106,16 +108,14 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
 def cross_validate(
     vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
 ) -> Floats:
-    """Fuse scores (n,), each learnt without the users of its gallery user's fold.
-
-    `limit` bounds how many impostor vectors are learnt from.
+    """Fuse scores (n,), with each fusion learned without the users of the gallery user's fold.
 
     Args:
         vectors: (n, m), a score of each matcher.
         pairs: the users of each vector, and the folds of users.
-        learner: makes a fusion of the vectors that it learns from.
-        limit: how many impostor vectors are learnt from at most.
-        rng: draws these.
+        learner: fits a fusion to training vectors.
+        limit: largest number of impostor vectors to learn from.
+        rng: random numbers to draw these vectors with.
     """
     fused = np.empty(len(vectors))
     genuine = pairs.probe == pairs.gallery
@@ -130,10 +130,10 @@ def cross_validate(
 
 
 def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
-    """List the three factors' subsets: each modality, the k-th matcher of each modality, all, singles.
+    """List subsets of matchers: each modality, the k-th matcher of each modality, all, and single ones.
 
-    A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
-    the larger ones.
+    A subset of a single matcher has that matcher's name. The larger subsets are those of the paper (M1,
+    M2, R1, R2, all).
     """
     by_modality: dict[str, list[int]] = {}
     for index, matcher in enumerate(matchers):

@@ -1,8 +1,8 @@
-"""Tests log-likelihood ratios in sequence: Wald's of two hypotheses, Page's of a change.
+"""Sequential tests of log-likelihood ratios: Wald's test of two hypotheses, Page's test for a change.
 
 Wald, "Sequential Tests of Statistical Hypotheses", Annals of Mathematical Statistics 16(2), 1945; Page,
-"Continuous Inspection Schemes", Biometrika 41, 1954. What they promise holds for ratios that are
-calibrated and independent.
+"Continuous Inspection Schemes", Biometrika 41, 1954. Their guarantees hold if the ratios are calibrated
+and independent.
 """
 
 from collections.abc import Callable
@@ -19,16 +19,16 @@ Booleans = NDArray[np.bool_]
 
 
 class Rates(NamedTuple):
-    """States a test's rates of error: of accepting an impostor, and of rejecting the person."""
+    """Error rates of a test: accepting an impostor, and rejecting the genuine person."""
 
     false_accept: float
     false_reject: float
 
 
 class Decisions(NamedTuple):
-    """Holds what became of sequences (n,): whether they were accepted, and after how many probes.
+    """Decisions on sequences (n,): whether they were accepted, and after how many probes.
 
-    Those that came to no decision have 0 probes and are not accepted.
+    A sequence without a decision has 0 probes and is not accepted.
     """
 
     accepted: Booleans
@@ -41,9 +41,9 @@ class Decisions(NamedTuple):
 
 
 def thresholds(rates: Rates) -> tuple[float, float]:
-    """Return the sums of log-likelihood ratios below which one rejects, and above which one accepts.
+    """Return the sums of log-likelihood ratios at which a test rejects and accepts.
 
-    Raises BadInput where a rate is not above zero, or their sum not below one.
+    Raises BadInput if a rate is not above zero, or if their sum is not below one.
     """
     accept, reject = rates
     if not (accept > 0.0 and reject > 0.0 and accept + reject < 1.0):
@@ -54,15 +54,16 @@ def thresholds(rates: Rates) -> tuple[float, float]:
 
 
 def wald_bounds(rates: Rates) -> Rates:
-    """Compute what error rates cannot exceed by the thresholds: Wald's inequalities (3.18), (3.19)."""
+    """Compute the bounds on error rates for these thresholds: Wald's inequalities (3.18), (3.19)."""
     accept, reject = rates
     return Rates(accept / (1.0 - reject), reject / (1.0 - accept))
 
 
 def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
-    """Compute the mean number of probes by Wald (4.8), as if the sum ended on a threshold exactly.
+    """Compute the mean number of probes by Wald (4.8), as if the sum ended exactly on a threshold.
 
-    `mean_ratio` is the mean log-likelihood ratio of a probe, of the person (`genuine`) or of impostors.
+    `mean_ratio` is the mean log-likelihood ratio of a probe, either of the person (`genuine`) or of
+    impostors.
     """
     low, high = thresholds(rates)
     accepted = 1.0 - rates.false_reject if genuine else rates.false_accept
@@ -70,18 +71,18 @@ def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
 
 
 def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, most: int) -> Decisions:
-    """Test `count` sequences of at most so many probes by Wald's test.
-
-    `ratio_of(sequences)` gives the next probe's log-likelihood ratio of each of these sequences.
+    """Decide on `count` sequences of at most `most` probes with Wald's test.
 
     Args:
-        ratio_of: sequences (k,) -> the next probe's log-likelihood ratio (k,) of each.
-        count: how many sequences there are.
-        rates: the stated rates of error.
-        most: a sequence ends undecided after so many probes.
+        ratio_of: function of sequences (k,) that returns the log-likelihood ratio (k,) of the next probe
+            of each.
+        count: number of sequences.
+        rates: the specified error rates.
+        most: number of probes after which a sequence ends undecided.
 
     Returns:
-        (count,), which were accepted, and after how many probes each was decided; 0 for never.
+        Which sequences (count,) were accepted, and after how many probes each was decided; 0 for
+        undecided sequences.
     """
     low, high = thresholds(rates)
     total, probes = np.zeros(count), np.zeros(count, np.int64)
@@ -97,25 +98,25 @@ def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, mos
 
 
 def page_sums(ratios: Floats) -> Floats:
-    """Compute Page's cumulative sums (..., n) of ratios (..., n) of a change: anew where below zero."""
+    """Compute Page's cumulative sums (..., n) of ratios (..., n), reset to zero when negative."""
     total = np.cumsum(ratios, axis=-1)
     return total - np.minimum(np.minimum.accumulate(total, axis=-1), 0.0)
 
 
 def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
-    """Count probes (...,) until one of the sums (..., n) is over its threshold; 0 for never.
+    """Count the probes (...,) until one of the sums (..., n) exceeds its threshold; 0 if none does.
 
-    The threshold is log(together * run_length), where each probe adds to so many sums: by the
-    martingale of Shiryaev and Roberts the mean number of probes until a false alarm is then no less than
+    The threshold is log(together * run_length), where each probe adds to `together` sums. By the
+    martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is then at least
     `run_length` (Pollak, Annals of Statistics 13(1), 1985).
 
     Args:
-        sums: (..., n), as of `page_sums`.
-        run_length: stated mean number of probes until a false alarm.
-        together: to how many sums each probe adds.
+        sums: (..., n), from `page_sums`.
+        run_length: specified mean number of probes until a false alarm.
+        together: number of sums to which each probe adds.
 
     Returns:
-        (...,), from 1 on.
+        Numbers of probes (...,), counted from 1.
     """
     over = sums >= np.log(together * run_length)
     return np.where(over.any(axis=-1), np.argmax(over, axis=-1) + 1, 0)

@@ -1,4 +1,4 @@
-"""Draws score fusion: how scores are spread, rates of both errors, probes as they come."""
+"""Timeline of score fusion: distributions of scores, error rates, and probes over time."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -30,14 +30,14 @@ from fuselog.replay.timeline.drawing.plots import LINE, POINTS, below_legend, pl
 GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
 BINS = 60
 UPDATES = 50
-# How many of the genuine scores are below the histogram's upper end.
+# Share of the genuine scores that are below the histogram's upper end.
 SHOWN_SHARE = 0.95
 # What is plotted of a probe's comparisons.
 OF_PROBE = "genuine and greatest impostor of each probe"
 
 
 class Fusion(NamedTuple):
-    """Holds what an estimator fused; `note` tells where a threshold is from that it does not state."""
+    """Scores fused by an estimator; `note` explains the threshold if the estimator states none."""
 
     estimator: str
     fused: Fused
@@ -47,12 +47,12 @@ class Fusion(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw a board for every subset of matchers that was fused; without estimates, all scores."""
+    """Draw a board for every fused subset of matchers; without estimates, draw all scores."""
     return draw_cases(scene, partial(_draw_case, canvas, scene))
 
 
 def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
-    """Draw how fused scores are spread and what errors they make; in a tab, the scores of each probe."""
+    """Draw distributions and errors of fused scores and, in a tab, the scores of each probe."""
     fusions = list(_fusions(scene, case))
     probes = [_draw_fused_probes(canvas, case, fusion) for fusion in fusions]
     rows = [rrb.Horizontal(*views) for views in (probes, _draw_matchers(canvas, scene, case)) if views]
@@ -69,9 +69,9 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
 
 
 def _fusions(scene: Scene, case: str) -> Iterator[Fusion]:
-    """Yield a case's fusions.
+    """Yield the fusions of a case.
 
-    One without a threshold decides half-way between the medians of genuine and impostor scores.
+    If a fusion has no threshold, it is half-way between the medians of genuine and impostor scores.
     """
     for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
         fused = fused_of(stream)
@@ -87,7 +87,7 @@ def _quantity_of(fusion: Fusion) -> str:
 
 
 def _draw_fused_probes(canvas: Canvas, case: str, fusion: Fusion) -> rrb.View:
-    """Draw genuine and greatest impostor score of each probe."""
+    """Draw the genuine score and the greatest impostor score of each probe."""
     plot = entity_path("fusion", case, fusion.estimator, "scores")
     _draw_probes(canvas, plot, fusion.fused, fusion.time_ns)
     ends = fusion.time_ns[[0, -1]]
@@ -97,7 +97,7 @@ def _draw_fused_probes(canvas: Canvas, case: str, fusion: Fusion) -> rrb.View:
 
 
 def _draw_rates(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusion]) -> rrb.View:
-    """Draw both rates of errors at every threshold, a curve for each fusion of a case."""
+    """Draw both error rates at every threshold, one curve for each fusion of a case."""
     curves, strokes = {}, {}
     for estimator, fused, *_ in fusions:
         found = roc(fused.score, fused.genuine)
@@ -108,11 +108,11 @@ def _draw_rates(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusio
 
 
 def _draw_errors(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusion]) -> rrb.View:
-    """Plot the share of wrong decisions so far of every fusion of a case."""
+    """Plot the share of wrong decisions so far for every fusion of a case."""
     plot = entity_path("errors", case)
     for estimator, fused, time_ns, threshold, _ in fusions:
         wrong = _errors_so_far(fused, threshold)
-        # a probe's comparisons share a stamp: the last one holds
+        # a probe's comparisons have the same stamp: use the last of them
         last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
         canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
         canvas.fix(f"{plot}/{estimator}", LINE(names=[estimator], colors=[scene.colour(estimator)]))
@@ -131,13 +131,13 @@ def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> Non
 
 
 def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
-    """Return the row of the greatest score of each distinct time."""
+    """Return the row of the greatest score at each distinct time."""
     order = np.lexsort((score, time_ns))
     return order[np.append(time_ns[order][1:] != time_ns[order][:-1], True)]
 
 
 def _errors_so_far(fused: Fused, threshold: float) -> Floats:
-    """Compute per cent of comparisons so far that were decided wrongly: mean of both classes' rates."""
+    """Compute the percentage of wrong decisions so far, as the mean of both classes' error rates."""
     wrong = (fused.score > threshold) != fused.genuine
     rates = []
     for chosen in (fused.genuine, ~fused.genuine):
@@ -147,9 +147,9 @@ def _errors_so_far(fused: Fused, threshold: float) -> Floats:
 
 
 def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChartView:
-    """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars.
+    """Draw two histograms of scores so far, each with sum 1; end bars include scores outside the range.
 
-    Their bars stand side by side within each bin. A bar as high as all marks the threshold.
+    The two bars of a bin are side by side. A bar of the largest height marks the threshold.
     """
     estimator, fused, time_ns, threshold, note = fusion
     entity = entity_path("fusion", case, estimator, "distribution")
@@ -177,7 +177,7 @@ def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChar
             )
             canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
         largest = max(largest, float(shares[-1].max()))
-    # a single bar is none to Rerun
+    # Rerun does not draw a single bar
     heights, places = np.array([0.0, largest]), np.array([low, threshold])
     mark = rr.BarChart(heights, abscissa=places, color=WRONG, widths=[0.2 * width] * 2)
     canvas.fix(f"{entity}/threshold", mark)

@@ -1,8 +1,8 @@
-"""Measures how well scores verify and identify users: rates, ROC, equal error rate, Cllr.
+"""Measures of verification and identification by scores: rates, ROC, equal error rate, Cllr.
 
 Verification rate and relative rate increase: Zheng & Blasch, JAIF 2014, eq. 3. Cllr: Brummer & du Preez,
-Computer Speech & Language 2006. Scores are alike where they are great; a comparison is accepted where
-its score is not below the threshold.
+Computer Speech & Language 2006. A greater score means more similar; a comparison is accepted if its
+score is not below the threshold.
 """
 
 import operator
@@ -20,7 +20,7 @@ FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)  # also called false match rates (FMR), 
 
 
 class Roc(NamedTuple):
-    """Holds rates (n,) at falling thresholds, from nothing accepted to everything."""
+    """Accept rates (n,) at falling thresholds, from nothing accepted to everything accepted."""
 
     threshold: Floats
     false_accept: Floats
@@ -28,10 +28,11 @@ class Roc(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Holds fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
+    """Fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
 
-    `fold` (users,) is that of the cross validation, `threshold` what the fusion decides by; None where
-    it has none. `is_ratio`: the scores are log-likelihood ratios.
+    `fold` (users,) is the fold of each user in the cross-validation, `threshold` the decision threshold
+    of the fusion; both are None if the fusion has none. `is_ratio` is true if the scores are
+    log-likelihood ratios.
     """
 
     score: Floats
@@ -48,12 +49,12 @@ class Fused(NamedTuple):
 
     @property
     def is_complete(self) -> bool:
-        """Tell whether every probe is compared with every gallery entry."""
+        """Test whether every probe is compared with every gallery entry."""
         return len(self.score) == (int(self.gallery.max()) + 1) ** 2
 
 
 def fused_of(stream: Stream) -> Fused:
-    """Read what a fusion's output stream says."""
+    """Read the fused scores of a fusion's output stream."""
     folds = stream.metadata.get("fold_of_user")
     threshold = stream.metadata.get("threshold")
     return Fused(
@@ -67,15 +68,15 @@ def fused_of(stream: Stream) -> Fused:
 
 
 def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None) -> Roc:
-    """Return the rates at every distinct score; `weight` (n,) counts comparisons more than once.
+    """Compute the accept rates at every distinct score.
 
     Args:
-        score: (n,), greater for more alike.
-        genuine: (n,), whether both are of one person.
+        score: (n,), greater if more similar.
+        genuine: (n,), whether probe and gallery entry are of the same person.
         weight: (n,), how often each comparison counts; once by default.
 
     Returns:
-        Rates from nothing accepted to everything.
+        Rates from nothing accepted to everything accepted.
     """
     order = np.argsort(-score, kind="stable")
     falling = score[order]
@@ -87,10 +88,10 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """Return the greatest genuine accept rate whose false accept rate is not above that given.
+    """Return the greatest genuine accept rate whose false accept rate does not exceed the given rate.
 
     Args:
-        curve: of a fusion.
+        curve: rates of a fusion.
         false_accept: rates (...), between 0 and 1.
     """
     last = np.searchsorted(curve.false_accept, false_accept, side="right") - 1
@@ -98,21 +99,21 @@ def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
 
 
 def equal_error_rate(curve: Roc) -> float:
-    """Return the mean of false accepts and false rejects where they are closest: scores may be tied."""
+    """Return the mean of false accept and false reject rates at the threshold where they are closest."""
     reject = 1 - curve.genuine_accept
     closest = int(np.argmin(np.abs(curve.false_accept - reject)))
     return float(curve.false_accept[closest] + reject[closest]) / 2
 
 
 def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
-    """Compute Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing.
+    """Compute Cllr in bits: 0 for perfect log-likelihood ratios, 1 for uninformative ones.
 
     Args:
         ratio: (n,), log-likelihood ratios.
-        genuine: (n,), whether both are of one person.
+        genuine: (n,), whether probe and gallery entry are of the same person.
 
     Returns:
-        Bits, at least 0.
+        Cllr in bits, at least 0.
     """
     same = np.logaddexp(0, -ratio[genuine]).mean()
     other = np.logaddexp(0, ratio[~genuine]).mean()
@@ -120,15 +121,15 @@ def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
 
 
 def identified(scores: Floats) -> int:
-    """Count the columns of scores (probes, gallery) whose greatest, the first of equals, is at home."""
+    """Count the columns of scores (probes, gallery) whose first greatest score is on the diagonal."""
     best = np.argmax(np.where(np.isnan(scores), -np.inf, scores), axis=0)
     return int(np.count_nonzero(best == np.arange(len(best))))
 
 
 def verification_rate(fused: Fused) -> float:
-    """Compute the share of right decisions (genuine is above the threshold), averaged over the folds.
+    """Compute the share of correct decisions (genuine above the threshold), averaged over the folds.
 
-    The threshold is 0, as of a log-likelihood ratio, where the fusion states none.
+    If the fusion has no threshold, it is 0, as for a log-likelihood ratio.
     """
     right = (fused.score > (fused.threshold or 0.0)) == fused.genuine
     if fused.fold is None:
@@ -139,11 +140,11 @@ def verification_rate(fused: Fused) -> float:
 
 
 def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
-    """Compute how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3).
+    """Compute by how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3).
 
     Args:
-        fused_rate: between 0 and 1.
-        rates: of the single matchers, (n,).
+        fused_rate: rate of the fusion, between 0 and 1.
+        rates: rates of the single matchers, (n,).
     """
     mean = float(np.mean(np.asarray(rates, float)))
     increase = fused_rate - mean
@@ -151,10 +152,11 @@ def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, 
 
 
 def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
-    """Compute GAR at the three FARs, and EER, (replicates, 4), of users drawn again with replacement.
+    """Compute GAR at the three FARs, and EER, (replicates, 4), for users resampled with replacement.
 
-    A comparison counts as often as its probe's user was drawn times its gallery's; the user alone for
-    a genuine one. So the dependence of scores of one user is kept (Bolle, Ratha & Pankanti 2004).
+    A comparison counts as often as its probe's user was drawn times its gallery's user; a genuine
+    comparison counts as often as its user was drawn. This preserves the dependence of scores of the same
+    user (Bolle, Ratha & Pankanti 2004).
     """
     users = int(fused.gallery.max()) + 1
     order = np.argsort(-fused.score, kind="stable")
@@ -173,7 +175,7 @@ Runs = dict[int, list[Stream]]
 
 
 def _add(state: Runs, output: Output) -> Runs:
-    """Keep the fused scores of every run; nothing of other outputs."""
+    """Collect the fused scores of every run; ignore other outputs."""
     if output.rows.stream.schema.full_name == schemas.SCORE_VECTOR.full_name and output.leaf == "fused":
         for run in range(output.rows.runs):
             state.setdefault(output.first_run + run, []).append(output.rows.of_run(run))
@@ -181,7 +183,7 @@ def _add(state: Runs, output: Output) -> Runs:
 
 
 def _means(state: Runs) -> dict[str, float]:
-    """Return the rates of a fusion, means over the runs."""
+    """Return the rates of a fusion, averaged over the runs."""
     runs = [_rates(fused_of(concatenate(parts))) for parts in state.values()]
     return {name: float(np.mean([run[name] for run in runs])) for name in runs[0]} if runs else {}
 
@@ -206,7 +208,7 @@ def _rates(fused: Fused) -> dict[str, float]:
     values["eer_percent"] = 100 * equal_error_rate(curve)
     impostors = np.count_nonzero(~fused.genuine)
     for rate, name, of in zip(FALSE_ACCEPT_RATES, named, accepted, strict=True):
-        if impostors * rate >= 1.0:  # fewer do not tell such a rate
+        if impostors * rate >= 1.0:  # fewer impostors cannot resolve such a rate
             values[f"fnmr_at_fmr_{name}"] = 100 - float(of)
     if fused.is_complete and fused.is_ratio:
         values["cllr_bits"] = cost_of_ratio(fused.score, fused.genuine)

@@ -1,8 +1,8 @@
-"""Filters axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
+"""Filters of axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
 
 The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
-Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in
-compiled loops, parallel over runs.
+Kalman filters that the paper compares it with. All of them process an ensemble as ragged rows in
+compiled loops, in parallel over the runs.
 """
 
 import math
@@ -32,14 +32,14 @@ from fuselog.replay.families.directional.distributions.gaussian_kernels import c
 
 
 class Steps(NamedTuple):
-    """Holds the steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
+    """Steps of many runs, concatenated: run r owns the rows offsets[r]:offsets[r + 1].
 
-    A row is a prediction with a known increment u, then an update with a measurement z; a row of NaN
-    in either leaves that half of the step out.
+    A row is a prediction with a known increment u, followed by an update with a measurement z. NaN in
+    one of them skips that half of the step.
 
     Attributes:
         offsets: (runs + 1,).
-        increment: unit vectors u (rows, d), the identity (1, 0, ...) where there is no control input.
+        increment: unit vectors u (rows, d); the identity (1, 0, ...) if there is no control input.
         measurement: unit vectors z (rows, d).
     """
 
@@ -49,19 +49,19 @@ class Steps(NamedTuple):
 
 
 def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
-    """Make steps with every vector at exactly unit length.
+    """Check vectors, normalize them to exactly unit length and return them as steps.
 
     Args:
         offsets: (runs + 1,), where the rows of each run begin.
         increment: known turns (rows, d), unit vectors.
-        measurement: unit vectors (rows, d), NaN for none.
+        measurement: unit vectors (rows, d), NaN if there is no measurement.
 
-    Raises BadInput where a vector is neither unit nor NaN, or the numbers of rows differ.
+    Raises BadInput if a vector is neither a unit vector nor NaN, or if the numbers of rows differ.
     """
     if not len(increment) == len(measurement) == offsets[-1]:
         raise BadInput(
             f"{len(increment)} increments and {len(measurement)} measurements for {offsets[-1]} steps; "
-            "give a row of each for every step, NaN for none"
+            "give one row of each for every step, NaN if there is no value"
         )
     return Steps(offsets, _unit_or_nan(increment, "increment"), _unit_or_nan(measurement, "measurement"))
 
@@ -73,21 +73,21 @@ def _unit_or_nan(x: NDArray, what: str) -> Floats:
 
 
 class BinghamNoise(NamedTuple):
-    """Holds system noise w and measurement noise v, no batch axes, modes at or near the identity."""
+    """System noise w and measurement noise v without batch axes, with modes at or near the identity."""
 
     system: Bingham
     measurement: Bingham
 
 
 class Gaussian(NamedTuple):
-    """Holds Gaussian states: mean (..., d) and covariance (..., d, d)."""
+    """Gaussian states: mean (..., d) and covariance (..., d, d)."""
 
     mean: Floats
     covariance: Floats
 
 
 class GaussianNoise(NamedTuple):
-    """Holds covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
+    """Covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
 
     system: Floats
     measurement: Floats
@@ -104,15 +104,15 @@ def run_bingham_filter(
     """Run the recursive Bingham filter: algorithms 1 and 2.
 
     Args:
-        noise: see there.
+        noise: system and measurement noise.
         state: the distributions before the first row, batch axis (runs,).
-        steps: see there.
-        rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
-            the modes, see `fuselog.replay.engine.vectors.tangent`.
+        steps: increments and measurements of all runs.
+        rotations: (rows, t, t), t = 1 or 3, overwritten if given: the covariances of small rotations
+            about the modes, see `fuselog.replay.engine.vectors.tangent`.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
-        fit does not converge, the run is NaN from there on and the others go on.
+        The state after the last row, and the estimates of all rows, batch axis (rows,). If a moment fit
+        does not converge, the run is NaN from that row on; the other runs continue.
     """
     rows, d = steps.measurement.shape
     identity = np.eye(d)[0]
@@ -155,7 +155,7 @@ def _bingham_run(
         if not math.isnan(steps.measurement[row, 0]):
             update(axes, z, inverse_noise, steps.measurement[row])
         if math.isnan(z[0]):
-            # NaN stays: all later rows of the run are NaN as well
+            # NaN propagates to all later rows of the run
             axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
@@ -173,18 +173,18 @@ def run_kalman_filter(
 ) -> tuple[Gaussian, Gaussian]:
     """Run the paper's modified Kalman filter on R^d (section 7), which mirrors measurements.
 
-    Means are normalised.
+    The filter normalizes the mean after every update.
 
     Args:
-        noise: see there; the paper adds it as it is, wherever the state points.
+        noise: system and measurement noise; the paper adds it unrotated, whatever the state is.
         state: the Gaussians before the first row, batch axis (runs,).
-        steps: see there.
+        steps: increments and measurements of all runs.
         rotations: as for `run_bingham_filter`.
-        rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
+        rotated: rotate the noise into the frame of the state, x (+) (w - e_1), before adding it.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
-        covariance loses its definiteness is NaN from there on.
+        The state after the last row, and the estimates of all rows, batch axis (rows,). If the
+        covariance of a run is no longer positive definite, the run is NaN from that row on.
     """
     rows, d = steps.measurement.shape
     state = Gaussian(state.mean.copy(), state.covariance.copy())
@@ -221,7 +221,7 @@ def _kalman_run(
             along = 0.0
             for i in range(d):
                 along += x[i] * steps.measurement[row, i]
-            # z and -z are one axis: take the one on the side of the state
+            # z and -z are the same axis: use the one closer to the state
             side = math.copysign(1.0, along)
             for i in range(d):
                 innovation[i] = side * steps.measurement[row, i] - x[i]
@@ -239,9 +239,10 @@ def _kalman_run(
 
 
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:
-    """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
+    """Write the covariance (t, t) of small rotations, given the second moment about the identity.
 
-    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
+    The vector part of a unit complex number is the angle; that of a quaternion is half the rotation
+    vector.
     """
     t = len(covariance)
     for i in range(t):
@@ -257,7 +258,7 @@ def _length(x: NDArray) -> float:
 
 
 def _frame(state: NDArray, rotated: bool, frame: NDArray) -> None:
-    """Fill the state scaled to unit length where `rotated`, else the identity."""
+    """Write the state scaled to unit length if `rotated`, the identity otherwise."""
     length = _length(state)
     for i in range(len(state)):
         identity = 1.0 if i == 0 else 0.0

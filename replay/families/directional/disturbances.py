@@ -1,4 +1,4 @@
-"""Finds where a magnetic field is disturbed, by an estimate of orientation and of the place's field."""
+"""Detection of magnetic disturbances from estimates of the orientation and the local magnetic field."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ AVERAGED_NS = 1_000_000_000
 
 
 class Disturbances(NamedTuple):
-    """Holds spans (n,) in which the field differs from the place's: from, to, by how much at most."""
+    """Spans (n,) in which the field differs from the local field: begin, end, and largest difference."""
 
     begin_ns: Integers
     end_ns: Integers
@@ -23,12 +23,12 @@ class Disturbances(NamedTuple):
 
 
 def disturbances(samples: Stream, estimates: Stream, limit_ut: float = 8.0) -> Disturbances:
-    """Find the seconds in which the field's mean deviation is longer than a limit, joined to spans.
+    """Find the seconds in which the field's mean deviation exceeds a limit, and join them to spans.
 
     Args:
-        samples: of an inertial unit with a magnetometer.
-        estimates: that have `COMPONENTS`; samples without an estimate say nothing.
-        limit_ut: as a rule four times the standard deviation of a field that is not disturbed.
+        samples: samples of an inertial unit with a magnetometer.
+        estimates: estimates with the components `COMPONENTS`; samples without an estimate are ignored.
+        limit_ut: usually four times the standard deviation of an undisturbed field.
     """
     row = np.searchsorted(estimates.publish_time_ns, samples.publish_time_ns).clip(0, len(estimates) - 1)
     field = samples["magnetic_field_ut"]

@@ -1,7 +1,7 @@
-"""Offers the filters of axes, orientations and pairs of headings to a replay.
+"""Estimators of axes, orientations and pairs of headings for replay.
 
-The numerics are in `bingham` and `torus`; here they are bound to streams. Noise and prior are what the
-channel states, unless a parameter says otherwise.
+The algorithms are in `bingham` and `torus`; this module binds them to streams. Noise and prior are those
+that the channel states, unless a parameter overrides them.
 """
 
 from collections.abc import Callable, Mapping
@@ -48,12 +48,12 @@ Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """States distributions of prior and noises; one that is none is what the log's channel states.
+    """Distributions of the prior and the noises; by default those that the log's channel states.
 
     Attributes:
         prior: distribution of the orientation at the start.
-        system: distribution of what a step turns by.
-        measurement: distribution of what a measurement is turned by.
+        system: distribution of the rotation in a step.
+        measurement: distribution of the rotation by which a measurement is wrong.
     """
 
     prior: DirectionalNoise | None = None
@@ -62,23 +62,23 @@ class BinghamParameters(Parameters):
 
 
 class KalmanParameters(BinghamParameters):
-    """States how noise is added.
+    """Distributions of the prior and the noises, and how noise is added.
 
     Attributes:
-        rotated: whether the noise is turned into the state's frame; the paper adds it as it is.
+        rotated: whether the noise is rotated into the state's frame; the paper adds it unrotated.
     """
 
     rotated: bool = False
 
 
 class HeadingsFilterParameters(Parameters):
-    """States the model of `headings`; a number that is none is what the log's channel states.
+    """The model of `headings`; by default, the numbers that the log's channel states.
 
     Attributes:
-        coupling_rad: per step the first heading turns by this times the cosine of the second, the second
-            by this times the sine of the first.
-        drift1_rad: by how much the first heading turns per step besides.
-        drift2_rad: by how much the second heading turns per step besides.
+        coupling_rad: in each step, the first heading turns by this times the cosine of the second, and
+            the second by this times the sine of the first.
+        drift1_rad: additional turn of the first heading per step.
+        drift2_rad: additional turn of the second heading per step.
         system_sigma_rad: standard deviation of a heading's noise per step.
         system_correlation: correlation of the two headings' noises.
         measurement_sigma_rad: standard deviation of a measured heading.
@@ -95,7 +95,7 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """States the samples of the filter.
+    """The model of `headings`, and the samples of the filter.
 
     Attributes:
         central_weight: weight of the central one of the five samples (w5 in the paper).
@@ -105,17 +105,18 @@ class TorusParameters(HeadingsFilterParameters):
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """States how angles are compared.
+    """The model of `headings`, and how angles are compared.
 
     Attributes:
-        wrapped: whether the innovation is taken the short way round; else all is merely modulo 2 pi.
+        wrapped: whether the innovation is wrapped to [-pi, pi); otherwise angles are only taken modulo
+            2 pi.
     """
 
     wrapped: bool = True
 
 
 class Distributions(NamedTuple):
-    """Holds the prior and both noises."""
+    """The prior and both noises."""
 
     prior: DirectionalNoise
     system: DirectionalNoise
@@ -123,13 +124,13 @@ class Distributions(NamedTuple):
 
 
 def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
-    """Take all runs through their measurements."""
+    """Process the measurements of all runs."""
     for part, changed in zip(state, advance(state, messages, results), strict=True):
         part[:] = changed
 
 
 def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
-    """Return prior and noises; BadInput where parameters and channels state none with d components."""
+    """Return prior and noises; raise BadInput if one is not stated or does not have d components."""
     found = {}
     for name in Distributions._fields:
         value = getattr(given.parameters, name)
@@ -144,24 +145,24 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
             ) from None
         if len(found[name].diagonal) != d:
             raise BadInput(
-                f"{name}: {len(found[name].diagonal)} numbers for {d} components; give one for each"
+                f"{name} has {len(found[name].diagonal)} numbers for {d} components; give one for each"
             )
     return Distributions(**found)
 
 
 def as_bingham(noise: DirectionalNoise) -> Bingham:
-    """Return the Bingham distribution, or that with the second moment of the projected Gaussian."""
+    """Return the Bingham distribution; for a Gaussian, fit one to its projection on the sphere."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
     try:
         return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
     except BadInput as error:
-        raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
+        raise BadInput(f"Gaussian noise with the variances {noise.diagonal}: {error}") from None
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
-    """Return the Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
+    """Return the covariance (d, d) of the Gaussian; for a Bingham distribution, (57) about its mode."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
     return bingham.hemisphere_covariance(as_bingham(noise))
@@ -205,7 +206,7 @@ def _widened(state: Any, runs: int) -> Any:
 
 
 def heading_model(given: Given[Any]) -> HeadingModel:
-    """Return the model that parameters and channel state."""
+    """Return the model that the parameters and the channel state."""
     stated = {name: given.stated("headings", name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])
@@ -278,8 +279,8 @@ def _unscented(parameters: UnscentedTorusParameters) -> HeadingFilter:
     return partial(run_unscented_filter, wrapped=parameters.wrapped)
 
 
-_BINGHAM = "recursive Bingham filter of "
-_KALMAN = "Kalman filter, modified for unit vectors, of "
+_BINGHAM = "recursive Bingham filter for "
+_KALMAN = "Kalman filter, modified for unit vectors, for "
 _AXIS, _ORIENTATION = (schemas.AXIS, AXIS_KINDS), (schemas.ORIENTATION, ORIENTATION_KINDS)
 BINGHAM_AXIS = _of_unit_vectors(f"{_BINGHAM}an axis", BinghamParameters, *_AXIS, _start_bingham)
 KALMAN_AXIS = _of_unit_vectors(f"{_KALMAN}an axis", KalmanParameters, *_AXIS, _start_kalman)
@@ -289,5 +290,7 @@ BINGHAM_ORIENTATION = _of_unit_vectors(
 KALMAN_ORIENTATION = _of_unit_vectors(
     f"{_KALMAN}an orientation", KalmanParameters, *_ORIENTATION, _start_kalman
 )
-TORUS = _of_headings("recursive toroidal filter of two headings", TorusParameters, _toroidal)
-UKF_TORUS = _of_headings("unscented Kalman filter of two headings", UnscentedTorusParameters, _unscented)
+TORUS = _of_headings("recursive toroidal filter for two headings", TorusParameters, _toroidal)
+UKF_TORUS = _of_headings(
+    "unscented Kalman filter for two headings", UnscentedTorusParameters, _unscented
+)

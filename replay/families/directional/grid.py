@@ -1,6 +1,7 @@
-"""Filters by Bayes' rule on a grid over the half circle and the torus, as a reference.
+"""Bayesian filters on a grid over the half circle and the torus, as a reference.
 
-They approximate no density, only the domain, and show what any filter of the same model can reach.
+They discretize the domain and approximate no density, so they show what any filter of the same model can
+achieve.
 """
 
 from collections.abc import Iterator
@@ -20,18 +21,18 @@ from fuselog.replay.families.directional.torus import HeadingModel, Motion
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Cells that a transition reaches with less than this part of its peak are left out.
+# Cells that a transition reaches with less than this fraction of its peak are dropped.
 _NEGLIGIBLE = 1e-12
 
 
 class GridEstimates(NamedTuple):
-    """Holds what a filter on a grid over the torus says.
+    """Results of a filter on a grid over the torus.
 
     Attributes:
         state: probabilities (runs, n, n) after the last row.
         mean: circular means (rows, 2) of the estimates of all rows.
-        predicted: the same, before their measurements.
-        log_density: logarithms (rows,) of the densities that measurements were predicted with.
+        predicted: circular means (rows, 2) of the predictions, before the measurements.
+        log_density: logarithms (rows,) of the predicted densities at the measurements.
     """
 
     state: Floats
@@ -41,12 +42,12 @@ class GridEstimates(NamedTuple):
 
 
 def run_axis_grid_filter(noise: BinghamNoise, state: Floats, steps: Steps) -> tuple[Floats, Floats]:
-    """Run the reference for `run_bingham_filter` with d = 2.
+    """Run the reference filter for `run_bingham_filter` with d = 2.
 
     Args:
-        noise: see there.
+        noise: system and measurement noise.
         state: probabilities (runs, cells) of the axes at the angles pi / cells * (0, 1, ...).
-        steps: see there.
+        steps: increments and measurements of all runs.
 
     Returns:
         The state after the last row, and the principal axes (rows, 2) of the estimates of all rows.
@@ -79,15 +80,15 @@ def run_torus_grid_filter(
     measurement: Floats,
     motion: Motion = turn_together,
 ) -> GridEstimates:
-    """Run the reference for `run_toroidal_filter`.
+    """Run the reference filter for `run_toroidal_filter`.
 
     Args:
-        model: see there.
+        model: motion and noise of the headings.
         state: probabilities (runs, n, n) at the angles of `torus_grid(n)`.
-        offsets: (runs + 1,).
-        measurement: (rows, 2), rad; NaN for a row that is only a prediction, and for a second angle that
-            is not measured.
-        motion: of the angles.
+        offsets: (runs + 1,), the rows of each run.
+        measurement: (rows, 2), rad; NaN if the row is only a prediction, or if the second angle is not
+            measured.
+        motion: motion of the angles.
     """
     n = state.shape[1]
     grid = torus_grid(n).reshape(-1, 2)
@@ -96,7 +97,9 @@ def run_torus_grid_filter(
     predicted, means = np.empty((2, *measurement.shape))
     log_density = np.empty(len(measurement))
     for runs, rows in _in_step(offsets):
-        prior = np.ascontiguousarray((transition @ probability[runs].T).T)  # sums round by the layout
+        prior = np.ascontiguousarray(
+            (transition @ probability[runs].T).T
+        )  # rounding of the sums depends on the memory layout
         posterior = prior * _likelihood(model, measurement[rows], grid)
         total = posterior.sum(axis=1, keepdims=True)
         probability[runs] = posterior / total
@@ -120,7 +123,7 @@ def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> Floats:
 
 
 def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
-    """Compute the densities (rows, cells) of measurements; of one angle where the other is NaN."""
+    """Compute the densities (rows, cells) of measurements; if the second angle is NaN, of the first."""
     missing = np.isnan(measured)
     sigmas = np.where(missing, np.sqrt(UNIFORM), np.sqrt(np.diag(model.measurement)))
     correlation = model.measurement[0, 1] / np.sqrt(np.prod(np.diag(model.measurement)))
@@ -131,7 +134,7 @@ def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
 
 
 def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.csr_array":
-    """Compute the probabilities of the next cell (rows) given the last one (columns)."""
+    """Compute the probabilities of the next cell (rows) given the previous cell (columns)."""
     from scipy import sparse  # which takes long to import
 
     moved = np.stack(motion(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
@@ -143,7 +146,7 @@ def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.c
 
 
 def _in_step(offsets: Integers) -> Iterator[tuple[Integers, Integers]]:
-    """Go row by row through all runs at once: the runs that have a next row, and these rows."""
+    """Yield the runs that have a next row, and these rows, until no run has more."""
     counts = np.diff(offsets)
     for step in range(int(counts.max(initial=0))):
         runs = np.flatnonzero(counts > step)

@@ -1,6 +1,6 @@
-"""Draws directions: the density of two headings on the torus, of an axis, orientation triads.
+"""Timelines of directional scenarios: densities of two headings and of an axis, triads of orientations.
 
-To the right of each are the errors in degrees with their bands, as everywhere.
+To the right of each view are the errors in degrees with their bounds, as in all timelines.
 """
 
 from collections.abc import Callable, Iterator
@@ -39,7 +39,7 @@ from fuselog.replay.timeline.drawing.plots import draw_quality
 from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 
 QUATERNION = COMPONENTS[:4]
-# Pictures and outlines are large: fewer of them than of numbers.
+# Pictures and outlines are large, so fewer of them are drawn than of numbers.
 PICTURES = 500
 CELLS = 96
 OUTLINE_POINTS = 145
@@ -51,7 +51,7 @@ AXES: tuple[Colour, Colour, Colour] = ((230, 60, 60), (80, 200, 80), (80, 120, 2
 
 
 class Track(NamedTuple):
-    """Holds states (n, d) of truth or an estimator, with covariances (n, t, t) where it has them."""
+    """States (n, d) of truth or an estimator, with covariances (n, t, t) if available."""
 
     name: str
     colour: Colour
@@ -61,7 +61,7 @@ class Track(NamedTuple):
 
 
 def _tracks(scene: Scene, case: str, width: int, rows: int) -> Iterator[Track]:
-    """Yield the truth, then every estimate of this width, thinned to what is drawn."""
+    """Yield the truth, then every estimate with `width` components, thinned for drawing."""
     for stream in scene.truths_of(case):
         if stream["state"].shape[1] == width:
             yield _track("truth", TRUTH, stream, "state", rows)
@@ -87,7 +87,7 @@ def _track(name: str, colour: Colour, stream: Stream, field: str, rows: int) -> 
 def _draw_with(
     board: Callable[[Canvas, Scene, str], Board], canvas: Canvas, scene: Scene
 ) -> rrb.Container | rrb.View:
-    """Draw a board above the events of each case, its errors beside it."""
+    """Draw a board above the events of each case, and its errors next to it."""
 
     def draw_case(case: str) -> rrb.Container:
         left = above_events(
@@ -99,7 +99,7 @@ def _draw_with(
 
 
 def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield where estimators that know the magnetic field of the place find it disturbed."""
+    """Yield the spans in which estimators that know the local magnetic field find it disturbed."""
     topic = f"/{case}/inertial".replace("//", "/")
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if topic in scene.source.topics and set(COMPONENTS) <= set(stream.components):
@@ -113,7 +113,7 @@ def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Draw triads: the truth's in red, green and blue, an estimate's longer and in its own colour."""
+    """Draw triads: red, green and blue for the truth; longer, in its own colour, for an estimate."""
     root = entity_path("space", case)
     for number, track in enumerate(_tracks(scene, case, 4, 5000)):
         is_truth = track.name == "truth"
@@ -125,7 +125,7 @@ def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
 
 
 def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Draw each estimate's density around the circle, truth and measurement as lines through it."""
+    """Draw each estimate's density around a circle, and truth and measurement as lines through it."""
     root = entity_path("axis", case)
     canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
     angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS)
@@ -163,7 +163,7 @@ def _draw_lines(
 def _draw_strips(
     canvas: Canvas, entity: str, time_ns: Times, strips: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """Draw one strip (points, 2) per row of strips (n, points, 2)."""
+    """Draw one line strip (points, 2) per row of strips (n, points, 2)."""
     canvas.send(entity, time_ns, rr.LineStrips2D.columns(strips=list(strips.astype(np.float32))))
     radii = rr.Radius.ui_points(radius_px)
     canvas.fix(entity, rr.LineStrips2D.from_fields(colors=[colour], radii=radii))
@@ -172,7 +172,8 @@ def _draw_strips(
 def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> Board:
     """Draw the first estimator's density as a heat map, with its five samples sized by weight.
 
-    The others, truth and measurement are points. Heading 1 goes right, heading 2 up, from -pi to pi.
+    The other estimates, the truth and the measurements are points. Heading 1 increases to the right and
+    heading 2 upwards, from -pi to pi.
     """
     root = entity_path("torus", case)
     tracks = list(_tracks(scene, case, 2, PICTURES))
@@ -200,7 +201,7 @@ def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> Board:
 
 
 def _draw_ticks(canvas: Canvas, entity: str) -> None:
-    """Draw lines at quarters of both headings, with their degrees at the left and at the bottom."""
+    """Draw grid lines at quarters of both headings, labelled in degrees."""
     share, ends = np.linspace(0.0, 1.0, 5), np.array([0.0, CELLS])
     across = [np.stack([ends, np.full(2, at)], axis=1) for at in CELLS * (1.0 - share)]
     lines = [*across, *(line[:, ::-1] for line in across)]
@@ -228,7 +229,7 @@ def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
     pictures = []
     for mean, covariance in zip(*found, strict=True):
         density = wrapped_normal.density(WrappedNormal(mean, covariance), grid)
-        peak = max(density.max(), np.finfo(float).tiny)  # zero where it lies between the cells
+        peak = max(density.max(), np.finfo(float).tiny)  # zero if the peak is between the cells
         shown = colours(density / peak, bytes=True)[:, :3]
         pictures.append(np.ascontiguousarray(shown).ravel())
     image = ImageFormat(
@@ -257,7 +258,7 @@ def _draw_dots(
 
 
 def _on_map(headings_rad: Floats) -> Floats:
-    """Find where headings (n, 2) are in the picture, in cells: x to the right, y down."""
+    """Convert headings (n, 2) to positions in the picture, in cells: x to the right, y down."""
     share = (headings_rad + np.pi) / (2.0 * np.pi) % 1.0
     return CELLS * np.stack([share[:, 0], 1.0 - share[:, 1]], axis=-1)
 

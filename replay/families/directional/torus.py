@@ -1,9 +1,10 @@
-"""Filters two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
+"""Filters of two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
 
-The recursive toroidal filter that Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate
-Circular Estimation", 2016, announce, and beside it the unscented Kalman filter with their UKF samples.
-All take an ensemble as ragged rows, run r owning offsets[r]:offsets[r + 1]; a row is a prediction, then
-an update with its measurement (2,) unless that is NaN, or with its first angle where the second is.
+The recursive toroidal filter that Kurz and Hanebeck announce in "Deterministic Sampling on the Torus for
+Bivariate Circular Estimation", 2016, and the unscented Kalman filter with their UKF samples. Both
+process an ensemble as ragged rows, in which run r owns offsets[r]:offsets[r + 1]. A row is a prediction,
+followed by an update with its measurement (2,). If the measurement is NaN, there is no update; if only
+the second angle is NaN, the update uses the first angle.
 """
 
 import math
@@ -37,12 +38,12 @@ from fuselog.replay.families.directional.distributions.wrapped_normal_kernels im
 )
 from fuselog.replay.inference.run.loops import OnEvent, over_events
 
-# A variance (rad^2) of a measurement that moves a Gaussian by less than its rounding.
+# A measurement with this variance (rad^2) changes a Gaussian by less than rounding error.
 _VAGUE = 1e18
 
 
 class HeadingModel(NamedTuple):
-    """Describes the system and its noise.
+    """The motion of two headings and their noise.
 
     Attributes:
         coupling_rad: c in the motion.
@@ -58,14 +59,14 @@ class HeadingModel(NamedTuple):
 
 
 class HeadingRows(NamedTuple):
-    """Holds what all runs measure: run r owns offsets[r]:offsets[r + 1] of the measurements (n, 2)."""
+    """Measurements (n, 2) of all runs: run r owns offsets[r]:offsets[r + 1]."""
 
     offsets: Integers
     measurement: Floats
 
 
 class HeadingInputs(NamedTuple):
-    """Holds what a filter goes by; its option is the central weight, or whether angles are wrapped."""
+    """Inputs of a filter; `option` is the central weight, or whether angles are wrapped."""
 
     events: HeadingRows
     model: HeadingModel
@@ -79,17 +80,19 @@ Motion = Callable[..., tuple[Component, Component]]
 def make_heading_model(
     coupling_rad: float, drift_rad: ArrayLike, system: ArrayLike, measurement: ArrayLike
 ) -> HeadingModel:
-    """Make a checked model.
+    """Make a heading model from checked numbers.
 
     Args:
         coupling_rad: c in the motion.
         drift_rad: what is added in every step, (2,).
         system, measurement: covariances of w and v, (2, 2), rad^2.
 
-    Raises BadInput where a covariance is not positive definite or a number not finite.
+    Raises BadInput if a covariance is not positive definite or a number is not finite.
     """
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
-        raise BadInput("coupling and drift of a heading model must be finite, and the drift two numbers")
+        raise BadInput(
+            "coupling and drift of a heading model must be finite; give two numbers for the drift"
+        )
     covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
     return HeadingModel(
         float(coupling_rad), np.array(drift_rad, float), *map(np.ascontiguousarray, covariances)
@@ -107,20 +110,21 @@ def run_toroidal_filter(
 ) -> tuple[WrappedNormal, WrappedNormal]:
     """Run the recursive toroidal filter.
 
-    A prediction moves five samples and refits by circular moments and r_c (by mixed maximum likelihood
-    where these allow no covariance), then adds the system noise; an update refits the exact product.
+    A prediction moves five samples, fits a wrapped normal to them by circular moments and r_c (or by
+    mixed maximum likelihood if these allow no covariance), and adds the system noise. An update fits a
+    wrapped normal to the exact product.
 
     Args:
-        model: see there.
+        model: motion and noise of the headings.
         state: the distributions before the first row, batch axis (runs,).
-        offsets: (runs + 1,).
+        offsets: (runs + 1,), the rows of each run.
         measurement: (rows, 2), rad.
-        motion: of the angles.
+        motion: motion of the angles.
         central_weight: w5 of the five samples.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,). A run that
-        fails is NaN from there on.
+        The state after the last row, and the estimates of all rows, batch axis (rows,). If a run fails,
+        it is NaN from that row on.
     """
     require_central_weight(central_weight)
     return _run(_toroidal_step, motion, model, state, offsets, measurement, central_weight)
@@ -139,7 +143,7 @@ def run_unscented_filter(
 
     Args:
         model, state, offsets, measurement, motion: as for `run_toroidal_filter`.
-        wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.
+        wrapped: wrap the innovation to [-pi, pi); otherwise angles are only taken modulo 2 pi.
 
     Returns:
         What `run_toroidal_filter` returns.
@@ -147,7 +151,7 @@ def run_unscented_filter(
     return _run(_unscented_step, motion, model, state, offsets, measurement, wrapped)
 
 
-# (motion) -> what processes a row.
+# Makes the function that processes a row, for a given motion.
 MakeStep = Callable[[Motion], OnEvent]
 
 
@@ -161,11 +165,11 @@ def _run(
     option: float | bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     if measurement.shape != (offsets[-1], 2):
-        raise BadInput(f"heading measurements of shape {measurement.shape}; give ({offsets[-1]}, 2)")
+        raise BadInput(f"heading measurements have shape {measurement.shape}; give ({offsets[-1]}, 2)")
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
     rows = HeadingRows(offsets, np.ascontiguousarray(measurement))
-    # a fit to samples is no wider than a uniform distribution
+    # a fit to samples is at most as wide as a uniform distribution
     most = UNIFORM + np.diagonal(model.system) + np.maximum(np.diagonal(model.measurement), UNIFORM)
     inputs, memory = HeadingInputs(rows, model, option), partial(blank_mixture, most)
     _over_runs(step, motion)(len(offsets) - 1, inputs, state, estimates, scratch=memory)
@@ -174,7 +178,7 @@ def _run(
 
 @cache
 def _over_runs(step: MakeStep, motion: Motion) -> OverRuns:
-    """Compile the loop of a filter: what `step` makes processes a row, whose state is written down."""
+    """Compile the loop of a filter; the function that `step` makes processes one row."""
     loop = over_events(step(motion), _write, fails=False)
     return compile_over_runs(loop, title="a filter of headings")
 
@@ -201,7 +205,7 @@ def _toroidal_step(motion: Motion) -> OnEvent:
             for j in range(2):
                 covariance[i, j] += model.system[i, j]
         if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
-            # no distribution: NaN stays, all later rows of the run are NaN as well
+            # not a distribution: NaN propagates to all later rows of the run
             mean[:], covariance[:] = np.nan, np.nan
         elif not math.isnan(z[0]):
             measured, noise = np.empty(2), np.empty((2, 2))
@@ -213,7 +217,7 @@ def _toroidal_step(motion: Motion) -> OnEvent:
 
 
 def _take(z: NDArray, noise: NDArray, vague: float, measured: NDArray, covariance: NDArray) -> None:
-    """Fill a measurement and its covariance, so wide for a missing angle that it tells nothing."""
+    """Write a measurement and its covariance; a missing angle gets a negligible weight."""
     is_whole = not math.isnan(z[1])
     for i in range(2):
         measured[i] = z[i] if is_whole or i == 0 else 0.0
@@ -271,7 +275,7 @@ def _unscented_step(motion: Motion) -> OnEvent:
 
 
 def _fill_sigma_points(mean: NDArray, covariance: NDArray, x: NDArray) -> None:
-    """Fill the mean, and it plus and minus sqrt(5 / 2) times the columns of the Cholesky factor."""
+    """Write the mean and the mean ± sqrt(5 / 2) times the columns of the Cholesky factor."""
     first = math.sqrt(2.5 * covariance[0, 0])
     below = 2.5 * covariance[0, 1] / first
     second = math.sqrt(2.5 * covariance[1, 1] - below * below)

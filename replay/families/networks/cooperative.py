@@ -1,10 +1,10 @@
-"""Localizes robots that share position estimates when they see each other.
+"""Cooperative localization of robots that share position estimates when they see each other.
 
-Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees
-another, each of the two takes the sighting as a measurement of itself that rests on the other one:
-as if that were independent (naive), or by covariance intersection (Jin, Lee, Hashimoto, DIND networks,
-4.2 and 5.2; the sensor's own noise is independent). The joint filter keeps all correlations, as a centre
-could.
+Every robot integrates its odometry; the anchors also use the mapped landmarks. When a robot sees
+another, each of the two uses the sighting as a measurement of itself that depends on the other's
+estimate: either as if the estimates were independent (naive), or by covariance intersection (Jin, Lee,
+Hashimoto, DIND networks, 4.2 and 5.2; the sensor's own noise is independent). The joint filter keeps all
+correlations, as a central node could.
 """
 
 import copy
@@ -51,24 +51,24 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """States how robots use their sightings of each other, and which of them use landmarks.
+    """How robots use their sightings of each other, and which of them use landmarks.
 
-    Noise that is none is what the channels state.
+    Noise that is not set is read from the channels.
 
     Attributes:
         mode: how sightings are fused: not at all (alone), as if independent (naive), by covariance
             intersection (ci), or in one filter of all robots (joint).
-        criterion: what covariance intersection makes least: the trace of a pose's covariance, in m^2 +
-            rad^2, or its determinant.
+        criterion: quantity that covariance intersection minimizes: the trace of a pose's covariance, in
+            m^2 + rad^2, or its determinant.
         anchors: numbers of the robots that know the map.
         forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times
-            the root of the step.
+            the square root of the step.
         turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
-            root of the step.
+            square root of the step.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
-        gate_probability: a measurement whose NIS is beyond this quantile of chi-square is not used; 1
-            uses all.
+        gate_probability: a measurement is rejected if its NIS exceeds this quantile of chi-square; 1
+            accepts all.
     """
 
     mode: Mode = "ci"
@@ -82,9 +82,9 @@ class CooperativeParameters(Parameters):
 
 
 class CooperativeState(NamedTuple):
-    """Holds the robots' states, and why robots take no part: (runs, robots), "" where they do.
+    """The robots' states, and the reasons (runs, robots) why robots do not take part, "" if they do.
 
-    `announced` says of whom that was told, or need not be.
+    `announced` marks the robots whose reason was reported or need not be.
     """
 
     robots: RobotStates
@@ -94,7 +94,7 @@ class CooperativeState(NamedTuple):
 
 
 def memory(states: int) -> RobotMemory:
-    """Allocate memory for one run of so many states."""
+    """Allocate scratch memory for one run with `states` states."""
     return RobotMemory(
         np.empty(3),
         np.empty((3, 3)),
@@ -118,10 +118,10 @@ Cooperating = Given[CooperativeParameters]
 
 
 def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
-    """Return all robots at their priors, and the maps.
+    """Return the settings and the initial state: all robots at their priors, and the maps.
 
-    A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
-    that is so for all, or the map is not planar.
+    A robot whose prior cannot be used does not take part, and the other robots do not use it. Raises
+    BadInput if no robot has a usable prior, or if the map is not planar.
     """
     prefixes, _ = given.setup
     priors = [_prior(given[f"{prefix}/prior"]) for prefix in prefixes]
@@ -179,7 +179,7 @@ def advance(
     before, failed_ns = state.robots.failure, robots.time_ns.max(axis=1)
     made.append(failures_of(topic, before, robots.failure, failed_ns, FAILURES))
     announced = state.announced.copy()
-    for robot, prefix in enumerate(prefixes):  # who takes no part, each told at its first odometry
+    for robot, prefix in enumerate(prefixes):  # report unusable robots at their first odometry
         odometry = block.streams[f"{prefix}/odometry"]
         new = np.flatnonzero(~announced[:, robot] & (np.diff(odometry.offsets) > 0))
         announced[new, robot] = True
@@ -228,7 +228,7 @@ def _number(prefix: str) -> int:
 
 
 def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
-    """Return the prefixes of the robots that have what is needed, by number."""
+    """Return the prefixes of the robots that have all required topics, in order of number."""
     leaves = {
         "odometry": schemas.ODOMETRY,
         "range_bearing": schemas.RANGE_BEARING,
@@ -241,7 +241,7 @@ def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
 def _find(
     name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters
 ) -> Iterator[Binding]:
-    """Yield one filter for all robots; raises BadInput where an anchor is not among them."""
+    """Yield one filter for all robots; raise BadInput if an anchor is not among them."""
     prefixes = _robots(topics)
     if len(prefixes) < 2 or "/landmarks" not in topics:
         return

@@ -1,10 +1,11 @@
-"""Fuses estimates whose errors correlate in an unknown way: covariance intersection and kin.
+"""Fusion of estimates whose errors have unknown correlations: covariance intersection and related rules.
 
 Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
 Reinhardt, Hanebeck, Inverse Covariance Intersection (2017); Li, Nashashibi, Split CI (2013). A rule
-fuses K estimates of one state: scalar loops, so that networks compile it, called `fuse(count, parts,
-weights, mean, covariance, memory) -> gap`, infinity where a covariance is singular.
+fuses K estimates of one state. The rules are scalar loops, so that networks can compile them. A rule is
+called as `fuse(count, parts, weights, mean, covariance, memory) -> gap`; the gap is infinite if a
+covariance is singular.
 """
 
 from functools import partial
@@ -29,17 +30,18 @@ from fuselog.replay.families.networks.pairwise import fuse_in_turn
 
 Criterion = Literal["trace", "determinant"]
 ITERATIONS = 10_000
-# by their numbers, which are known only when a kernel runs: one kernel has them all
+# one kernel contains all rules and selects one by its number when it runs
 RULES = ("ci-trace", "ci-determinant", "niehsen", "franken", "naive", "inverse-ci", "split-ci")
 CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(len(RULES))
 
 
 class Fusions(NamedTuple):
-    """Holds mean (..., n), covariance (..., n, n), weights (..., K) and their certificate `gap` (...,).
+    """Fused mean (..., n), covariance (..., n, n), weights (..., K) and their certificate `gap` (...,).
 
-    By the conditions of Karush, Kuhn and Tucker no weights better the criterion (the trace's logarithm,
-    or the determinant's divided by n) by more than the gap; it is 0 where a rule optimises nothing. A
-    rule that fuses one after another states, at i > 0, the weight of what was fused before i.
+    By the Karush-Kuhn-Tucker conditions, no other weights improve the criterion (the logarithm of the
+    trace, or the log determinant divided by n) by more than the gap. The gap is 0 for a rule that
+    optimizes nothing. For a rule that fuses one estimate after another, weight i > 0 is that of the
+    fusion of the estimates before i.
     """
 
     mean: Floats
@@ -49,23 +51,23 @@ class Fusions(NamedTuple):
 
 
 class FusionMemory(NamedTuple):
-    """Holds the informations (K, n, n) of K estimates that are fused, and weights (K,) to come."""
+    """Scratch memory: information matrices (K, n, n) of estimates, and their next weights (K,)."""
 
     information: Floats
     better: Floats
 
 
 def fusion_memory(count: int, states: int) -> FusionMemory:
-    """Allocate memory for the fusion of so many estimates at most."""
+    """Allocate memory for the fusion of at most `count` estimates."""
     return FusionMemory(np.empty((count, states, states)), np.empty(count))
 
 
 def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
-    """Fill the covariance of the weighted sum of informations, (14); False where it is singular.
+    """Compute the covariance of the weighted sum of information, (14); return False if it is singular.
 
     Args:
-        count: K, how many are summed.
-        weights, information: of each, (K,), (K, n, n); more of them are left alone.
+        count: number K of estimates to sum.
+        weights, information: of each estimate, (K,), (K, n, n); entries after the first K are ignored.
         covariance: (n, n), overwritten.
     """
     size = len(covariance)
@@ -80,11 +82,11 @@ def summed(count: int, weights: Floats, information: Floats, covariance: Floats)
 def combined(
     count: int, weights: Floats, information: Floats, means: Floats, mean: Floats, covariance: Floats
 ) -> bool:
-    """Fill mean and covariance of the weighted sum, (14) and (15); False where it is singular.
+    """Compute mean and covariance of the weighted sum, (14) and (15); return False if it is singular.
 
     Args:
         count, weights, information: as for `summed`.
-        means: (K, n), of the estimates.
+        means: means of the estimates, (K, n).
         mean, covariance: (n,), (n, n), overwritten.
     """
     if not summed(count, weights, information, covariance):
@@ -100,7 +102,7 @@ def combined(
 
 
 def trace_slope(covariance: Floats, slope: Floats) -> None:
-    """Fill P^2 / tr P: the criterion gains tr(I_i slope) by weight i.
+    """Compute P^2 / tr P; the criterion's gain by weight i is tr(I_i slope).
 
     Args:
         covariance, slope: P and what is filled, (n, n).
@@ -120,7 +122,7 @@ def trace_slope(covariance: Floats, slope: Floats) -> None:
 
 
 def determinant_slope(covariance: Floats, slope: Floats) -> None:
-    """Fill P / n: the criterion gains tr(I_i slope) by weight i.
+    """Compute P / n; the criterion's gain by weight i is tr(I_i slope).
 
     Args:
         covariance, slope: P and what is filled, (n, n).
@@ -139,17 +141,17 @@ def weigh_optimally(
     weights: Floats,
     tolerance: float,
 ) -> float:
-    """Fill weights by w_i <- w_i g_i^p, normalised, until none can gain more than the tolerance.
+    """Iterate w_i <- w_i g_i^p, normalized, until the criterion can gain no more than the tolerance.
 
-    For the trace p is 1/2, for the determinant 1. At the least criterion no gain g_i = tr(I_i slope)
-    exceeds 1, and those of weights above 0 are 1.
+    The power p is 1/2 for the trace and 1 for the determinant. At the minimum, no gain g_i = tr(I_i
+    slope) exceeds 1, and the gains of positive weights are 1.
 
     Args:
-        by_trace: whether the trace is least, or the determinant.
+        by_trace: whether to minimize the trace; otherwise the determinant.
         count, covariances, memory, weights, tolerance: as for `weigh`.
 
     Returns:
-        The gap, see `Fusions`; infinity where a covariance is singular.
+        The gap, see `Fusions`; infinity if a covariance is singular.
     """
     gap = np.inf
     size = covariances.shape[1]
@@ -181,7 +183,7 @@ def weigh_optimally(
 
 
 def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
-    """Weigh in proportion to 1 / tr P_i: Niehsen.
+    """Set weights in proportion to 1 / tr P_i: Niehsen.
 
     Args:
         count, covariances, weights: as for `weigh`.
@@ -198,7 +200,7 @@ def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
 
 
 def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
-    """Weigh by what is lost from |sum of I| without I_i, plus |I_i|: Franken and Huepper.
+    """Set weights in proportion to |sum of I| - |sum without I_i| + |I_i|: Franken and Huepper.
 
     Args:
         count, weights: as for `weigh`.
@@ -220,7 +222,7 @@ def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
 
 
 def weigh_fully(count: int, weights: Floats) -> None:
-    """Weigh each by 1, as if all errors were independent: naive Kalman fusion.
+    """Set all weights to 1, as if all errors were independent: naive Kalman fusion.
 
     Args:
         count, weights: as for `weigh`.
@@ -231,15 +233,15 @@ def weigh_fully(count: int, weights: Floats) -> None:
 def weigh(
     rule: int, count: int, covariances: Floats, memory: FusionMemory, weights: Floats, tolerance: float
 ) -> float:
-    """Fill the weights of a rule that adds up weighted informations; returns their certificate.
+    """Compute the weights of a rule that sums weighted information; return their certificate.
 
     Args:
-        rule: its number in `RULES`.
-        count: K, how many estimates there are.
+        rule: number of the rule in `RULES`.
+        count: number K of estimates.
         covariances: (K, n, n).
-        memory: with their informations.
+        memory: scratch memory with the information matrices of the estimates.
         weights: (K,), overwritten.
-        tolerance: how much the criterion may still gain.
+        tolerance: largest remaining gain of the criterion.
     """
     if rule in (CI_TRACE, CI_DETERMINANT):
         by_trace = rule == CI_TRACE
@@ -256,7 +258,7 @@ def weigh(
 def fuse_together(
     rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
-    """Add up weighted informations."""
+    """Fuse estimates by a rule that sums weighted information; return the certificate."""
     information, (mean, covariance, weights) = memory.information, fused
     for i in range(count):
         if not inverted(parts.covariance[i], information[i]):
@@ -268,7 +270,7 @@ def fuse_together(
 
 
 def rule_number(name: str) -> int:
-    """Return the number of a rule of RULES; raises BadInput for another name."""
+    """Return the number of a rule of RULES; raise BadInput for an unknown name."""
     if name not in RULES:
         raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
     return RULES.index(name)
@@ -277,10 +279,10 @@ def rule_number(name: str) -> int:
 def fuse_by(
     rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
-    """Fuse the first `count` estimates by the rule of a number; returns the certificate.
+    """Fuse the first `count` estimates by the rule with the given number; return the certificate.
 
-    `tolerance` bounds the gap where weights are optimised together, and the square of ten times a
-    single weight's error.
+    `tolerance` bounds the gap if weights are optimized together, and the square of ten times the error
+    of a single weight otherwise.
     """
     if rule in (INVERSE_CI, SPLIT_CI):
         return fuse_in_turn(rule == SPLIT_CI, count, parts, fused, tolerance)
@@ -313,9 +315,9 @@ def fuse(
         means: (..., K, n).
         covariances: (..., K, n, n).
         independents: (..., K, n, n), for "split-ci": the parts independent of all other errors.
-        tolerance: what the certificate of an optimised rule must reach.
+        tolerance: largest certificate of an optimized rule.
 
-    Raises BadInput where shapes do not fit, a number is not finite, a covariance is not symmetric and
+    Raises BadInput if shapes do not match, a number is not finite, a covariance is not symmetric and
     positive definite, an independent part exceeds its covariance, or the weights do not converge.
     """
     mean, covariance = np.asarray(means, float), np.asarray(covariances, float)

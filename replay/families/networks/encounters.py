@@ -1,4 +1,4 @@
-"""Moves robots by their odometry, and fuses their estimates where they see each other."""
+"""Motion of robots by their odometry, and fusion of their estimates when they see each other."""
 
 from typing import NamedTuple
 
@@ -18,10 +18,10 @@ from fuselog.replay.tracing.functions import traced
 
 
 class RobotStates(NamedTuple):
-    """Holds the robots' states between blocks; first axis = run. `failure` is one of gaussian's.
+    """The robots' states between blocks, first axis runs; `failure` is a code of `gaussian`.
 
-    The mean (3 n,) and covariance (3 n, 3 n) are of all n robots; only the joint filter has entries
-    between robots.
+    The mean (3 n,) and covariance (3 n, 3 n) are those of all n robots. Only the joint filter has
+    covariances between robots.
     """
 
     mean: Floats
@@ -32,7 +32,7 @@ class RobotStates(NamedTuple):
 
 
 class RobotSettings(NamedTuple):
-    """Holds the noise of the robots' odometry and sensors, both (n, 2), the anchors, and the gate."""
+    """Noise of the robots' odometry and sensors, both (n, 2), the anchors, and the gate."""
 
     density: Floats
     variance: Floats
@@ -41,9 +41,9 @@ class RobotSettings(NamedTuple):
 
 
 class SightingFusion(NamedTuple):
-    """Chooses how a sighting of another robot is used: one state of all, intersection, or naively.
+    """How a sighting of another robot is used: in one joint state, by intersection, or naively.
 
-    The weight of an intersection is that of the least trace or else of the least determinant.
+    The weight of an intersection minimizes the trace if `by_trace`, otherwise the determinant.
     """
 
     joint: bool
@@ -52,11 +52,12 @@ class SightingFusion(NamedTuple):
 
 
 class RobotEvents(NamedTuple):
-    """Holds the events of all runs in order: whose they are, and what they say.
+    """The events of all runs in order: the robots they belong to, and their values.
 
-    `robots` (m, 2) are the one that speaks and the one that it sees, -1 where it sees none. Odometry has
-    the value (forward, turn) and `is_sighting` false; a sighting has (range, bearing), of a robot or of
-    a landmark's `place` (m, 2). `is_due` says that the speaker's estimate is wanted.
+    `robots` (m, 2) are the robot that sent the event and the robot that it sees, -1 if it sees none. For
+    odometry, the value is (forward, turn) and `is_sighting` is false. For a sighting of a robot or of a
+    landmark at `place` (m, 2), the value is (range, bearing). `is_due` marks events at which the first
+    robot's estimate is written.
     """
 
     offsets: Integers
@@ -69,7 +70,7 @@ class RobotEvents(NamedTuple):
 
 
 class RobotInputs(NamedTuple):
-    """Holds what the robots go by."""
+    """Inputs of the cooperative filter."""
 
     events: RobotEvents
     settings: RobotSettings
@@ -77,21 +78,21 @@ class RobotInputs(NamedTuple):
 
 
 class RobotResults(NamedTuple):
-    """Holds the robot's pose (m, 3) and covariance (m, 3, 3) after an event; NaN if not wanted."""
+    """The robot's pose (m, 3) and covariance (m, 3, 3) after an event; NaN if not requested."""
 
     mean: Floats
     covariance: Floats
 
 
 class RobotMemory(NamedTuple):
-    """Holds what the kernel works in, for one run.
+    """Scratch memory of the kernel, for one run.
 
     Attributes:
-        state, transition, gain, variances: of a drive (3,), (3, 3), (3, 2), (2,).
-        predicted, rows: of a sighting (2,), and by the pose that sees (2, 3).
-        both: the same by the pose that sees and the one that is seen, (2, 2, 3).
-        spread, square: H P H' and H P P H' of both, (2, 2, 2).
-        whole: rows by the state of all robots, (2, 3 n).
+        state, transition, gain, variances: of a prediction, (3,), (3, 3), (3, 2), (2,).
+        predicted, rows: predicted sighting (2,), and its Jacobian by the observer's pose (2, 3).
+        both: Jacobians by the poses of the observer and of the observed robot, (2, 2, 3).
+        spread, square: H P H' and H P P H' of both robots, (2, 2, 2).
+        whole: Jacobian by the state of all robots, (2, 3 n).
         product: (3, 3 n).
         update: see `fuselog.replay.inference.linear_algebra.small_matrices`.
     """
@@ -129,14 +130,14 @@ linear_sight = derivative(
 def advance(
     carried: RobotStates, run: int, robot: int, time_ns: int, density: Floats, work: RobotMemory
 ) -> None:
-    """Move one robot to a time by its odometry, with its correlations.
+    """Predict one robot to a time by its odometry, with its correlations.
 
     Args:
         carried: the robots of all runs, changed in place.
-        run, robot: which.
-        time_ns: nothing is done where the robot is there already.
-        density: of the odometry's noise, forward and turn, (2,).
-        work: to work in.
+        run, robot: the run and the robot.
+        time_ns: time to predict to; nothing happens if the robot's state is not older.
+        density: densities of the odometry's noise, forward and turn, (2,).
+        work: scratch memory.
     """
     duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
     if duration_s <= 0.0:
@@ -163,11 +164,11 @@ def advance(
 
 
 def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
-    """Fill rows P rows' with the block P (3, 3) of one robot; symmetric by construction.
+    """Compute rows P rows' for the block P (3, 3) of one robot; symmetric by construction.
 
     Args:
         covariance: (3 n, 3 n) of all robots.
-        first: where the robot's block begins.
+        first: index at which the robot's block begins.
         rows: (k, 3).
         spread: (k, k), overwritten.
     """
@@ -188,15 +189,15 @@ def look(
     difference: Floats,
     work: RobotMemory,
 ) -> None:
-    """Fill the innovation of a robot's sighting of a place, and its rows by both robots.
+    """Compute the innovation of a robot's sighting of a position, and its Jacobians by both robots.
 
     Args:
         mean: (3 n,) of all robots.
-        robot: the one that sees.
+        robot: the robot that sees.
         place: x and y in m, of a landmark or of the robot that is seen.
         value: range in m and bearing in rad, (2,).
         difference: (2,), overwritten.
-        work: whose `both` is filled.
+        work: scratch memory, whose `both` is overwritten.
     """
     first = 3 * robot
     linear_sight((mean[first], mean[first + 1], mean[first + 2]), place, work)
@@ -208,12 +209,12 @@ def look(
 
 
 def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) -> float:
-    """Fill what a sighting says of one robot's block of the covariance; returns the block's trace.
+    """Project one robot's block of the covariance onto a sighting; return the block's trace.
 
     Args:
         covariance, first: as for `fill_spread`.
         side: 0 for the robot that sees, 1 for the one that is seen.
-        work: with `both`; `spread` and `square` of this side are filled.
+        work: scratch memory with `both`; `spread` and `square` of this side are overwritten.
     """
     rows, trace = work.both[side], 0.0
     fill_spread(covariance, first, rows, work.spread[side])
@@ -236,7 +237,7 @@ def scale(covariance: Floats, first: int, factor: float) -> None:
 
     Args:
         covariance, first: as for `fill_spread`.
-        factor: by which.
+        factor: the factor.
     """
     for row in range(3):
         for column in range(3):
@@ -253,16 +254,16 @@ def meet(
     fusion: SightingFusion,
     work: RobotMemory,
 ) -> bool:
-    """Use a sighting; False where a covariance is not positive definite.
+    """Update with a sighting; return False if a covariance is not positive definite.
 
     Args:
         mean, covariance: (3 n,), (3 n, 3 n) of all robots, changed in place.
-        robots: the one that sees and the one that is seen, -1 for a landmark, (2,).
+        robots: the robot that sees and the robot that is seen, -1 for a landmark, (2,).
         difference: the innovation (2,), see `look`.
-        variance: of range and bearing, (2,).
-        gate: the largest squared distance of what is used.
+        variance: variances of range and bearing, (2,).
+        gate: largest squared distance at which a sighting is accepted.
         fusion: how another robot's estimate is used.
-        work: with `both` by `look`.
+        work: scratch memory with `both` from `look`.
     """
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
     first, both = (3 * robots[0], 3 * robots[1]), robots[1] >= 0
@@ -299,7 +300,7 @@ def cooperate(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Move the robots of an event to its time, and use it unless it is from before the robot's own."""
+    """Predict the robots of an event to its time and process it, unless the robot's state is newer."""
     events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)
@@ -338,7 +339,7 @@ def write_pose(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Fill in the pose of the robot that an event is of, where it is wanted."""
+    """Write the pose of the robot that an event belongs to, if it is due."""
     if inputs.events.is_due[event]:
         first = 3 * inputs.events.robots[event, 0]
         mean, covariance = carried.mean[run], carried.covariance[run]

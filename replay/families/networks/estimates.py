@@ -1,4 +1,4 @@
-"""Computes with estimates that are fused: inverses, transforms and searches, in place."""
+"""In-place operations on estimates to fuse: inverses, transformations and a golden-section search."""
 
 from typing import NamedTuple
 
@@ -7,15 +7,15 @@ import numpy as np
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 
-# what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
+# a matrix is singular if its Cholesky factor keeps less than this share of a diagonal entry
 SINGULAR = 1e-13
 GOLDEN = 0.6180339887498949
 
 
 class Estimate(NamedTuple):
-    """Holds means (..., n), covariances (..., n, n), and the parts of these independent of all others.
+    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
 
-    Only split CI looks at the parts.
+    Only split CI uses the independent parts.
     """
 
     mean: Floats
@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Holds where a fusion fills in its mean (n,), covariance (n, n) and weights (K,)."""
+    """Output of a fusion: its mean (n,), covariance (n, n) and weights (K,)."""
 
     mean: Floats
     covariance: Floats
@@ -32,7 +32,7 @@ class Fused(NamedTuple):
 
 
 def inverted(matrix: Floats, inverse: Floats) -> bool:
-    """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular.
+    """Compute the inverse of a positive definite matrix; return False if the matrix is nearly singular.
 
     Args:
         matrix, inverse: (n, n).
@@ -44,7 +44,7 @@ def inverted(matrix: Floats, inverse: Floats) -> bool:
     for row in range(size):
         if not factor[row, row] ** 2 > SINGULAR * matrix[row, row]:
             return False
-    half = np.zeros((size, size))  # of the factor
+    half = np.zeros((size, size))  # inverse of the factor
     for column in range(size):
         half[column, column] = 1.0 / factor[column, column]
         for row in range(column + 1, size):
@@ -63,11 +63,11 @@ def inverted(matrix: Floats, inverse: Floats) -> bool:
 
 
 def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
-    """Fill matrix @ vector.
+    """Compute matrix @ vector.
 
     Args:
         matrix: (n, n).
-        vector, image: (n,), not the same.
+        vector, image: (n,), different arrays.
     """
     for row in range(len(vector)):
         image[row] = 0.0
@@ -76,11 +76,11 @@ def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
 
 
 def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats) -> None:
-    """Fill share * left + rest * right.
+    """Compute share * left + rest * right.
 
     Args:
-        share, rest: what left and right are multiplied by.
-        left, right, total: (n, n); the last, which is filled, may be one of the others.
+        share, rest: factors of left and right.
+        left, right, total: (n, n); `total` is overwritten and may be `left` or `right`.
     """
     for row in range(len(total)):
         for column in range(len(total)):
@@ -88,7 +88,7 @@ def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats)
 
 
 def determinant(matrix: Floats) -> float:
-    """Return the determinant of a matrix that is positive definite, else 0."""
+    """Compute the determinant of a positive definite matrix; return 0 if the matrix is not."""
     size = len(matrix)
     factor = np.zeros((size, size))
     if not cholesky(factor, matrix, size):
@@ -100,39 +100,39 @@ def determinant(matrix: Floats) -> float:
 
 
 def put(given: Estimate, place: Estimate) -> None:
-    """Copy an estimate; loops, since slices are very slow to compile."""
+    """Copy an estimate, in loops because slices take very long to compile."""
     copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
     place.independent[:, :] = given.independent
 
 
 def one_of(estimates: Estimate, i: int) -> Estimate:
-    """Return one of several estimates; changing it changes them."""
+    """Return a view of one of several estimates."""
     return Estimate(estimates.mean[i], estimates.covariance[i], estimates.independent[i])
 
 
 def steps_for(tolerance: float) -> int:
-    """Count the steps of a golden section that leave a tenth of the root of the tolerance."""
+    """Count golden-section steps until a tenth of the square root of the tolerance remains."""
     return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
 
 
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
-    """Find where in (0, 1) a search for the least value looks next: golden section.
+    """Return the next position in (0, 1) of a golden-section search for a minimum.
 
-    The last of all steps is the middle of what is left. Written like this, the function that is searched
-    is called in one place, and compiled once.
+    The last step returns the middle of the remaining interval. In this form, the function to minimize is
+    called at one place only and is compiled once.
 
     Args:
-        step, steps: which step, from 0, of how many.
-        value: that at the last place; of no use at step 0.
-        section: (7,), what the search remembers: both ends, both inner places, their values, and
-            which of these `value` is.
+        step, steps: number of the step, from 0, and number of steps.
+        value: value at the previous position; ignored at step 0.
+        section: (7,), state of the search: both ends, both inner positions, their values, and the index
+            of the position that `value` belongs to.
     """
     if step == 0:
         section[0], section[1] = 1e-9, 1.0 - 1e-9
         section[2], section[3] = 1.0 - GOLDEN, GOLDEN
         section[6] = 2
         return section[2]
-    section[2 + int(section[6])] = value  # 4: at the left place, 5: at the right one
+    section[2 + int(section[6])] = value  # 4: at the left position, 5: at the right one
     if step == 1:
         section[6] = 3
         return section[3]

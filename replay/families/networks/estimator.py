@@ -1,9 +1,10 @@
-"""Replays a sensor network: every node filters with its own sensor and fuses what others send.
+"""Replay of sensor networks: every node filters with its own sensor and fuses received estimates.
 
 Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
-prediction (not x*) with the x* received, by a rule of `covariance_intersection`; update with the own
-measurement again. The log says which message was sent when and where it arrived; what was in it is this
-replay's output, so that one run is replayed with any rule. The state is (positions, velocities).
+prediction (not x*) with the received x*, by a rule of `covariance_intersection`; update with the own
+measurement again. The log states which message was sent when, and when it arrived. The content of a
+message is an output of this replay, so that the same log can be replayed with any rule. The state is
+(positions, velocities).
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -54,21 +55,21 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """States the fusion rule, what nodes send, and a node that sends false estimates.
+    """The fusion rule, when nodes send, and a node that sends false estimates.
 
     Attributes:
         rule: the fusion rule; "alone" fuses nothing, "centralised" is one filter with all sensors and no
             links, and "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses
             its measurement a second time.
-        tolerance: how exactly weights are optimised.
-        send_interval_s: a node sends at most once in this time.
-        send_divergence: a node sends when its estimate differs from its last message by this
-            Kullback-Leibler divergence, in nats.
-        gate_probability: a received estimate is fused if it agrees with the node's own; honest
+        tolerance: tolerance of the optimization of weights.
+        send_interval_s: shortest time between two messages of a node.
+        send_divergence: Kullback-Leibler divergence between a node's estimate and its last message at
+            which it sends again, in nats.
+        gate_probability: a received estimate is fused if it agrees with the node's own; consistent
             estimates, however correlated, pass that gate with at least this probability.
         liar: number of the node that sends false estimates.
-        lie_m: what the liar adds to its estimates.
-        lie_after_s: from when on the liar does so.
+        lie_m: offset that the liar adds to its estimates.
+        lie_after_s: time from the start after which the liar adds the offset.
     """
 
     rule: Rule = "ci-trace"
@@ -105,17 +106,17 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
 
 
 def message_bytes(name: str, states: int) -> int:
-    """Count a message's bytes: stamp, mean, the covariance's triangle, twice that for split CI."""
+    """Count the bytes of a message: stamp, mean, and the covariance's triangle (twice for split CI)."""
     triangle = states * (states + 1) // 2
     doubles = {ALONE: 0, "split-ci": 1 + states + 2 * triangle}.get(name, 1 + states + triangle)
     return 8 * doubles
 
 
 def solve(given: Given[NetworkParameters]) -> list[Ragged]:
-    """Replay the network, see the module.
+    """Replay the network; see the module's docstring.
 
-    Raises BadInput where a link or the liar names an unknown node, or a message arrives before it was
-    sent.
+    Raises BadInput if a link or the liar refers to an unknown node, or if a message arrives before it
+    was sent.
     """
     (sensors, components), parameters = given.setup, given.parameters
     prior_ns, prior_mean, prior_covariance = given.prior("/prior")
@@ -177,7 +178,7 @@ def _schedule(
     prior_ns: Integers,
     name: str,
 ) -> tuple[Activities, Sensing, Integers]:
-    """Return the activities of all nodes and runs, their measurements, and the rows of what arrives."""
+    """Return the activities of all nodes and runs, their measurements, and rows of arriving messages."""
     numbers = list(sensors)
     centralised = name == CENTRALISED
     sensing = _sensing(whole, sensors, components)
@@ -217,7 +218,7 @@ def _schedule(
     instants, rank = np.unique(stacked[1], return_inverse=True)
     keys = (stacked[0] * len(instants) + rank) * len(numbers) + stacked[2]
     found, activity = np.unique(np.where(usable, keys, -1), return_inverse=True)
-    early = int(found[0] == -1) if len(found) else 0  # what happened before the prior
+    early = int(found[0] == -1) if len(found) else 0  # events before the prior
     found, activity = found[early:], activity - early
     moment, node_of = np.divmod(found, len(numbers))
     run_of, instant = np.divmod(moment, len(instants))
@@ -247,7 +248,7 @@ def _schedule(
 
 
 def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
-    """Return run, stamp and index of the part, of all messages, part by part."""
+    """Return run, stamp and index of the part for all messages, part by part."""
     run = [run_of_rows(part.offsets) for part in parts]
     index = [np.full(len(part), number) for number, part in enumerate(parts)]
     time_ns = [part.stream.publish_time_ns for part in parts]
@@ -299,9 +300,9 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: NetworkParameters) ->
 
 
 def state_of(prior: Topic) -> list[str]:
-    """Return a prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
+    """Return a prior's components: positions, then the velocity of each, such as `x_m` and `vx_mps`.
 
-    Raises BadInput where they are not these.
+    Raises BadInput if the prior has other components.
     """
     stated = [name for name in prior.metadata.get("components", "").split(",") if name]
     positions = [name for name in stated if name.endswith("_m")]

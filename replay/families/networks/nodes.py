@@ -1,4 +1,4 @@
-"""Runs the nodes of a network between events: they predict, measure, send, receive and fuse."""
+"""Nodes of a network: prediction, measurement, sending, receiving and fusion at their events."""
 
 from typing import NamedTuple
 
@@ -24,11 +24,11 @@ from fuselog.replay.inference.run.loops import Follow, over_stamps
 
 
 class Activities(NamedTuple):
-    """Holds each moment of a node at which it measures, sends or receives, by run, time and node.
+    """The moments at which nodes measure, send or receive, ordered by run, time and node.
 
-    Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
-    measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
-    in which a message was sent, `may_send` says in which activities a node has a chance to send.
+    Run r owns offsets[r]:offsets[r + 1]. Activity a uses the measurements measured[a]:measured[a + 1]
+    and the messages received[a]:received[a + 1]. `message` (m,) is the activity in which a message was
+    sent; `may_send` marks the activities in which a node can send.
     """
 
     offsets: Integers
@@ -41,7 +41,7 @@ class Activities(NamedTuple):
 
 
 class Sensing(NamedTuple):
-    """Holds measurements in the order of their activities: (k, n), NaN where not measured.
+    """Measurements (k, n) in the order of their activities, NaN if not measured.
 
     `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
     """
@@ -53,12 +53,12 @@ class Sensing(NamedTuple):
 
 
 class NodeFusion(NamedTuple):
-    """Holds the rule's number in `covariance_intersection.RULES`, and how exactly weights are optimised.
+    """The rule's number in `covariance_intersection.RULES`, and when nodes send and accept estimates.
 
-    With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
-    at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
-    squared distance between a prediction and what is heard, infinity where everything is fused. The
-    index `faulty_node` is -1 where there is none.
+    If `own_first`, a node fuses its own x* instead of its prediction. A node sends a message if it
+    differs by at least `divergence` nats from the last one, which must be at least `interval_ns` old.
+    `gate` is the largest squared distance between a prediction and a received estimate, infinite if
+    everything is accepted. `faulty_node` is an index, -1 if there is none.
     """
 
     rule: int
@@ -73,11 +73,11 @@ class NodeFusion(NamedTuple):
 
 
 class NodeInputs(NamedTuple):
-    """Holds what the nodes go by, all runs; the prior's stamp, mean and covariance are of every run.
+    """Inputs of the nodes in all runs; stamp, mean and covariance of the prior are given per run.
 
     Attributes:
         events: the activities.
-        sensing, fusion: what nodes measure, and how they fuse.
+        sensing, fusion: the measurements of nodes, and how nodes fuse estimates.
         prior_ns, prior_mean, prior_covariance: (runs,), (runs, n), (runs, n, n).
     """
 
@@ -90,12 +90,13 @@ class NodeInputs(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Holds what the nodes of one run know, first axis = node.
+    """Estimates of the nodes of one run, first axis nodes.
 
     Attributes:
-        time_ns: (nodes,), of their estimates.
+        time_ns: stamps of the estimates, (nodes,).
         mean, covariance: (nodes, n), (nodes, n, n).
-        last_ns, last_mean, last_covariance: of each node's last message; -1 where there is none.
+        last_ns, last_mean, last_covariance: stamp, mean and covariance of each node's last message;
+            stamp -1 if there is none.
     """
 
     time_ns: Integers
@@ -107,7 +108,7 @@ class Nodes(NamedTuple):
 
 
 class NodeMemory(NamedTuple):
-    """Holds what one core works in: a run's nodes, and what one of them fuses, weights (most,)."""
+    """Scratch memory of a core: a run's nodes, the estimates that a node fuses, and weights (most,)."""
 
     nodes: Nodes
     parts: Estimate
@@ -116,7 +117,7 @@ class NodeMemory(NamedTuple):
 
 
 def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
-    """Allocate memory for so many nodes, of which each fuses so many estimates at most."""
+    """Allocate memory for `nodes` nodes that each fuse at most `most` estimates."""
     square, many = (nodes, states, states), (most, states, states)
     return NodeMemory(
         Nodes(
@@ -134,9 +135,9 @@ def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
 
 
 class NodeResults(NamedTuple):
-    """Holds a row per activity: the estimates, x* as it is sent, and whether it is.
+    """Results per activity: the estimates, x* as it is sent, and whether it is sent.
 
-    `refused` (m,) says of every message that arrived whether the gate kept it out.
+    `refused` (m,) marks the arrived messages that the gate rejected.
     """
 
     mean: Floats
@@ -154,7 +155,7 @@ def move(mean: Floats, covariance: Floats, density: float, duration_s: float) ->
     Args:
         mean, covariance: (n,), positions in m, then velocities in m/s; (n, n).
         density: power spectral density of the acceleration, in m^2/s^3.
-        duration_s: how long.
+        duration_s: duration of the prediction, in s.
     """
     predict_constant_velocity(
         mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s)
@@ -164,12 +165,12 @@ def move(mean: Floats, covariance: Floats, density: float, duration_s: float) ->
 def observe(
     mean: Floats, covariance: Floats, independent: Floats, value: Floats, variance: Floats
 ) -> None:
-    """Update with what is measured, component by component, in place.
+    """Update with a measurement, component by component, in place.
 
     Args:
         mean, covariance: (n,), (n, n).
         independent: the part of the covariance from measurements since it was zero, (n, n).
-        value, variance: (n,), NaN for what is not measured.
+        value, variance: (n,), NaN for components that are not measured.
     """
     size = len(mean)
     gain, crossed = np.empty(size), np.empty(size)
@@ -199,12 +200,12 @@ def observe(
 def observe_all(
     activity: int, mean: Floats, covariance: Floats, independent: Floats, inputs: NodeInputs
 ) -> None:
-    """Update with all that a node measures in an activity, see `observe`.
+    """Update with all measurements of a node in an activity; see `observe`.
 
     Args:
-        activity: its number.
+        activity: number of the activity.
         mean, covariance, independent: as for `observe`.
-        inputs: with the measurements.
+        inputs: inputs of the nodes, with the measurements.
     """
     activities, sensing = inputs.events, inputs.sensing
     for k in range(activities.measured[activity], activities.measured[activity + 1]):
@@ -213,7 +214,7 @@ def observe_all(
 
 
 def squared_distance(difference: Floats, covariance: Floats) -> float:
-    """Return the squared Mahalanobis distance; infinity where the covariance is singular.
+    """Compute the squared Mahalanobis distance; infinity if the covariance is singular.
 
     Args:
         difference, covariance: (n,), (n, n).
@@ -229,10 +230,10 @@ def squared_distance(difference: Floats, covariance: Floats) -> float:
 
 
 def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
-    """Return the Kullback-Leibler divergence (nats) of a Gaussian from another one, the second.
+    """Compute the Kullback-Leibler divergence (nats) of a first Gaussian from a second one.
 
     Args:
-        mean, covariance, of_mean, of_covariance: of the first and the second, (n,), (n, n).
+        mean, covariance, of_mean, of_covariance: both Gaussians, (n,), (n, n).
     """
     size = len(mean)
     information, difference = np.empty_like(covariance), np.empty(size)
@@ -247,13 +248,13 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
 
 
 def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
-    """Tell whether an estimate may be of the same state, however both are correlated.
+    """Test whether two estimates can be of the same state, whatever their correlation.
 
-    The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
+    The covariance of the difference is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
 
     Args:
         mean, covariance, received: both estimates, (n,), (n, n).
-        gate: their largest squared distance; infinity lets everything in.
+        gate: their largest squared distance; infinity accepts everything.
     """
     if gate == np.inf:
         return True
@@ -265,9 +266,9 @@ def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) ->
 
 
 def following() -> Follow:
-    """Make the loop over the activities of one run, until these end or a fusion fails.
+    """Make the loop over the activities of one run, which ends after the last one or if a fusion fails.
 
-    Returns `follow(run, inputs, failed_ns, results, work)`, which fills in when the run failed.
+    Returns `follow(run, inputs, failed_ns, results, work)`, which writes the time of a failure.
     """
     go_through = over_stamps(act)
 
@@ -293,13 +294,13 @@ def act(
     results: NodeResults,
     work: NodeMemory,
 ) -> bool:
-    """Take all nodes through a time: they send first, then take in what they hear; False if they fail.
+    """Process one time of all nodes: they send, then receive and fuse; return False if a fusion fails.
 
     Args:
-        run: which.
-        begin, end: the activities of this time.
-        inputs, results, work: what nodes go by, what is filled, what is worked in.
-        failed_ns: (runs,), gets the time at which a fusion fails.
+        run: number of the run.
+        begin, end: the activities at this time.
+        inputs, results, work: inputs of the nodes, results to fill, and scratch memory.
+        failed_ns: (runs,), times at which a fusion failed, overwritten.
     """
     activities, fusion, (nodes, parts, weights, memory) = inputs.events, inputs.fusion, work
     for activity in range(begin, end):
@@ -314,7 +315,7 @@ def act(
             if not gap < np.inf:
                 failed_ns[run] = activities.time_ns[begin]
                 return False
-        # the independent part is of no use any more
+        # the independent part is not used after this
         observe_all(activity, mean, covariance, parts.independent[0], inputs)
         copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
     return True
@@ -323,7 +324,7 @@ def act(
 def predict_and_send(
     activity: int, start_ns: int, inputs: NodeInputs, nodes: Nodes, results: NodeResults
 ) -> None:
-    """Predict a node to now, update x* with its own measurements, and send that where it is due."""
+    """Predict a node to now, update x* with its own measurements, and send x* if it is due."""
     activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now = activities.node[activity], activities.time_ns[activity]
     if now > nodes.time_ns[node]:
@@ -346,12 +347,12 @@ def predict_and_send(
 def is_due(
     node: int, now: int, mean: Floats, covariance: Floats, inputs: NodeInputs, nodes: Nodes
 ) -> bool:
-    """Tell whether x* may be sent again, and differs enough from what the last message says of now.
+    """Test whether x* may be sent again and differs enough from the last message, predicted to now.
 
     Args:
-        node, now: its number, and the time in ns.
+        node, now: number of the node, and the time in ns.
         mean, covariance: x*, (n,), (n, n).
-        inputs, nodes: what nodes go by, and what they sent last.
+        inputs, nodes: inputs of the nodes, and their last messages.
     """
     sensing, fusion = inputs.sensing, inputs.fusion
     if nodes.last_ns[node] < 0:
@@ -369,7 +370,7 @@ def is_due(
 def receive(
     activity: int, inputs: NodeInputs, nodes: Nodes, parts: Estimate, results: NodeResults
 ) -> int:
-    """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
+    """Collect the estimates that a node fuses, its own first, predicted to now; return their number."""
     activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
     first, end = activities.received[activity], activities.received[activity + 1]
@@ -384,7 +385,7 @@ def receive(
             mean, covariance = results.sent_mean[source], results.sent_covariance[source]
         copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
         late_s = (now - activities.time_ns[source]) * 1e-9
-        # what was new in a late one others may have passed on
+        # other nodes may have forwarded the information of a late message, so it is not independent
         new = 1.0 if not is_own and late_s <= 0.0 else 0.0
         for row in range(size):
             for column in range(size):

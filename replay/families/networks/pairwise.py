@@ -1,4 +1,4 @@
-"""Fuses two estimates: inverse and split covariance intersection, and the weight of a sighting."""
+"""Fusion of two estimates by inverse and split covariance intersection, and the weight of a sighting."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ SIGHTING_STEPS = 40
 
 
 def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
-    """Fuse two estimates by inverse CI at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
+    """Fuse two estimates by inverse CI: I_a + I_b minus the inverse of w P_a + (1 - w) P_b."""
     size, shares = len(fused.mean), (weight, 1.0 - weight)
     covariance, information = np.zeros((3, size, size)), np.empty((3, size, size))
     for i in range(2):
@@ -50,7 +50,7 @@ def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
 
 
 def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
-    """Split CI of two estimates at a weight: only the correlated parts are divided by it."""
+    """Fuse two estimates by split CI: only the correlated parts are divided by the weights."""
     size, shares = len(fused.mean), (weight, 1.0 - weight)
     part, information = np.empty((size, size)), np.empty((2, size, size))
     for i in range(2):
@@ -76,7 +76,7 @@ def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
 
 
 def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> float:
-    """Fuse two estimates at a weight; returns the trace, infinite where they cannot be fused."""
+    """Fuse two estimates with a weight; return the trace, infinite if they cannot be fused."""
     is_fused = mix_split(weight, pair, fused) if is_split else mix_inverse(weight, pair, fused)
     if not is_fused:
         return np.inf
@@ -87,11 +87,11 @@ def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> 
 
 
 class Stake(NamedTuple):
-    """Holds what the best weight of a sighting with rows H (m, n) depends on, of a state (n,).
+    """Quantities of a state (n,) that determine the weight of a sighting with Jacobian H (m, n).
 
     Attributes:
         states: n.
-        trace: of the covariance P.
+        trace: trace of the covariance P.
         spread: H P H' (m, m).
         square: H P P H' (m, m).
     """
@@ -103,24 +103,24 @@ class Stake(NamedTuple):
 
 
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """Find the weight w of a measurement of part of a state that rests on another estimate.
+    """Find the best weight w of a measurement of part of a state that depends on another estimate.
 
-    Its noise has a part that is correlated with the state in an unknown way, and one that is not, the
-    sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace, which depends on
-    the state's units, or the least determinant, which does not. It is above 0: at 0 whatever the
-    measurement does not see would be lost.
+    One part of its noise has an unknown correlation with the state; the other part, the sensor's, is
+    independent. The fusion uses P / w and the noise shared / (1 - w) + own, with the w that minimizes
+    the trace, which depends on the units of the state, or the determinant, which does not. The weight is
+    above 0, since at 0 all components that the measurement does not observe would be lost.
 
-    With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
-    tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
-    logarithm are convex in w.
+    With R = shared / (1 - w) + own and S = H P H' / w + R, the fused covariance has the trace tr P / w -
+    tr(S^-1 H P P H') / w^2 and a determinant proportional to |R| / (w^n |S|). Trace and log determinant
+    are convex in w.
 
     Args:
-        by_trace: whether the trace is least, or the determinant.
-        stake: what the measurement says of the state.
-        shared, own: the parts of the noise, (m, m).
+        by_trace: whether to minimize the trace; otherwise the determinant.
+        stake: projections of the state's covariance onto the measurement.
+        shared, own: the correlated and the independent part of the noise, (m, m).
 
     Returns:
-        The weight; NaN where a covariance is singular.
+        The weight; NaN if a covariance is singular.
     """
     noise, total, precision = np.empty_like(own), np.empty_like(own), np.empty_like(own)
     section = np.empty(7)
@@ -142,7 +142,7 @@ def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -
 
 
 def fuse_in_turn(is_split: bool, count: int, parts: Estimate, into: Fused, tolerance: float) -> float:
-    """Fuse one estimate after another, each at the weight of the least trace."""
+    """Fuse one estimate after another, each with the weight that minimizes the trace."""
     (mean, covariance, weights), steps = into, steps_for(tolerance)
     size = len(mean)
     pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))

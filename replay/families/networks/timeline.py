@@ -1,7 +1,8 @@
-"""Draws a sensor network: its graph with the messages, the nodes' estimates, NEES by node.
+"""Timeline of a sensor network: its graph with messages, the nodes' estimates, and NEES per node.
 
-A message runs from its sender towards its receiver when it is sent; one that is lost is red and ends
-half way. Each fusion rule has maps of its own: the ways, and every node's error with its 95 % ellipse.
+A message is drawn from its sender to its receiver when it is sent; a lost message is red and ends
+half-way. Each fusion rule has its own maps: the trajectories, and every node's error with its 95 %
+ellipse.
 """
 
 from collections.abc import Sequence
@@ -45,19 +46,19 @@ GRAPH = f"{ROOT}/graph"
 PLACE = ("x_m", "y_m")
 ARRIVED = (0, 158, 115, 255)
 LOST = (*WRONG, 255)
-# Plots are drawn for so many nodes, and an event names so many lost messages.
+# Largest number of nodes with plots, and of lost messages that an event names.
 PLOTTED_NODES = 6
 NAMED_MESSAGES = 8
-# Nodes are named on the map of errors at so many times at most.
+# Largest number of times at which nodes are labelled on the map of errors.
 NAMED_TIMES = 500
-# The errors' map shows what this share of them does not reach beyond.
+# Share of the errors that are inside the bounds of their map.
 SHOWN_SHARE = 0.9
-# Both directions of a link lie side by side, this share of the circle's radius apart.
+# Distance between both directions of a link, as a share of the circle's radius.
 APART = 0.05
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the graph, the maps of all rules and the events beside NEES and errors of the nodes."""
+    """Draw the graph, the maps of all rules and the events, next to NEES and errors of the nodes."""
     turn_up(canvas)
     links = scene.read("/links")
     nodes = _nodes(scene, links)
@@ -76,7 +77,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw the plots of one node."""
+    """Draw the NEES plots of one node, titled by its name."""
     views = draw_nees(canvas, scene, case, legend=False)
     for view in views:
         view.name = f"{case}: {view.name}"
@@ -84,7 +85,7 @@ def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
 
 
 def _nodes(scene: Scene, links: Stream) -> NDArray[np.int64]:
-    """Return the numbers (n,) of all nodes that sense, send or hear."""
+    """Return the numbers (n,) of all nodes that measure, send or receive."""
     parts = [topic.removeprefix("/node").partition("/") for topic in scene.source.topics]
     sensing = [int(number) for number, _, leaf in parts if leaf == "sensor" and number.isdigit()]
     numbers = np.concatenate([links["sender_id"], links["receiver_id"], sensing])
@@ -92,7 +93,7 @@ def _nodes(scene: Scene, links: Stream) -> NDArray[np.int64]:
 
 
 def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.Spatial2DView:
-    """Draw nodes on a circle, links as lines, and the messages of the moment on them."""
+    """Draw nodes on a circle, links as lines, and the current messages on them."""
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(len(nodes)) / max(len(nodes), 1)
     places = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     draw_points(canvas, f"{GRAPH}/nodes", nodes, places)
@@ -120,7 +121,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
 
 
 def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
-    """Draw for each estimator the way of the truth and of all nodes, and below it their errors."""
+    """Draw the trajectories of the truth and of all nodes for each estimator, and their errors below."""
     truth, shown = f"{ROOT}/truth", [np.empty((0, 2))]
     for stream in scene.truths_of(""):
         places = stream["state"][:, [stream.components.index(name) for name in PLACE]]
@@ -150,10 +151,10 @@ def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
 
 
 def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
-    """Draw the way of one node's estimates; returns its entity."""
+    """Draw the trajectory of one node's estimates; return its entity."""
     stroke = stroke_of(scene, errors.estimator)
     for name, stream in scene.outputs_of(errors.case, schemas.GAUSSIAN_ESTIMATE):
-        # what a node sent is a Gaussian too, without a truth to be judged by
+        # sent messages are Gaussians too, but without a truth to compare with
         if name == errors.estimator and "truth" in stream.metadata:
             places = stream["mean"][:, [stream.components.index(name) for name in PLACE]]
             draw_path(canvas, f"{root}/{errors.case}", stream.publish_time_ns, places, stroke)
@@ -161,7 +162,7 @@ def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
 
 
 def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> float:
-    """Draw one node's error of the position, the truth in the middle; returns how far to show."""
+    """Draw one node's position error, with the truth at the origin; return the extent to show."""
     stroke, entity = Stroke(scene.colour(errors.estimator)), f"{root}/{errors.case}"
     columns = [errors.components.index(name) for name in PLACE]
     error, covariance = errors.error[:, columns], errors.covariance[:, columns][:, :, columns]
@@ -173,7 +174,7 @@ def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> floa
 
 
 def _draw_names(canvas: Canvas, entity: str, found: Sequence[Errors], extent_m: float) -> None:
-    """Write the nodes' numbers beside their errors, together where they would cover each other."""
+    """Label errors with the nodes' numbers, and join labels that would overlap."""
     if not found:
         return
     known = np.unique(np.concatenate([errors.time_ns for errors in found]))
@@ -198,7 +199,7 @@ def _draw_names(canvas: Canvas, entity: str, found: Sequence[Errors], extent_m: 
 
 
 def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLogView]:
-    """List what happened to estimators, sensors and messages."""
+    """List the events of estimators, sensors and messages."""
     plotted, others = scene.cases[: PLOTTED_NODES + 1], scene.cases[PLOTTED_NODES + 1 :]
     happened = [draw_events(canvas, scene, case, more=others) for case in plotted[:1]]
     happened += [draw_events(canvas, scene, case) for case in plotted[1:]]
@@ -211,7 +212,7 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
 
 
 def _line_of(sent: Stream) -> str:
-    """Write the messages that are sent at one time as a line."""
+    """Summarize the messages sent at one time in a line."""
     ways = [f"{a}>{b}" for a, b in zip(sent["sender_id"], sent["receiver_id"], strict=True)]
     late_s = (sent["arrival_time_ns"] - sent.publish_time_ns) * 1e-9
     parts = [f"{len(sent)} messages sent"]

@@ -1,4 +1,4 @@
-"""Filters several cooperative vehicles jointly, with unordered fixes.
+"""Joint filters of several cooperative vehicles, with unordered fixes.
 
 Begin with `streams`.
 """

@@ -1,7 +1,7 @@
-"""Associates detections with vehicles: by the best map, or all maps of an unordered scan with weights.
+"""Association of detections with vehicles: the best map, or all maps of an unordered scan with weights.
 
-A map sends every vehicle to a detection of its own or to none; the detections left over are false.
-The weights are those of a scan with detection probability p_D and Poisson clutter of uniform density.
+A map assigns every vehicle its own detection or none; unassigned detections are false. The weights are
+those of a scan with detection probability p_D and Poisson clutter of uniform density.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Integers
 
 MISSED = -1
-# Detections farther than this from a vehicle are not tried for it, nor maps that are so improbable.
+# Detections outside this gate are not tried for a vehicle, and less probable maps are dropped.
 GATE_PROBABILITY = 1.0 - 1e-12
 LEAST_WEIGHT = 1e-9
-# A scan that should be whole and clean, but is not, is read as one that is nearly so.
+# Smallest clutter and miss probability: they apply if a scan is not complete although it should be.
 LEAST_CLUTTER_PER_M2 = 1e-12
 LEAST_MISSED = 1e-9
 
 
 class Scanning(NamedTuple):
-    """Holds what is known of a sensor of unordered scans."""
+    """Properties of a sensor of unordered scans."""
 
     variance_m2: float
     detection_probability: float
@@ -29,21 +29,21 @@ class Scanning(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Tell whether a scan holds every vehicle once and nothing else."""
+        """Test whether a scan contains every vehicle once and nothing else."""
         return self.detection_probability == 1.0 and self.clutter_per_m2 == 0.0
 
     @property
     def log_odds_of_detection(self) -> float:
-        """Return the log weight of being detection j, before its likelihood, to being missed."""
+        """Return the log weight of a detection relative to a miss, before the likelihood."""
         missed = max(1.0 - self.detection_probability, LEAST_MISSED)
         clutter = max(self.clutter_per_m2, LEAST_CLUTTER_PER_M2)
         return float(np.log(self.detection_probability / (missed * clutter)))
 
 
 class Hypotheses(NamedTuple):
-    """Holds maps of all runs, sorted by run: each vehicle's detection (h, vehicles), or MISSED.
+    """Maps of all runs, sorted by run: each vehicle's detection (h, vehicles), or MISSED.
 
-    `log_weight` (h,) is what scanning alone says, without the likelihood of the places.
+    `log_weight` (h,) is the weight from the scan's properties, without the likelihood of the positions.
     """
 
     run: Integers
@@ -52,12 +52,12 @@ class Hypotheses(NamedTuple):
 
 
 def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -> Floats:
-    """Compute how likely a vehicle is a detection, (runs, vehicles, detections); -inf outside gates.
+    """Compute log likelihoods of detections (runs, vehicles, detections); -inf outside the gates.
 
     Args:
         predicted: (runs, vehicles, axes).
         covariance: of a detection about its vehicle's prediction, (runs, vehicles, axes, axes).
-        detections: (runs, detections, axes), NaN where a run has no more.
+        detections: (runs, detections, axes), padded with NaN.
     """
     axes = predicted.shape[-1]
     difference = detections[:, None] - predicted[:, :, None]
@@ -69,7 +69,7 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
 
 def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """Return the most probable map of every run, vehicles taken as independent (Hungarian method).
+    """Return the most probable map of every run for independent vehicles (Hungarian method).
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
@@ -90,7 +90,7 @@ def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 
 def _assigned(gain: Floats) -> Integers:
-    """Find the map (vehicles,) of most gain (vehicles, detections) in sum; being missed has 0."""
+    """Find the map (vehicles,) with the largest total gain (vehicles, detections); a miss has gain 0."""
     from scipy.optimize import linear_sum_assignment  # which takes long to import
 
     vehicle, detection = linear_sum_assignment(-np.maximum(gain, 0.0))
@@ -100,9 +100,9 @@ def _assigned(gain: Floats) -> Integers:
 
 
 def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """Return all maps of every run inside the gates, but for those of next to no weight.
+    """Return all maps of every run inside the gates, except those with negligible weight.
 
-    Where a scan is whole and clean, no vehicle is missed, unless nothing is left for it.
+    If a scan is complete and without clutter, no vehicle is missed unless no detection is left for it.
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
@@ -123,7 +123,7 @@ def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 
 def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
-    """Build maps of some runs, one vehicle after another; `log_weight` is the sum of gains."""
+    """Build the maps of some runs, one vehicle after another; `log_weight` is the sum of gains."""
     _, vehicles, detections = gain.shape
     run, chosen = runs, np.empty((len(runs), 0), np.int64)
     taken, score = np.zeros((len(runs), detections), bool), np.zeros(len(runs))
@@ -146,16 +146,16 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
 
 
 def log_permanents(logs: Floats) -> Floats:
-    """Compute the logarithms of permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
+    """Compute log permanents of exp(logs), (...,) from (..., n, n): sums over permutations.
 
-    The first rows share out every set of so many columns, n 2^(n-1) products of positive numbers. A
-    permanent too small for a number is that of its greatest term.
+    Dynamic programming over subsets of columns takes n 2^(n-1) products of positive numbers. If a
+    permanent underflows, the result is its greatest term.
     """
     n = logs.shape[-1]
     flat = logs.reshape(-1, n, n)
     greatest = flat.max(axis=2, keepdims=True)
     entries = np.moveaxis(np.exp(flat - greatest), 0, -1)
-    shared = np.ones((1 << n, len(flat)))  # by set of columns, a bit each
+    shared = np.ones((1 << n, len(flat)))  # index: set of columns, one bit each
     for columns in range(1, 1 << n):
         row = columns.bit_count() - 1
         taken = (column for column in range(n) if columns >> column & 1)

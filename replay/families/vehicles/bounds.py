@@ -1,7 +1,7 @@
-"""Computes vehicles' total error: exact for the Kalman filter, bounds for what uses more.
+"""Total error of vehicles: exact for the Kalman filter, bounds for methods that use more information.
 
-All axes of all vehicles are alike and uncoupled, so everything follows from one axis. The filter
-supposes accelerations; the truth has them (stochastic) or none (deterministic).
+All axes of all vehicles are equal and uncoupled, so one axis is sufficient. The filter assumes random
+accelerations; the truth has them (stochastic) or has none (deterministic).
 """
 
 from typing import NamedTuple
@@ -15,9 +15,9 @@ SETTLED = 2000
 
 
 class Axis(NamedTuple):
-    """Holds one axis over the steps: squared position errors by the filter and of a truth without noise.
+    """Squared position errors of one axis: by the filter's covariance, and for a truth without noise.
 
-    `gain` (2,) is the last one, of position and velocity.
+    `gain` (2,) is the last gain, of position and velocity.
     """
 
     stochastic: Floats
@@ -51,9 +51,10 @@ def follow_axis(
 
 
 class Bounds(NamedTuple):
-    """Holds total errors in m of settled filters, by what is made of the infrastructure sensor.
+    """Total errors in m of steady-state filters, by the use of the infrastructure sensor.
 
-    Each measured combination of the positions is known as with all fixes, the others by own fixes alone.
+    Each combination of positions that the sensor measures has the error of all fixes; the other
+    combinations have the error of a vehicle's own fixes.
     """
 
     topology: float
@@ -64,7 +65,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """Compute the least total errors; topology is one combination, a shape seen anyhow all but three."""
+    """Compute the smallest total errors; the topology measures 1 combination, a free pose all but 3."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"
@@ -74,7 +75,7 @@ def bounds(
 
 
 def exact_total_error(vehicles: int, fix_variance_m2: float, steps: int, *, stochastic: bool) -> float:
-    """Return the Kalman filter's root of the expected squared total error over so many steps, in m."""
+    """Compute the Kalman filter's root mean square total error over `steps` steps, in m."""
     axis = follow_axis(fix_variance_m2, steps=steps)
     squared = axis.stochastic if stochastic else axis.deterministic
     return float(np.sqrt(2 * vehicles * squared.mean()))

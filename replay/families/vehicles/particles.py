@@ -1,9 +1,9 @@
-"""Filters cooperative vehicles with unordered fixes by particles.
+"""Particle filters of cooperative vehicles with unordered fixes.
 
 Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric
-measurement equation filter", 2016 (a bootstrap filter on sums of powers: their exact likelihood is a
+measurement equation filter", 2016 (a bootstrap filter on sums of powers, whose exact likelihood is a
 permanent for each axis); Doucet, de Freitas, Murphy, Russell, "Rao-Blackwellised particle filtering for
-dynamic Bayesian networks", UAI 2000 (here associations are drawn and vehicles filtered). A method is
+dynamic Bayesian networks", UAI 2000 (here, associations are sampled and vehicles filtered). A method is
 named `KIND-PARTICLES` or `KIND-PARTICLES-topology`, as in `vehicle-particles:axes-1000-topology`.
 """
 
@@ -64,10 +64,10 @@ _choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):
-    """States the method and its random numbers, which depend on `seed` and on the run's first fixes.
+    """The method and its random numbers, which depend on `seed` and on the run's first fixes.
 
     Attributes:
-        method: what particles are of (set, axes or associations) and their number, as in
+        method: kind of the particles (set, axes or associations) and their number, as in
             associations-60; -topology adds the roadside sensor.
         seed: seed of the random numbers.
     """
@@ -77,11 +77,11 @@ class ParticlesParameters(Parameters):
 
 
 class Cloud(NamedTuple):
-    """Holds the particles of all runs.
+    """The particles of all runs.
 
-    Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone, the
-    covariances are empty. Log weights are (runs, particles). Generators are made when a run's first
-    fixes are there.
+    Each particle is a Gaussian of all vehicles (runs * particles, n). For a bootstrap filter, it has
+    only a mean, and the covariances are empty. Log weights are (runs, particles). A run's generator is
+    made when its first fixes arrive.
     """
 
     carried: VehiclesState
@@ -91,7 +91,7 @@ class Cloud(NamedTuple):
 
 
 class Method(NamedTuple):
-    """Names what is done: see `KINDS`."""
+    """A particle method: its kind, see `KINDS`, and its settings."""
 
     kind: str
     particles: int
@@ -100,7 +100,7 @@ class Method(NamedTuple):
 
 
 def parse_method(method: str, seed: int) -> Method:
-    """Return a method from its name; raises BadInput for another."""
+    """Parse the name of a method; raise BadInput if it is unknown."""
     found = re.fullmatch(r"([a-z]+)-([1-9]\d*)(-topology)?", method)
     if found is None or found[1] not in KINDS:
         known = ", ".join(f"{kind}-1000" for kind in KINDS)
@@ -142,7 +142,7 @@ def _run(settings: tuple[Setup, Method], before: Cloud, block: Block) -> tuple[C
 
 
 def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: int, number: int) -> None:
-    """Take the particles of one run through one frame, in place."""
+    """Process one frame of one run with its particles, in place."""
     own = slice(run * method.particles, (run + 1) * method.particles)
     rng = _generator(method, cloud, frames, run, number)
     duration_s = (frames.time_ns[run, number] - cloud.carried.time_ns[run]) * 1e-9
@@ -180,7 +180,7 @@ def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: in
 def _generator(
     method: Method, cloud: Cloud, frames: Frames, run: int, number: int
 ) -> np.random.Generator:
-    """Make a run's own random stream, the same whatever other runs there are; starts come first."""
+    """Return a run's own generator; if it is new, make it from the first fixes and sample the states."""
     found = cloud.generators[run]
     if found is None:
         seen = frames.network[run, number]
@@ -196,7 +196,7 @@ def _generator(
 
 
 def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generator) -> Floats:
-    """Return states after a turn with an acceleration each."""
+    """Return states after a turn, each with its own random acceleration."""
     motion = setup.motion
     states = joint.mean.reshape(-1, motion.vehicles, STATES)
     moved = np.stack(turn(np.moveaxis(states, -1, 0), motion.turn_rate_radps, duration_s), axis=-1)
@@ -207,7 +207,7 @@ def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generat
 
 
 def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) -> Floats:
-    """Compute the log likelihood (particles,) of full unordered fixes: a permanent, or one per axis."""
+    """Compute the log likelihood (particles,) of unordered fixes by a permanent, or one per axis."""
     places = positions(setup.motion, mean)
     squared = (seen - places[:, :, None]) ** 2 / setup.network.variance_m2
     if method.kind == "set":
@@ -216,7 +216,7 @@ def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) ->
 
 
 def _drawn(setup: Setup, joint: Joint, seen: Floats, rng: np.random.Generator) -> tuple[Joint, Floats]:
-    """Return particles with an association each, and the scan's log likelihood (particles,)."""
+    """Sample an association for each particle; return the particles and the scan's log likelihood."""
     particles, vehicles = len(joint.mean), setup.motion.vehicles
     rows = position_rows(vehicles, setup.states)
     noise = setup.network.variance_m2 * np.ones(2 * vehicles)
@@ -238,7 +238,7 @@ def _drawn(setup: Setup, joint: Joint, seen: Floats, rng: np.random.Generator) -
 
 
 def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tuple[Joint, Floats]:
-    """Return the particles after a full scan's topology, and its log likelihood (particles,)."""
+    """Update particles with a full scan's topology; also return its log likelihood (particles,)."""
     variance_m2 = setup.infrastructure.variance_m2
     if method.kind == "associations":
         measured = topology_measurement(setup.motion, joint, seen[None], variance_m2)
@@ -251,7 +251,7 @@ def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tu
 
 
 def _estimate(method: Method, cloud: Cloud, run: int) -> tuple[Floats, Floats]:
-    """Return the best association's Gaussian, or the moments of the drawn states."""
+    """Return the Gaussian of the best association, or the moments of the sampled states."""
     own = slice(run * method.particles, (run + 1) * method.particles)
     mean = cloud.joint.mean[own]
     weight = np.exp(cloud.log_weight[run])

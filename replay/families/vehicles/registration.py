@@ -1,8 +1,8 @@
-"""Finds where an infrastructure sensor stands, from unordered detections and the vehicles' estimates.
+"""Registration of an infrastructure sensor: its pose from unordered detections and vehicle estimates.
 
-Places are complex numbers here: a turn is a factor of length one, and the best one between centred
-points is the phase of their inner product (Procrustes in the plane). Which detection is of which vehicle
-is found by trying all permutations.
+Positions are complex numbers here: a rotation is a factor of length one, and the best rotation between
+centred points is the phase of their inner product (Procrustes in the plane). All permutations are tried
+to assign detections to vehicles.
 """
 
 from functools import lru_cache
@@ -17,16 +17,16 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 MOST_VEHICLES = 8
-# A fit with so improbable a residual is of other things than the vehicles.
+# If the residual is less probable than this, a detection is not of a vehicle.
 IMPROBABLE = 1e-4
-# By how many squared sigmas the next permutation must fit worse for the best to be believed.
+# The best permutation must fit better than the next by this number of squared sigmas.
 LEAST_LEAD = 30.0
-# Least spread of the vehicles, in sigmas of a place: without it no heading can be told.
+# Smallest spread of the vehicles, in sigmas of a position, that determines a heading.
 LEAST_SPREAD = 5.0
 
 
 class Registration(NamedTuple):
-    """Holds sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
+    """Sensor poses (runs, 3), the detection of every vehicle, and whether both are reliable."""
 
     pose: Floats
     detection: Integers
@@ -34,16 +34,16 @@ class Registration(NamedTuple):
 
 
 def register(places: Floats, detections: Floats, variance_m2: Floats | float) -> Registration:
-    """Find the pose that lays full scans best on places, in any order.
+    """Find the pose that best aligns full scans, in any order, with positions.
 
-    It is not clear where even the best fits badly (something else was taken for a vehicle), another
-    order fits nearly as well, or the vehicles are too close together. `variance_m2` (runs,) is that of a
-    place and a detection together. Raises BadInput for too many vehicles.
+    The result is not clear if the best fit is poor (a detection is not of a vehicle), if another order
+    fits nearly as well, or if the vehicles are too close together. Raises BadInput if there are too many
+    vehicles.
 
     Args:
         places: (runs, vehicles, 2), in m.
         detections: (runs, vehicles, 2), in the sensor's frame, in m.
-        variance_m2: (runs,), that of a place and a detection together.
+        variance_m2: (runs,), sum of the variances of a position and a detection.
     """
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
@@ -71,11 +71,11 @@ def register(places: Floats, detections: Floats, variance_m2: Floats | float) ->
 
 
 def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
-    """Tell whether detections (runs, vehicles, 2), NaN for none, are far enough apart for a heading.
+    """Test whether detections are far enough apart to determine a heading.
 
     Args:
-        detections: (runs, vehicles, 2), in m, NaN for none.
-        variance_m2: (runs,), of a detection.
+        detections: (runs, vehicles, 2), in m, NaN if missing.
+        variance_m2: (runs,), variance of a detection.
     """
     count = np.isfinite(detections[..., 0]).sum(axis=1)
     squared = np.nansum((detections - _middle(detections)) ** 2, axis=(1, 2))
@@ -83,23 +83,23 @@ def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
 
 
 def _middle(places: Floats) -> Floats:
-    """Return means (runs, 1, 2) of what is there of places (runs, vehicles, 2); zero for nothing."""
+    """Return means (runs, 1, 2) of positions (runs, vehicles, 2) without NaN; zero if all are NaN."""
     there = np.isfinite(places)
     count = np.maximum(there.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.where(there, places, 0.0).sum(axis=1, keepdims=True) / count)
 
 
 def fitted_pose(places: Floats, detections: Floats) -> Floats:
-    """Find the poses that lay detections best on places in the same order.
+    """Find the poses that best align detections with positions in the same order.
 
-    Pairs where either is NaN are left out.
+    Pairs with a NaN are ignored.
 
     Args:
         places: (runs, vehicles, 2), in m.
         detections: (runs, vehicles, 2), in the sensor's frame, in m, in the same order.
 
     Returns:
-        (runs, 3), x, y in m and heading in rad.
+        Poses (runs, 3): x, y in m and heading in rad.
     """
     missing = np.any(np.isnan(places + detections), axis=2, keepdims=True)
     places, detections = np.where(missing, np.nan, places), np.where(missing, np.nan, detections)
@@ -110,7 +110,7 @@ def fitted_pose(places: Floats, detections: Floats) -> Floats:
 
 
 def _centred(places: Floats) -> NDArray[np.complex128]:
-    """Return places (runs, vehicles, 2) about their mean, as complex numbers."""
+    """Return positions (runs, vehicles, 2) minus their mean, as complex numbers."""
     return np.asarray((places - _middle(places)) @ np.array([1.0, 1j]))
 
 

@@ -1,8 +1,8 @@
-"""Filters cooperative vehicles from a log's streams: which method uses what, and what it says.
+"""Filters of cooperative vehicles on a log's streams: methods, the topics they use, and their outputs.
 
 A method is named `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how the fixes are
-associated, and what is made of the infrastructure sensor. What came at one time in all runs is a frame;
-frame after frame is filtered in all runs at once.
+associated, and how the infrastructure sensor is used. A frame contains everything with the same stamp in
+a run. The filter processes frame after frame, for all runs in parallel.
 """
 
 import copy
@@ -53,15 +53,15 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """States the method, and what it may assume.
+    """The method and its assumptions.
 
     Attributes:
         method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: how fixes are used (known,
-            hungarian, set, axes, powers, unscented-powers, products or complex), and what of the
-            roadside sensor is (topology, registration or static).
-        registration_scan: number of the scan from which on the sensor's pose may be estimated.
+            hungarian, set, axes, powers, unscented-powers, products or complex), and how the roadside
+            sensor is used (topology, registration or static).
+        registration_scan: number of the first scan from which the sensor's pose may be estimated.
         sigma_fix_m: standard deviation of each component of a fix that does not state its covariance;
-            without one such a fix is not used.
+            if not set, such a fix is not used.
     """
 
     method: str = "hungarian"
@@ -70,9 +70,10 @@ class VehiclesParameters(Parameters):
 
 
 class VehiclesState(NamedTuple):
-    """Carries the joint state from block to block; first axis = run.
+    """The joint state between blocks, first axis runs.
 
-    `scans` counts the infrastructure sensor's; `registered` says that its pose was found.
+    `scans` counts the infrastructure sensor's scans; `registered` marks runs in which its pose was
+    found.
     """
 
     mean: Floats
@@ -84,12 +85,12 @@ class VehiclesState(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """Holds all that came, by run and frame: times (runs, frames), counts (runs,), measurements.
+    """Measurements by run and frame: times (runs, frames), counts (runs,), and values.
 
     `fixes` (runs, frames, vehicles, 2) with `noise` (runs, frames, vehicles, 2, 2), and scans of the
-    network and the infrastructure sensor (runs, frames, detections, 2), are NaN where there are none;
-    `has_network`, `has_sensor` (runs, frames) say where there is a scan, `skipped` (runs, frames,
-    vehicles) where a fix is not used since its covariance is missing.
+    network and the infrastructure sensor (runs, frames, detections, 2), are NaN if missing.
+    `has_network` and `has_sensor` (runs, frames) mark frames with a scan; `skipped` (runs, frames,
+    vehicles) marks fixes that are not used because their covariance is missing.
     """
 
     counts: Integers
@@ -104,9 +105,10 @@ class Frames(NamedTuple):
 
 
 class VehiclesResults(NamedTuple):
-    """Holds means (runs, frames, n), covariances after every frame, and maps where single ones are used.
+    """Means (runs, frames, n), covariances after every frame, and maps if the method uses single ones.
 
-    `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
+    `associated` has arrays (runs, frames, vehicles, ...), with NaN innovations if nothing was
+    associated.
     """
 
     mean: Floats
@@ -115,7 +117,7 @@ class VehiclesResults(NamedTuple):
 
 
 def no_results(setup: Setup, runs: int, frames: int) -> VehiclesResults:
-    """Make results that say nothing."""
+    """Make results that are NaN everywhere."""
     states, vehicles = setup.states, setup.motion.vehicles
     return VehiclesResults(
         np.full((runs, frames, states), np.nan),
@@ -142,7 +144,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
 
 
 def find_vehicles(name: str, topics: Mapping[str, Topic], fixes: str, sensor: str) -> Iterator[Binding]:
-    """Find the topics that a method follows; nothing where one is missing."""
+    """Find the topics that a method uses; yield nothing if one is missing."""
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -167,18 +169,18 @@ def find_vehicles(name: str, topics: Mapping[str, Topic], fixes: str, sensor: st
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
-    """Return the numbers of the vehicles of a log."""
+    """Return the numbers of the vehicles in a log."""
     return list(numbered(topics, "vehicle", "prior", schemas.GAUSSIAN_ESTIMATE))
 
 
 def motion_of(topics: Mapping[str, Topic], numbers: Sequence[int]) -> Motion:
-    """Read how the vehicles move, as their priors' channels state it."""
+    """Read the vehicles' motion parameters from their priors' channels."""
     priors = [topics[f"/vehicle{number}/prior"] for number in numbers]
     return Motion(*(np.array([stated([prior], name) for prior in priors]) for name in Motion._fields))
 
 
 def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
-    """Read what a scan's channel states of its sensor; a log without it has no such sensor."""
+    """Read a sensor's properties from its scan channel; use defaults if the log has no such topic."""
     if topic not in topics:
         return Scanning(1.0, 1.0, 0.0)
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
@@ -189,7 +191,7 @@ def _start(given: Given[Any]) -> tuple[Setup, VehiclesState]:
 
 
 def start(setup: Setup, given: Given[Any]) -> VehiclesState:
-    """Return every run's priors."""
+    """Return the initial state from every run's priors."""
     runs = given.runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
     for vehicle, prior in enumerate(given):
@@ -209,13 +211,13 @@ def run(setup: Setup, carried: VehiclesState, block: Block) -> tuple[VehiclesSta
     for number in range(count):
         rows = np.flatnonzero((number < frames.counts) & ~carried.failed)
         if len(rows):
-            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges fails, no more
+            with np.errstate(over="ignore", invalid="ignore"):  # only the run that diverges fails
                 _advance(setup, carried, frames, number, rows, results)
     return carried, list(outputs_of(setup, frames, results, carried.failed & ~before))
 
 
 def frames_of(setup: Setup, block: Block) -> Frames:
-    """Return a block's messages by run and frame."""
+    """Arrange a block's messages by run and frame."""
     events = block.events
     runs = len(events.offsets) - 1
     run_of = run_of_rows(events.offsets)
@@ -272,7 +274,7 @@ def _advance(
     rows: Integers,
     results: VehiclesResults,
 ) -> None:
-    """Take some runs through one frame: changes their rows of what is carried, and fills the results."""
+    """Process one frame of some runs: update their rows of the state, and write the results."""
     time_ns = frames.time_ns[rows, number]
     joint = _predicted(
         setup, Joint(carried.mean[rows], carried.covariance[rows]), time_ns - carried.time_ns[rows]
@@ -310,7 +312,7 @@ def _advance(
 
 
 def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
-    """Return the joint states after so long, (runs,); most often it is as long in all runs."""
+    """Predict the joint states by durations (runs,), grouped by equal durations."""
     for span_ns in np.unique(duration_ns):
         move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
         joint = where(duration_ns == span_ns, joint, move)
@@ -320,12 +322,12 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Yield every vehicle's estimates, the pose's where it is estimated, and who failed.
+    """Yield every vehicle's estimates, the pose's if estimated, and failures.
 
     Args:
-        setup: of the method.
-        frames, results: what was seen and what came of it, of all runs.
-        failing: (runs,), which failed in these frames.
+        setup: the bound method.
+        frames, results: measurements and results of all runs.
+        failing: (runs,), which runs failed in these frames.
     """
     runs, count = frames.time_ns.shape
     is_estimated = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
@@ -342,7 +344,7 @@ def outputs_of(
         return Ragged(stream, np.concatenate([[0], np.cumsum(rows.sum(axis=1))]))
 
     def innovations(vehicle: int) -> Ragged:
-        """Return what a vehicle was associated with; the target is a detection's number in its scan."""
+        """Return a vehicle's innovations; the target is the number of the detection in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
         is_associated = detection != MISSED
         squared = np.einsum(

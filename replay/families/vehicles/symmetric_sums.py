@@ -1,10 +1,11 @@
-"""Makes pseudo-measurements of symmetric functions of noisy numbers: sums of powers, of products.
+"""Pseudo-measurements from symmetric functions of noisy numbers: sums of powers, sums of products.
 
-Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992;
-Leven and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement
-equations", IEEE TAC 2009. Numbers m = p + v have independent noise of variance sigma^2. A covariance is
-never formed, only a factor W of it: R = W W^H. Its entries span ten decades and more, and R has their
-squares. Complex numbers x + iy, whose parts have the same sigma each, keep which x is of which y.
+Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992; Leven
+and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement
+equations", IEEE TAC 2009. Numbers m = p + v have independent noise with variance sigma^2. A covariance R
+is never formed, only a factor W with R = W W^H: the entries of W span ten decades and more, and those of
+R twice as many. Complex numbers x + iy, whose parts have the same sigma, preserve which x belongs to
+which y.
 """
 
 from itertools import combinations
@@ -20,9 +21,9 @@ Numbers = NDArray  # real or complex
 
 
 class Pseudo(NamedTuple):
-    """Holds a pseudo-measurement at p: expectation (..., n), Jacobian by p, a factor W of its noise.
+    """A pseudo-measurement at p: expectation (..., n), Jacobian by p, and a factor W of its noise.
 
-    The Jacobian is (..., n, n), W (..., n, terms).
+    The Jacobian is (..., n, n) and W is (..., n, terms).
     """
 
     expected: Numbers
@@ -31,10 +32,10 @@ class Pseudo(NamedTuple):
 
 
 def power_sums(m: Numbers, sigma: float) -> Numbers:
-    """Compute unbiased sums of powers (..., n) of measured numbers (..., n): those of order 1 to n.
+    """Compute unbiased sums of powers of order 1 to n, (..., n), from measured numbers (..., n).
 
-    Of real numbers by Hermite polynomials, sigma^a He_a(m / sigma), whose mean is p^a. Powers of
-    complex numbers with circular noise are unbiased as they are.
+    For real numbers, these are sums of Hermite polynomials, sigma^a He_a(m / sigma), whose mean is p^a.
+    Powers of complex numbers with circular noise are unbiased.
     """
     if np.iscomplexobj(m) or sigma == 0.0:
         return raw_power_sums(m)
@@ -47,15 +48,15 @@ def power_sums(m: Numbers, sigma: float) -> Numbers:
 
 
 def raw_power_sums(m: Numbers) -> Numbers:
-    """Compute the paper's (8): sums of powers as they are, biased where numbers are noisy and real."""
+    """Compute the paper's (8): plain sums of powers, which are biased for noisy real numbers."""
     return np.sum(m[..., None, :] ** np.arange(1, m.shape[-1] + 1)[:, None], axis=-1)
 
 
 def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
     """Compute the expected power sums of numbers p (..., n).
 
-    W[a, (i, j)] = s^j a! / ((a - j)! sqrt(j!)) p_i^(a - j) with s = sigma, for complex numbers
-    sigma sqrt(2).
+    W[a, (i, j)] = s^j a! / ((a - j)! sqrt(j!)) p_i^(a - j) with s = sigma, or s = sigma sqrt(2) for
+    complex numbers.
     """
     n = p.shape[-1]
     s = sigma * np.sqrt(2.0) if np.iscomplexobj(p) else sigma
@@ -70,12 +71,12 @@ def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
 
 
 def product_sums(m: Numbers) -> Numbers:
-    """Compute the paper's (7): elementary symmetric functions e_1 ... e_n of (..., n), unbiased."""
+    """Compute the paper's (7): the unbiased elementary symmetric functions e_1 ... e_n of (..., n)."""
     return _elementary(m)[..., 1:]
 
 
 def _elementary(m: Numbers) -> Numbers:
-    """Compute the functions e_0 ... e_n (..., n + 1)."""
+    """Compute the elementary symmetric functions e_0 ... e_n (..., n + 1)."""
     n = m.shape[-1]
     found = np.zeros((*m.shape[:-1], n + 1), m.dtype)
     found[..., 0] = 1.0
@@ -87,7 +88,7 @@ def _elementary(m: Numbers) -> Numbers:
 def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
     """Compute expected sums of products of p (..., n): W[a, T] = sigma^|T| e_{a - |T|}(p without T).
 
-    T are the non-empty subsets of the numbers, 2^n - 1 of them.
+    T runs over the 2^n - 1 non-empty subsets of the numbers.
     """
     n = p.shape[-1]
     columns = []
@@ -98,7 +99,7 @@ def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
             column[..., size - 1 :] = sigma**size * rest
             columns.append(column)
     factor = np.stack(columns, axis=-1)
-    # without its noise, each number's own column is the derivative by it
+    # divided by sigma, the column of each single number is the derivative by that number
     jacobian = factor[..., :n] / sigma if sigma else product_sums_at(p, 1.0).jacobian
     return Pseudo(product_sums(p), jacobian, factor)
 
@@ -106,24 +107,24 @@ def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
 def update_root(
     mean: Floats, root: Floats, measured: Numbers, innovation: Numbers, factor: Numbers
 ) -> tuple[Floats, Floats]:
-    """Apply Kalman's update in square-root form: means (..., n), factors X (..., n, k), P = X X'.
+    """Apply the Kalman update in square-root form: means (..., n), factors X (..., n, k), P = X X'.
 
-    NaN where the numbers have grown beyond all measure, or the innovation's covariance is singular.
-    One QR decomposition of [[W', 0], [Z', X']] gives the root of the innovation's covariance, the gain
-    and the new root. Rows are scaled to one first: sums of powers differ by many decades.
+    The result is NaN if numbers overflow or the innovation covariance is singular. One QR decomposition
+    of [[W', 0], [Z', X']] gives the root of the innovation covariance, the gain and the new root. Rows
+    are scaled to unit length first, because sums of powers differ by many decades.
 
     Args:
-        mean: before.
-        root: X before.
-        measured: Z (..., m, k), how the measurement changes along the columns of X: H X, or its
-            deviations at samples. Complex rows stand for their real and imaginary parts.
+        mean: mean before the update.
+        root: X before the update.
+        measured: Z (..., m, k), the change of the measurement along the columns of X: H X, or its
+            deviations at samples. Complex rows represent their real and imaginary parts.
         innovation: (..., m).
         factor: W (..., m, terms).
     """
     if np.iscomplexobj(measured):
         measured = np.concatenate([measured.real, measured.imag], axis=-2)
         innovation = np.concatenate([innovation.real, innovation.imag], axis=-1)
-        # of circular noise w both parts have half the variance
+        # each part of circular noise has half the variance
         upper = np.concatenate([factor.real, -factor.imag], axis=-1)
         lower = np.concatenate([factor.imag, factor.real], axis=-1)
         factor = np.concatenate([upper, lower], axis=-2) * np.sqrt(0.5)

@@ -1,8 +1,9 @@
-"""Draws vehicles: a map, the same close up, and errors and GOSPA over time.
+"""Timeline of vehicles: a map, a close-up, and errors and GOSPA over time.
 
-Errors are a metre where paths are hundreds, so everything is drawn once more close up: about each
-vehicle's true place, side by side. Detections of the infrastructure sensor are in its own frame; the
-map has them by the sensor's true pose, and registered where an estimator finds that pose.
+Errors are about a metre on trajectories of hundreds of metres, so everything is also drawn in a close-up
+about each vehicle's true position, side by side. Detections of the infrastructure sensor are in its own
+frame; the map shows them transformed by the sensor's true pose, and by the estimated pose if an
+estimator finds it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -65,35 +66,35 @@ SENSOR = f"{ROOT}/sensor"
 FIX: Colour = (150, 150, 90)
 SEEN: Colour = (190, 110, 60)
 LINK = (255, 255, 255, 255)
-# Close-ups stand so far apart, and what is farther away from its vehicle is not drawn there.
+# Distance between close-ups, and largest distance from a vehicle that is drawn in its close-up.
 CELL_M, SHOWN_M = 8.0, 3.8
 
 
 class Vehicles(NamedTuple):
-    """Holds the true places (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
+    """True positions (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
 
     time_ns: Times
     places: Floats
 
     @property
     def number(self) -> int:
-        """Return how many there are."""
+        """Return the number of vehicles."""
         return self.places.shape[1]
 
     def rows(self, time_ns: Times) -> NDArray[np.int64]:
-        """Return the steps of stamps; the next one where a stamp lies between."""
+        """Return the steps of stamps; the next step if a stamp is between two."""
         return np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
 
 
 class Points(NamedTuple):
-    """Holds places (n, 2) at stamps (n,), sorted."""
+    """Positions (n, 2) at sorted stamps (n,)."""
 
     time_ns: Times
     places: Floats
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Return the map above the close-up, beside GOSPA, errors in a tab, and NEES."""
+    """Draw the map above the close-up, next to GOSPA, errors in a tab, and NEES."""
     turn_up(canvas)
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}
@@ -143,7 +144,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Plot NEES of a case, named by it."""
+    """Plot the NEES of a case, titled by its name."""
     views = draw_nees(canvas, scene, case)
     for view in views:
         view.name = f"{case}: {view.name}"
@@ -151,7 +152,7 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
 
 
 def _own(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Plot mode probabilities and effective particles of a case, named by it."""
+    """Plot mode probabilities and effective particles of a case, titled by its name."""
     views = [*draw_modes(canvas, scene, case), *draw_effective(canvas, scene, case)]
     for view in views:
         view.name = f"{view.name}, {case}"
@@ -172,7 +173,7 @@ def _truths(scene: Scene) -> Vehicles:
 
 
 def _tracks(scene: Scene, name: str, vehicles: Vehicles) -> Floats:
-    """Return an estimator's places (steps, vehicles, 2) at the truth's stamps, NaN where it has none."""
+    """Return an estimator's positions (steps, vehicles, 2) at the truth's stamps, NaN if missing."""
     topics = [f"/estimates/{name}/vehicle{n + 1}/state" for n in range(vehicles.number)]
     found = [scene.outputs[topic] for topic in topics if topic in scene.outputs]
     found = [stream for stream in found if set(PLANE) <= set(stream.components)]
@@ -190,7 +191,7 @@ def _points(scene: Scene, topic: str) -> Points:
 
 
 def _registered(scene: Scene) -> list[tuple[str, Points]]:
-    """Return the infrastructure sensor's detections, placed by each estimator that finds its pose."""
+    """Return the infrastructure sensor's detections, placed by each estimator's pose of the sensor."""
     raw = _points(scene, "/infrastructure/detection")
     found = []
     for name, stream in scene.outputs_of("infrastructure", schemas.GAUSSIAN_ESTIMATE):
@@ -205,7 +206,7 @@ def _registered(scene: Scene) -> list[tuple[str, Points]]:
 
 
 def _poses(scene: Scene) -> list[Floats]:
-    """Return the sensor's true poses (n, 3): x, y in m, heading in rad; an empty list without them."""
+    """Return the sensor's true poses (n, 3), x, y in m, heading in rad; an empty list if unknown."""
     return [
         truth["state"]
         for truth in scene.truths_of("infrastructure")
@@ -214,7 +215,7 @@ def _poses(scene: Scene) -> list[Floats]:
 
 
 def _placed(scene: Scene, points: Points) -> Points:
-    """Return points in the sensor's frame on the map, by its true pose: none where that is unknown."""
+    """Transform points from the sensor's frame to the map; drop them if its true pose is unknown."""
     poses = _poses(scene)
     if not poses:
         return Points(points.time_ns[:0], points.places[:0])
@@ -224,7 +225,7 @@ def _placed(scene: Scene, points: Points) -> Points:
 
 
 def _unnamed(scene: Scene) -> Iterator[tuple[str, Points]]:
-    """Yield estimated sets of positions, of which none says whose it is, on the map."""
+    """Yield estimated sets of positions without labels, on the map."""
     for case in ("network", "infrastructure"):
         sizes = dict(scene.outputs_of(case, schemas.ESTIMATE_SIZE))
         for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
@@ -234,9 +235,9 @@ def _unnamed(scene: Scene) -> Iterator[tuple[str, Points]]:
 
 
 def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
-    """Return lines (n, 2, 2) from predicted places to associated fixes, and their vehicles.
+    """Return lines (n, 2, 2) from predicted positions to associated fixes, and their vehicles.
 
-    Of the first estimator that says which detections it took.
+    They are those of the first estimator that states its associations.
     """
     fixes = _points(scene, "/network/detection")
     rows: list[tuple[Times, Floats, NDArray[np.int64]]] = []
@@ -262,7 +263,7 @@ def _draw_map(
     tracks: dict[str, Floats],
     unnamed: Sequence[tuple[str, Points]],
 ) -> None:
-    """Draw paths of truth and estimators, fixes without identity, the sensor and its detections."""
+    """Draw trajectories of truth and estimators, unlabelled fixes, the sensor and its detections."""
     root = f"{ROOT}/map"
     for pose in _poses(scene):
         draw_points(canvas, f"{root}/sensor", np.array(["sensor"]), pose[:1, :2])
@@ -293,7 +294,7 @@ def _draw_close(
     tracks: dict[str, Floats],
     unnamed: Sequence[tuple[str, Points]],
 ) -> None:
-    """Draw everything about each vehicle's true place, the vehicles side by side."""
+    """Draw everything relative to each vehicle's true position, the vehicles side by side."""
     corners = CELL_M * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
     centres = np.stack([CELL_M * np.arange(vehicles.number), np.zeros(vehicles.number)], axis=1)
     frames = rr.LineStrips2D(
@@ -313,7 +314,7 @@ def _draw_close(
     canvas.fix(f"{CLOSE}/truth", truth)
 
     def near(points: Points) -> Points:
-        """Return points in the cells of all vehicles they are near to."""
+        """Return points in the cells of all vehicles that they are near."""
         apart = points.places[:, None] - vehicles.places[vehicles.rows(points.time_ns)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2, initial=0.0) < SHOWN_M)
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])
@@ -354,7 +355,7 @@ def _draw_ellipse(
     stream: Stream,
     centre: Floats,
 ) -> None:
-    """Draw an estimate's 95 % ellipse about its vehicle's true place."""
+    """Draw an estimate's 95 % ellipse relative to its vehicle's true position."""
     place = read_vectors(stream, "mean", PLANE)
     apart = place - vehicles.places[vehicles.rows(stream.publish_time_ns), n]
     covariance = covariances_of(stream, PLANE)
@@ -370,7 +371,7 @@ def _draw_ellipse(
 
 
 def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
-    """Draw the fixes by latitude and longitude, where there are some."""
+    """Draw the fixes by latitude and longitude, if there are any."""
     topics = [topic for topic in scene.source.topics if topic.endswith("/geodetic_fix")]
     fixes = [stream for topic in topics if len(stream := scene.read(topic))]
     for stream in fixes:
@@ -382,7 +383,7 @@ def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
 def _draw_errors(
     canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot GOSPA, which sees no labels, and all vehicles' error together, labels as they are."""
+    """Plot GOSPA, which ignores labels, and the joint error of all vehicles with their labels."""
     for name, places in tracks.items():
         known = np.isfinite(places).all(axis=(1, 2))
         there, truths = places[known], vehicles.places[known]

@@ -1,6 +1,7 @@
-"""Updates the joint filter, by what a method makes of fixes and of the infrastructure sensor.
+"""Updates of the joint filter with fixes and the infrastructure sensor, by method.
 
-Each takes the joint states of some runs and what came in them at one time, and returns them updated.
+Each function takes the joint states of some runs and their measurements at one time, and returns the
+updated states.
 """
 
 from collections.abc import Callable
@@ -59,7 +60,7 @@ SENSOR = {
 
 
 class Setup(NamedTuple):
-    """Holds what a bound method is told; `numbers` are the vehicles', as in their topics' names."""
+    """Settings of a bound method; `numbers` are those of the vehicles in the names of their topics."""
 
     name: str
     numbers: tuple[int, ...]
@@ -73,33 +74,33 @@ class Setup(NamedTuple):
 
     @property
     def has_pose(self) -> bool:
-        """Tell whether the state holds the sensor's pose."""
+        """Test whether the state contains the sensor's pose."""
         return self.sensor in ("registration", "static")
 
     @property
     def uses_sums(self) -> bool:
-        """Tell whether unordered fixes become symmetric sums; else they are associated."""
+        """Test whether unordered fixes become symmetric sums; otherwise they are associated."""
         return self.fixes not in ("known", "hungarian", "set", "axes")
 
     @property
     def states(self) -> int:
-        """Return how many components the joint state has."""
+        """Return the number of components of the joint state."""
         return STATES * self.motion.vehicles + POSE * self.has_pose
 
 
 def split_method(method: str) -> tuple[str, str]:
-    """Split a method into that for fixes and that for the infrastructure sensor, "" if unused."""
+    """Split a method into the parts for fixes and for the infrastructure sensor, "" if unused."""
     fixes, _, sensor = method.rpartition("-")
     return (fixes, sensor) if fixes and sensor in SENSOR else (method, "")
 
 
 def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
-    """Return the joint states with those of some rows changed.
+    """Return the joint states with some rows replaced.
 
     Args:
-        joint: of all runs.
-        rows: (k,), which change.
-        changed: what these become.
+        joint: joint states of all runs.
+        rows: (k,), rows to replace.
+        changed: their new values.
     """
     if len(rows) == len(joint.mean):
         return changed
@@ -109,24 +110,24 @@ def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
 
 
 def where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """Return the joint states, changed where chosen.
+    """Return the joint states, changed in the chosen runs.
 
     Args:
-        chosen: (runs,).
-        joint: of all runs.
-        change: of the joint states of the runs that are chosen.
+        chosen: (runs,), which runs to change.
+        joint: joint states of all runs.
+        change: function of the joint states of the chosen runs.
     """
     rows = np.flatnonzero(chosen)
     return put(joint, rows, change(joint.of(rows))) if len(rows) else joint
 
 
 def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) -> Joint:
-    """Update by fixes of known vehicles.
+    """Update with fixes of known vehicles.
 
     Args:
         setup: the bound method.
         joint: the Gaussians of all runs.
-        fixes: (runs, vehicles, 2), in m, NaN where one is missing.
+        fixes: (runs, vehicles, 2), in m, NaN if missing.
         noise: (runs, vehicles, 2, 2), in m^2.
     """
     vehicles = setup.motion.vehicles
@@ -138,7 +139,7 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
 
 
 class Associated(NamedTuple):
-    """Holds one map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
+    """One map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
 
     detection: Integers
     innovation: Floats
@@ -146,7 +147,7 @@ class Associated(NamedTuple):
 
 
 def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Associated | None]:
-    """Update by unordered fixes; returns their map too where a single one is used.
+    """Update with unordered fixes; also return their map if the method uses a single one.
 
     Args:
         setup: the bound method.
@@ -171,15 +172,15 @@ def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint
 
 
 def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
-    """Update by symmetric sums of full scans; others have none, and tell nothing.
+    """Update with symmetric sums of full scans; scans with missing or extra fixes are ignored.
 
-    Sums of numbers less their expected mean are linear combinations of the sums themselves; they lose
-    fewer digits.
+    The sums are taken of numbers minus their expected mean: such sums are linear combinations of the
+    original sums and lose fewer digits.
 
     Args:
-        setup: of the method.
-        joint: of the runs.
-        detections: (runs, detections, 2), in m, NaN where a run has no more.
+        setup: the bound method.
+        joint: the Gaussians of the runs.
+        detections: (runs, detections, 2), in m, padded with NaN.
     """
     vehicles, states = setup.motion.vehicles, setup.states
     full = np.flatnonzero(np.isfinite(detections[..., 0]).sum(axis=1) == vehicles)
@@ -212,7 +213,7 @@ def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
 
 
 def _root(covariance: Floats) -> Floats:
-    """Return factors X with X X' = covariances that rounding may have made a little indefinite."""
+    """Return factors X with X X' = covariance, also if rounding has made it slightly indefinite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), np.float64)
     except np.linalg.LinAlgError:
@@ -221,14 +222,14 @@ def _root(covariance: Floats) -> Floats:
 
 
 def blocks_of(matrices: Floats, vehicles: int) -> Floats:
-    """Take the blocks on the diagonals of matrices.
+    """Return the diagonal blocks of matrices.
 
     Args:
         matrices: (runs, vehicles a, vehicles a).
-        vehicles: how many there are.
+        vehicles: number of vehicles.
 
     Returns:
-        (runs, vehicles, a, a).
+        Blocks (runs, vehicles, a, a).
     """
     size = matrices.shape[-1] // vehicles
     split = matrices.reshape(-1, vehicles, size, vehicles, size)
@@ -237,7 +238,7 @@ def blocks_of(matrices: Floats, vehicles: int) -> Floats:
 
 
 def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
-    """Return detections less predictions, (h, vehicles * axes), by vehicle; NaN where missed.
+    """Return detections minus predictions, (h, vehicles * axes), by vehicle; NaN if missed.
 
     Args:
         maps: h hypotheses.
@@ -252,12 +253,12 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
 
 
 def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Update by topology; scans with another number of detections, or a point, tell nothing.
+    """Update with the topology of scans; ignore incomplete scans and scans of a single point.
 
     Args:
-        setup: of the method.
-        joint: of the runs.
-        seen: (runs, detections, 2), in m in the sensor's frame, NaN where a run has no more.
+        setup: the bound method.
+        joint: the Gaussians of the runs.
+        seen: (runs, detections, 2), in m in the sensor's frame, padded with NaN.
     """
     vehicles = setup.motion.vehicles
     rows = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=1) == vehicles)
@@ -272,20 +273,20 @@ def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
 def update_by_pose(
     setup: Setup, joint: Joint, seen: Floats, registered: Booleans, may_start: Booleans
 ) -> tuple[Joint, Booleans]:
-    """Update by detections from a pose found along.
+    """Update with detections from the sensor's pose, which is estimated too.
 
-    The pose is found anew, from what is known of the vehicles alone, where it was not yet known, and
-    where it is supposed to change from scan to scan.
+    The pose is estimated from the vehicles' estimates if it is not yet known, or if it is assumed to
+    change between scans.
 
     Args:
-        setup: of the method.
-        joint: of the runs.
-        seen: (runs, detections, 2), in m in the sensor's frame, NaN where a run has no more.
-        registered: (runs,), where the pose is known.
-        may_start: (runs,), where it may be found.
+        setup: the bound method.
+        joint: the Gaussians of the runs.
+        seen: (runs, detections, 2), in m in the sensor's frame, padded with NaN.
+        registered: (runs,), whether the pose is known.
+        may_start: (runs,), whether the pose may be found.
 
     Returns:
-        The joint states, and where (runs,) the pose is known now.
+        The joint states, and whether (runs,) the pose is known now.
     """
     vehicles = setup.motion.vehicles
     ordered = np.full((len(seen), vehicles, 2), np.nan)
@@ -326,7 +327,7 @@ def _position_blocks(setup: Setup, joint: Joint) -> Floats:
 
 
 def _recognised(setup: Setup, joint: Joint, seen: Floats) -> Floats:
-    """Return detections (runs, vehicles, 2) in the vehicles' order, by the pose as thought to be."""
+    """Return detections (runs, vehicles, 2) in the vehicles' order, associated by the estimated pose."""
     vehicles = setup.motion.vehicles
     sight = sight_of(setup.motion, joint)
     spread = sight.rows @ joint.covariance @ sight.rows.swapaxes(1, 2)

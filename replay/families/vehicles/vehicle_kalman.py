@@ -1,11 +1,11 @@
-"""Tracks one vehicle by its own fixes: the paper's reference, association known.
+"""Tracking of one vehicle by its own fixes: the paper's reference with known association.
 
 Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
-symmetric measurement equation filter", 2016, section 4.1. Each vehicle is an estimate of its own.
+symmetric measurement equation filter", 2016, section 4.1. Each vehicle has its own estimate.
 
-Not of the paper: the modes of a vehicle that turns and stops, for an interacting multiple model. It
-drives as the paper says, manoeuvres with larger accelerations, or stands; between driving and standing
-it brakes or starts, which is a manoeuvre.
+The modes of a vehicle that turns and stops, for an interacting multiple model, are not in the paper. The
+vehicle drives as in the paper, manoeuvres with larger accelerations, or stands; between driving and
+standing it brakes or starts, which is a manoeuvre.
 """
 
 from typing import Any
@@ -23,18 +23,18 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):
-    """States how the vehicle moves, and the rates of change between its modes.
+    """The motion of the vehicle, and the rates of transitions between its modes.
 
     Attributes:
-        turn_rate_radps: turn rate that the vehicle keeps.
+        turn_rate_radps: constant turn rate of the vehicle.
         acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
         manoeuvring_sigma_mps2: standard deviation of the acceleration of a time step in a manoeuvre, per
             axis.
-        standing_sigma_mps: standard deviation of the velocity of a vehicle that stands, per axis.
-        manoeuvres_per_s: rate of changes from driving to a manoeuvre.
-        settles_per_s: rate of changes from a manoeuvre to driving.
-        stops_per_s: rate of changes from a manoeuvre to standing.
-        starts_per_s: rate of changes from standing to a manoeuvre.
+        standing_sigma_mps: standard deviation of the velocity of a standing vehicle, per axis.
+        manoeuvres_per_s: rate of transitions from driving to a manoeuvre.
+        settles_per_s: rate of transitions from a manoeuvre to driving.
+        stops_per_s: rate of transitions from a manoeuvre to standing.
+        starts_per_s: rate of transitions from standing to a manoeuvre.
     """
 
     turn_rate_radps: float | None = None
@@ -49,7 +49,7 @@ class VehicleParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Move by a coordinated turn."""
+    """Move the vehicle by a coordinated turn."""
     return turn(state, parameters.turn_rate_radps, duration_s)
 
 
@@ -60,24 +60,24 @@ def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> C
 
 
 def manoeuvring_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Compute noise as `acceleration_noise`, of larger accelerations."""
+    """Return noise as from `acceleration_noise`, for the larger accelerations of a manoeuvre."""
     place, mixed, velocity = noise_moments(parameters.manoeuvring_sigma_mps2, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
 
 def stand(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Return the state, which stays where it is."""
+    """Return the state with the same position and zero velocity."""
     return state[0], 0.0 * state[1], state[2], 0.0 * state[3]
 
 
 def standing_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the variances of what little a standing vehicle moves."""
+    """Return the variances of the small motion of a standing vehicle."""
     velocity = parameters.standing_sigma_mps**2
     return velocity * duration_s**2, velocity, velocity * duration_s**2, velocity
 
 
 def mode_rates(parameters: Any) -> Components:
-    """Return the rates from driving, manoeuvring and standing to the others, in this order."""
+    """Return the rates from driving, manoeuvring and standing to the other modes, in this order."""
     return (
         parameters.manoeuvres_per_s,
         0.0,
@@ -89,7 +89,7 @@ def mode_rates(parameters: Any) -> Components:
 
 
 def position(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return where the vehicle is."""
+    """Return the position of the vehicle."""
     return state[0], state[2]
 
 

@@ -1,9 +1,9 @@
-"""Filters several vehicles as one joint Gaussian, all runs of an ensemble at once.
+"""Joint Gaussian filter of several vehicles, for all runs of an ensemble in parallel.
 
 Sources: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016; Bar-Shalom, Li, "Multitarget-Multisensor Tracking",
-1995, 6.2 (the collapse over associations). The state is (x, vx, y, vy) of every vehicle and then,
-where it is estimated along, the infrastructure sensor's pose (x, y, heading).
+1995, 6.2 (moment matching over associations). The state is (x, vx, y, vy) of every vehicle, followed by
+the infrastructure sensor's pose (x, y, heading) if it is estimated.
 """
 
 from typing import NamedTuple
@@ -17,32 +17,32 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.families.vehicles.association import Hypotheses
 
-STATES = 4  # of a vehicle
+STATES = 4  # components of a vehicle's state
 POSE = 3  # components of the sensor's pose
-# A topology so improbable, chi-square with one degree of freedom, is of other things than the vehicles.
+# Chi-square gate, one degree of freedom: a less probable topology includes other things than vehicles.
 TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
 
 
 class Joint(NamedTuple):
-    """Holds Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
+    """Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
 
     mean: Floats
     covariance: Floats
 
     def of(self, rows: Integers) -> "Joint":
-        """Return some of the runs."""
+        """Return the joint states of some runs."""
         return Joint(self.mean[rows], self.covariance[rows])
 
 
 class Motion(NamedTuple):
-    """Describes how the vehicles move: turn rates and sigmas of the acceleration, (vehicles,) each."""
+    """The vehicles' motion: turn rates and standard deviations of the acceleration, (vehicles,) each."""
 
     turn_rate_radps: Floats
     acceleration_sigma_mps2: Floats
 
     @property
     def vehicles(self) -> int:
-        """Return how many there are."""
+        """Return the number of vehicles."""
         return len(self.turn_rate_radps)
 
 
@@ -50,15 +50,15 @@ def positions(motion: Motion, mean: Floats) -> Floats:
     """Return the vehicles' positions (runs, vehicles, 2).
 
     Args:
-        motion: for how many vehicles there are.
-        mean: (runs, n), see above.
+        motion: the vehicles' motion, for their number.
+        mean: means of the joint states, (runs, n).
     """
     count = motion.vehicles
     return mean[:, : STATES * count].reshape(-1, count, STATES)[..., 0::2]
 
 
 def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) -> Floats:
-    """Make the matrix (axes * vehicles, states) that takes these axes of all positions from a state."""
+    """Make the matrix (axes * vehicles, states) that selects some axes of all positions from a state."""
     rows = np.zeros((vehicles, len(axes), states))
     for place, axis in enumerate(axes):
         rows[np.arange(vehicles), place, STATES * np.arange(vehicles) + 2 * axis] = 1.0
@@ -66,7 +66,7 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
-    """Return the joint state after `duration_s`: coordinated turns and white accelerations."""
+    """Predict the joint state by `duration_s`: coordinated turns and white accelerations."""
     states = joint.mean.shape[1]
     transition, noise = np.eye(states), np.zeros((states, states))
     for vehicle in range(motion.vehicles):
@@ -81,9 +81,10 @@ def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
 
 
 class Gain(NamedTuple):
-    """Holds what a linear measurement does to a covariance; S is the innovation's covariance.
+    """Effect of a linear measurement on a covariance; S is the innovation covariance.
 
-    inverse: S^-1 (runs, m, m); log_determinant (runs,) of S; gain (runs, n, m); covariance after.
+    `inverse` is S^-1 (runs, m, m), `log_determinant` (runs,) that of S, `gain` is (runs, n, m), and
+    `covariance` is the covariance after the update.
     """
 
     inverse: Floats
@@ -93,7 +94,7 @@ class Gain(NamedTuple):
 
 
 def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
-    """Compute Kalman's gain, and what it makes of the covariance.
+    """Compute the Kalman gain and the updated covariance.
 
     Args:
         covariance: (runs, n, n).
@@ -110,12 +111,12 @@ def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
 
 
 def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joint:
-    """Update by Kalman's filter; an innovation of NaN was not measured.
+    """Apply the Kalman update; components with a NaN innovation are not measured.
 
     Args:
         joint: the Gaussians of all runs.
         rows: (m, n), or (runs, m, n).
-        innovation: (runs, m), NaN where not measured.
+        innovation: (runs, m), NaN if not measured.
         noise: (runs, m, m).
     """
     missing = np.isnan(innovation)
@@ -130,10 +131,10 @@ def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joi
 
 
 class Weighed(NamedTuple):
-    """Holds hypotheses with scores: log weight and likelihood of the innovations, zero where missed.
+    """Hypotheses with scores (log weight and log likelihood), and innovations, zero if missed.
 
-    `group` (h,) says which row of the gains a hypothesis has; those of a run that miss the same vehicles
-    share one. `group_run` is the run of each row.
+    `group` (h,) is the row of the gains for each hypothesis: hypotheses of a run that miss the same
+    vehicles have the same row. `group_run` is the run of each row.
     """
 
     score: Floats
@@ -146,14 +147,14 @@ class Weighed(NamedTuple):
 def weigh(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Weighed:
-    """Return the likelihood of every hypothesis, by all vehicles together.
+    """Compute the likelihood of every hypothesis, jointly for all vehicles.
 
     Args:
-        joint: before the measurement.
-        rows: takes the measured components of all vehicles from the state, (m, n).
-        innovations: of every hypothesis, (h, m), NaN for a vehicle that was not detected.
+        joint: joint states before the measurement.
+        rows: selects the measured components of all vehicles from the state, (m, n).
+        innovations: innovations of every hypothesis, (h, m), NaN for a vehicle that was not detected.
         noise: the variance of every measured component, (m,).
-        hypotheses: sorted by run, at least one for every run.
+        hypotheses: hypotheses sorted by run, at least one for every run.
     """
     there = ~np.isnan(innovations)
     innovations = np.where(there, innovations, 0.0)
@@ -173,8 +174,8 @@ def collapse(
 ) -> Joint:
     """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
 
-    Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
-    is what an exact symmetric measurement equation filter collapses to.
+    The weights are exact: for a complete set, the weights of all maps are the terms of a permanent. The
+    result is therefore the one to which an exact symmetric measurement equation filter collapses.
 
     Args:
         joint, rows, innovations, noise, hypotheses: as for `weigh`.
@@ -193,7 +194,7 @@ def collapse(
 
 
 def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
-    """Find a pattern's distinct rows, its first column being sorted, and which of them each row is."""
+    """Find the distinct rows of a pattern with a sorted first column, and the index of each row."""
     if len(pattern) == 0 or pattern[:, 1:].all():
         runs, group = np.unique(pattern[:, 0], return_inverse=True)
         return np.concatenate([runs[:, None], np.ones_like(pattern[: len(runs), 1:])], axis=1), group
@@ -202,7 +203,7 @@ def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
 
 
 def _sums(values: Floats, group: Integers, groups: int) -> Floats:
-    """Sum rows by group; groups are mostly of a single row."""
+    """Sum rows by group; most groups have a single row."""
     out = np.zeros((groups, *values.shape[1:]))
     if len(values) == groups and np.array_equal(group, np.arange(groups)):
         return values
@@ -211,10 +212,10 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
 
 
 def normalised(score: Floats, run: Integers) -> Floats:
-    """Return exp(score), scaled to sum one in each run.
+    """Return exp(score), scaled to a sum of one in each run.
 
     Args:
-        score, run: (h,), the latter sorted.
+        score, run: (h,); `run` is sorted.
     """
     first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
     count = np.diff(np.append(first, len(run)))
@@ -223,21 +224,21 @@ def normalised(score: Floats, run: Integers) -> Floats:
 
 
 def spread_of(places: Floats) -> Floats:
-    """Return the sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
+    """Compute the sum of squared distances from the mean, (...,), of positions (..., vehicles, 2)."""
     return np.sum((places - places.mean(axis=-2, keepdims=True)) ** 2, axis=(-2, -1))
 
 
 def topology(places: Floats) -> Floats:
-    """Compute the paper's (18), all squared distances between pairs, (...,) of (..., vehicles, 2)."""
+    """Compute (18), the sum of squared distances of all pairs, (...,), from (..., vehicles, 2)."""
     return places.shape[-2] * spread_of(places)
 
 
 def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats]:
-    """Compute mean and variance (...,) of what noise adds to the measured topology of places.
+    """Compute mean and variance (...,) of what noise adds to the measured topology.
 
     Args:
         places: (..., vehicles, 2), in m.
-        variance_m2: of the noise, per axis.
+        variance_m2: variance of the noise, per axis.
     """
     count = places.shape[-2]
     added = 2.0 * count * (count - 1) * variance_m2
@@ -246,7 +247,7 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
 
 
 class Scalar(NamedTuple):
-    """Holds a linearised scalar measurement: rows (runs, 1, n), innovations (runs,), their variances.
+    """A linearized scalar measurement: Jacobian (runs, 1, n), innovations (runs,), their variances.
 
     `noise` (runs,) is the measurement's part of the variance.
     """
@@ -258,15 +259,15 @@ class Scalar(NamedTuple):
 
 
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
-    """Return the topology of scans, whatever their frame and order.
+    """Linearize the topology of scans, which does not depend on their frame and order.
 
-    The innovation is NaN where it is too improbable: something was missed and something else taken for
-    a vehicle.
+    The innovation is NaN if it is too improbable: then a vehicle was missed and something else was
+    detected.
 
     Args:
-        motion, joint: of the vehicles in all runs.
+        motion, joint: motion and joint states of the vehicles in all runs.
         detections: full scans, (runs, vehicles, 2), in m.
-        variance_m2: of a detection, per axis.
+        variance_m2: variance of a detection, per axis.
     """
     places = positions(motion, joint.mean)
     added, noise = topology_moments(places, variance_m2)
@@ -280,19 +281,19 @@ def topology_measurement(motion: Motion, joint: Joint, detections: Floats, varia
 
 
 def update_by_scalar(joint: Joint, measured: Scalar) -> Joint:
-    """Apply Kalman's update by a scalar measurement."""
+    """Apply the Kalman update with a scalar measurement."""
     return update(joint, measured.rows, measured.innovation[:, None], measured.noise[:, None, None])
 
 
 class Sight(NamedTuple):
-    """Holds what the infrastructure sensor should see: places (runs, m), Jacobian (runs, m, n)."""
+    """Predicted detections of the infrastructure sensor (runs, m), and their Jacobian (runs, m, n)."""
 
     predicted: Floats
     rows: Floats
 
 
 def sight_of(motion: Motion, joint: Joint) -> Sight:
-    """Predict what the sensor with the estimated pose should see of the estimated vehicles."""
+    """Predict the detections of the estimated vehicles by the sensor at its estimated pose."""
     count, states = motion.vehicles, joint.mean.shape[1]
     places, pose = positions(motion, joint.mean), joint.mean[:, -POSE:]
     seen = np.stack(into_frame(pose.T[:, :, None], np.moveaxis(places, -1, 0)), axis=-1)
@@ -311,16 +312,16 @@ def sight_of(motion: Motion, joint: Joint) -> Sight:
 def update_by_shape(
     motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
 ) -> Joint:
-    """Update by what a sensor sees from a pose of which nothing is known before.
+    """Update with a sensor's detections from a pose without prior information.
 
-    What any change of the pose would change is left out of the update of the vehicles; then the pose
-    follows from them.
+    The update of the vehicles uses only the part of the detections that no change of the pose affects;
+    the pose then follows from the vehicles.
 
     Args:
-        motion, joint: of the vehicles in all runs.
-        pose: (runs, 3), x, y, heading, where to linearise and no more.
-        seen: (runs, vehicles, 2) in the sensor's frame, NaN where not seen.
-        variance_m2: of a detection, per axis.
+        motion, joint: motion and joint states of the vehicles in all runs.
+        pose: (runs, 3), x, y, heading; only the linearization point.
+        seen: (runs, vehicles, 2) in the sensor's frame, NaN if not seen.
+        variance_m2: variance of a detection, per axis.
     """
     own = slice(0, STATES * motion.vehicles)
     mean = joint.mean.copy()

@@ -1,15 +1,15 @@
-"""Lays batch axes of the public functions flat for the compiled loops."""
+"""Flattening of batch axes for compiled loops."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 
 def flatten(array: NDArray, batch: tuple[int, ...], *core: int) -> NDArray[np.float64]:
-    """Lay an array out as (n, *core), contiguous, broadcast to its batch axes.
+    """Broadcast an array to its batch axes and return it as a contiguous array (n, *core).
 
     Args:
         array: (..., *core).
-        batch: the axes (...) that it gets; n is their product.
+        batch: the batch axes (...) to broadcast to; n is their product.
         core: the sizes of its last axes.
     """
     flat = np.broadcast_to(array, (*batch, *core)).reshape(-1, *core)

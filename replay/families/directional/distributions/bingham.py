@@ -1,8 +1,8 @@
-"""Computes with the Bingham distribution, f(x) = exp(x^T M Z M^T x) / F, on axes and orientations.
+"""The Bingham distribution, f(x) = exp(x^T M Z M^T x) / F, of axes and orientations.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
-Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first; the numbers come from
-`bingham_kernels`, exact for concentrations from 0 to beyond 1e6, where the paper takes a saddlepoint
+Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first. The numbers come from
+`bingham_kernels` and are exact for concentrations from 0 to beyond 1e6; the paper uses a saddlepoint
 approximation.
 """
 
@@ -19,7 +19,7 @@ from fuselog.replay.families.directional.distributions.batches import flatten
 
 
 class Bingham(NamedTuple):
-    """Represents Bingham distributions with any batch axes.
+    """Bingham distributions with any batch axes.
 
     Attributes:
         axes: M (..., d, d), orthogonal, principal axes in columns, the mode last.
@@ -31,30 +31,30 @@ class Bingham(NamedTuple):
 
     @property
     def mode(self) -> NDArray[np.float64]:
-        """Return the most probable axis (..., d); its negative is the same."""
+        """Return the most probable axis (..., d); its negative is equally probable."""
         return self.axes[..., -1]
 
 
 def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """Make a checked distribution of axes and concentrations in any order and offset.
+    """Make a checked distribution from axes and concentrations in any order and with any offset.
 
-    Raises BadInput where d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
+    Raises BadInput if d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
 
     Args:
         axes: (..., d, d), orthonormal, as columns.
-        concentrations: (..., d), along these; only their differences count.
+        concentrations: (..., d), along these axes; only their differences matter.
     """
     axes, z = np.asarray(axes, float), np.asarray(concentrations, float)
     d = z.shape[-1] if z.ndim else 0
     if d not in (2, 4) or axes.shape[-2:] != (d, d):
         raise BadInput(
-            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d) and (..., d) with "
-            "d = 2 or 4"
+            f"Bingham axes have shape {axes.shape} and concentrations {z.shape}; give (..., d, d) and "
+            "(..., d) with d = 2 or 4"
         )
     if not np.isfinite(z).all():
-        raise BadInput("Bingham concentrations must be finite; give finite numbers, 0 for none")
+        raise BadInput("Bingham concentrations must be finite; use 0 for a uniform distribution")
     if not np.allclose(axes @ np.swapaxes(axes, -1, -2), np.eye(d), rtol=0.0, atol=1e-9):
-        raise BadInput("Bingham axes must be orthonormal columns; give such a matrix")
+        raise BadInput("Bingham axes must be an orthogonal matrix; give orthonormal columns")
     shape = np.broadcast_shapes(axes.shape[:-1], z.shape)
     order = np.argsort(np.broadcast_to(z, shape), axis=-1, kind="stable")
     z = np.take_along_axis(np.broadcast_to(z, shape), order, -1)
@@ -63,10 +63,10 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
 
 
 def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """Make distributions about modes, with concentrations along mode (+) e_2, ..., e_d.
+    """Make distributions about given modes, with concentrations along mode (+) e_2, ..., e_d.
 
-    Small errors of an orientation about its own axis i have the standard deviation sigma_rad for the
-    concentration -2 / sigma_rad^2, half angles being what a quaternion holds.
+    A concentration of -2 / sigma_rad^2 gives small errors of an orientation about its axis i the
+    standard deviation sigma_rad, because a quaternion contains half angles.
 
     Args:
         mode: (..., d), unit vectors.
@@ -106,12 +106,12 @@ def square_moments(concentrations: ArrayLike) -> NDArray[np.float64]:
 
 
 def covariance(bingham: Bingham) -> NDArray[np.float64]:
-    """Compute E(x x^T), (..., d, d), by (16); with the density even, the mean is 0."""
+    """Compute E(x x^T), (..., d, d), by (16); the density is even, so the mean is 0."""
     return _spectral(bingham.axes, square_moments(bingham.concentrations))
 
 
 def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
-    """Compute the log density (...) at unit vectors; F stands for 1 / F in the print's (10)-(11).
+    """Compute the log density (...) at unit vectors; the paper's (10)-(11) print F for 1 / F.
 
     Args:
         bingham: the distributions, batch axes (...).
@@ -123,15 +123,17 @@ def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def fit(second_moment: ArrayLike) -> Bingham:
-    """Fit the distributions with E(x x^T) = `second_moment` (..., d, d): the most likely, (13)-(14).
+    """Fit the most likely distributions, those with E(x x^T) = `second_moment` (..., d, d): (13)-(14).
 
-    Raises BadInput where a matrix has not trace 1 or is not positive definite: its concentration would
-    diverge.
+    Raises BadInput if the trace of a matrix is not 1, or if a matrix is not positive definite: its
+    concentration would diverge.
     """
     moment = _symmetric(second_moment, "second moment of a Bingham distribution")
     shape, d = moment.shape[:-2], moment.shape[-1]
     if not np.allclose(np.trace(moment, axis1=-2, axis2=-1), 1.0, rtol=0.0, atol=1e-9):
-        raise BadInput("the second moment of unit vectors has trace 1; divide the matrix by its trace")
+        raise BadInput(
+            "the second moment of unit vectors must have trace 1; divide the matrix by its trace"
+        )
     axes, z = np.empty((*shape, d, d)), np.empty((*shape, d))
     converged = kernels.fit_each(
         moment.reshape(-1, d, d).copy(), axes.reshape(-1, d, d), z.reshape(-1, d)
@@ -140,8 +142,8 @@ def fit(second_moment: ArrayLike) -> Bingham:
         index = np.unravel_index(int(np.argmin(converged)), shape)
         place = f" at {tuple(map(int, index))}" if shape else ""
         raise BadInput(
-            f"no Bingham distribution has the second moment{place}: an eigenvalue "
-            "is not positive and its concentration diverges; give a positive definite matrix"
+            f"no Bingham distribution has the second moment{place}: an eigenvalue is not positive, "
+            "so its concentration diverges; give a positive definite matrix"
         )
     return Bingham(axes, z)
 
@@ -152,12 +154,12 @@ def product(first: Bingham, second: Bingham) -> Bingham:
 
 
 def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
-    """Return the density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
+    """Return the factor by which an update multiplies: the density of x given z = x (+) v, (52)-(53).
 
-    M is z (+) (D M^v), where (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
+    M is z (+) (D M^v); (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
 
     Args:
-        noise: of the measurement.
+        noise: distribution of v.
         measurement: z (..., d), unit vectors.
     """
     z = require_unit(measurement, "measurement")
@@ -179,7 +181,7 @@ def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
 def compose(first: Bingham, second: Bingham) -> Bingham:
     """Return the Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
 
-    Lemmas 2 and 4 with (13)-(14); a fit that does not converge is NaN.
+    Lemmas 2 and 4 with (13)-(14). If a fit does not converge, its distribution is NaN.
     """
     shape = np.broadcast_shapes(first.concentrations.shape, second.concentrations.shape)
     batch, d = shape[:-1], shape[-1]
@@ -190,17 +192,17 @@ def compose(first: Bingham, second: Bingham) -> Bingham:
 
 
 def sample(bingham: Bingham, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Draw `count` exact samples (..., count, d) of every distribution."""
+    """Draw `count` exact samples (..., count, d) from every distribution."""
     axes, z = bingham
     wide = (*z.shape[:-1], count, z.shape[-1])
     return sample_bingham(axes[..., None, :, :], np.broadcast_to(z[..., None, :], wide), generator)
 
 
 def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
-    """Compute E((x - m)(x - m)^T), (..., d, d), over the half sphere about the mode m: for one mode.
+    """Compute E((x - m)(x - m)^T), (..., d, d), over the hemisphere about the mode m.
 
-    It is the covariance of a Gaussian there: (57), which lacks a factor 2. E|x_d| is exact too: it takes
-    one more factor (s - z_d)^(-1/2).
+    It is the covariance of a Gaussian about that mode: (57), which lacks a factor of 2. E|x_d| is exact
+    too; its integrand has one more factor (s - z_d)^(-1/2).
     """
     integrand, factors = _on_contour(bingham.concentrations)
     absolute = _sum(integrand * np.sqrt(factors[..., -1, :])) / (np.sqrt(np.pi) * _sum(integrand))
@@ -221,7 +223,7 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
     """
     variance, axes = np.linalg.eigh(_symmetric(gaussian_covariance, "Gaussian covariance"))
     if variance[0] < -1e-12 * variance[-1]:
-        raise BadInput("a Gaussian covariance must have no negative eigenvalues; give such a matrix")
+        raise BadInput("a Gaussian covariance must have no negative eigenvalues")
     variance = np.maximum(variance, 0.0)
     along = np.asarray(mean, float) @ axes
     log_t, step = np.linspace(-40.0, 80.0, 1201, retstep=True)
@@ -248,11 +250,11 @@ def _spectral(axes: NDArray, values: NDArray) -> NDArray[np.float64]:
 
 
 def _symmetric(matrix: ArrayLike, what: str) -> NDArray[np.float64]:
-    """Make `matrix` exactly symmetric; BadInput where it is not finite, square or nearly symmetric."""
+    """Make `matrix` exactly symmetric; raise BadInput if it is not nearly symmetric and finite."""
     matrix = np.asarray(matrix, float)
     if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or matrix.shape[-1] not in (2, 4):
         raise BadInput(f"{what} has shape {matrix.shape}; give (..., d, d) with d = 2 or 4")
     transposed = np.swapaxes(matrix, -1, -2)
     if not np.isfinite(matrix).all() or not np.allclose(matrix, transposed, rtol=1e-9, atol=1e-12):
-        raise BadInput(f"{what} is not a finite symmetric matrix; give a symmetric one")
+        raise BadInput(f"{what} must be a finite symmetric matrix")
     return 0.5 * (matrix + transposed)

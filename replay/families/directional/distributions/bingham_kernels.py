@@ -1,13 +1,13 @@
-"""Computes the Bingham distribution by scalar kernels, d = 2 and 4.
+"""Scalar kernels of the Bingham distribution for d = 2 and 4.
 
-The normalisation constant is an inverse Laplace transform at 1, from which the saddlepoint approximation
-of Kume and Wood (Biometrika 92, 2005) starts too:
+The normalization constant is an inverse Laplace transform at 1, as in the saddlepoint approximation of
+Kume and Wood (Biometrika 92, 2005):
 
     F(z) = 2 pi^(d/2) / (2 pi i)  int  exp(s)  prod_k (s - z_k)^(-1/2)  ds,
 
 and moments only add factors 1 / (s - z_k). On Talbot's contour, with the parameters of Trefethen,
 Weideman, Schmelzer (BIT 46, 2006), the trapezoidal rule converges geometrically, uniformly over all z in
-(-inf, 0]: 14 nodes give some 1e-14, without Bessel functions, tables or cancellation.
+(-inf, 0]: 14 nodes give an accuracy of about 1e-14, without Bessel functions, tables or cancellation.
 """
 
 import math
@@ -38,7 +38,7 @@ _PARTS = np.stack([CONTOUR.real, CONTOUR.imag, WEIGHTS.real, WEIGHTS.imag], axis
 for _table in (CONTOUR, WEIGHTS, _PARTS):
     _table.setflags(write=False)
 
-# Newton's error squares in every step: from here the last step ends below the rounding.
+# Newton's method squares the error in every step: below this, one more step reaches rounding error.
 _LAST_STEP = 1e-8
 _MOST_STEPS = 30
 _MOST_SWEEPS = 30
@@ -48,12 +48,12 @@ Complex = tuple[float, float]
 
 
 def times(x: Complex, y: Complex) -> Complex:
-    """Return the product of two complex numbers."""
+    """Multiply two complex numbers."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
 def reciprocal(x: Complex) -> Complex:
-    """Compute 1 / x, scaled by its larger part, as C divides."""
+    """Compute 1 / x, scaled by its larger part, as C does."""
     if abs(x[0]) >= abs(x[1]):
         ratio = x[1] / x[0]
         size = x[0] + x[1] * ratio
@@ -64,7 +64,7 @@ def reciprocal(x: Complex) -> Complex:
 
 
 def root(x: Complex) -> Complex:
-    """Return the square root of a complex number whose real part is the larger one, as C takes it."""
+    """Compute the square root of a complex number with a nonnegative real part, by the method of C."""
     size = math.sqrt((abs(x[0]) + math.hypot(x[0], x[1])) * 0.5)
     if size == 0.0:
         return 0.0, x[1]
@@ -74,12 +74,12 @@ def root(x: Complex) -> Complex:
 
 
 def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
-    """Return the moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
+    """Compute the moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
 
     Args:
         z: concentrations, none above 0.
         mean: E(x_i^2), (d,), overwritten.
-        covariance: Cov(x_i^2, x_j^2), (d, d), overwritten: the derivative of `mean` by z.
+        covariance: Cov(x_i^2, x_j^2), (d, d), overwritten: the derivative of `mean` with respect to z.
 
     Returns:
         F / (2 pi^(d/2)).
@@ -111,18 +111,18 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
 
 
 def fit_concentrations(target: NDArray, z: NDArray) -> bool:
-    """Find the concentrations under which E(x_i^2) is `target`: Newton's method on (14).
+    """Find the concentrations for which E(x_i^2) is `target`, by Newton's method on (14).
 
     The start is the fit of the first-order saddlepoint approximation. The residuals are weighted by
-    E(x_i^2) / target_i, which makes them nearly linear in z where z is large, so that five steps do
-    from 0 to beyond -1e6. Pairs are never sorted: z[i] stays with target[i].
+    E(x_i^2) / target_i, which makes them nearly linear in z if z is large, so that five steps suffice
+    from 0 to beyond -1e6. Pairs are never sorted: z[i] belongs to target[i].
 
     Args:
-        target: moments (d,), ascending, of sum 1.
+        target: moments (d,), ascending, with sum 1.
         z: concentrations (d,), overwritten; the last is 0.
 
     Returns:
-        Whether it converged; False for a target that is not positive, as a moment that diverges.
+        Whether the fit converged; False if a target is not positive or a moment diverges.
     """
     d = len(z)
     last = d - 1
@@ -148,13 +148,14 @@ def fit_concentrations(target: NDArray, z: NDArray) -> bool:
 
 
 def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
-    """Find eigenvalues, ascending, and eigenvectors of a symmetric matrix.
+    """Compute the eigenvalues, ascending, and eigenvectors of a symmetric matrix.
 
-    Cyclic Jacobi rotations: for d <= 4 faster than LAPACK, and small eigenvalues keep their digits.
+    Cyclic Jacobi rotations: for d <= 4 they are faster than LAPACK, and small eigenvalues keep their
+    digits.
 
     Args:
         matrix: (d, d), destroyed.
-        values, vectors: (d,) and, in columns, (d, d); both overwritten.
+        values, vectors: eigenvalues (d,) and eigenvectors as columns (d, d); both overwritten.
     """
     d = len(values)
     for i in range(d):
@@ -165,7 +166,7 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
         for p in range(d - 1):
             for q in range(p + 1, d):
                 off = matrix[p, q]
-                # below this the product of the diagonal no longer feels the square of `off`
+                # below this, the square of `off` is lost in rounding next to the diagonal
                 if not off * off > 1e-33 * abs(matrix[p, p] * matrix[q, q]):
                     continue
                 rotated = True
@@ -202,7 +203,7 @@ def compose(left: Vector, right: Vector, out: NDArray) -> None:
     """Write left (+) right to `out`.
 
     Args:
-        left, right, out: complex numbers or quaternions (d,); `out` is neither of the others.
+        left, right, out: complex numbers or quaternions (d,); `out` is a different array.
     """
     for i in range(len(out)):
         out[i] = 0.0
@@ -215,18 +216,18 @@ def compose_columns(left: Vector, columns: NDArray, out: NDArray) -> None:
 
     Args:
         left: (d,).
-        columns, out: (d, k), not the same.
+        columns, out: (d, k), different arrays.
     """
     for k in range(out.shape[1]):
         compose(left, columns[:, k], out[:, k])
 
 
 def turn_columns(columns: NDArray, increment: NDArray) -> None:
-    """Make columns[:, k] (+) increment of the columns, in place.
+    """Replace columns[:, k] by columns[:, k] (+) increment, in place.
 
     Args:
         columns: (d, k), such as principal axes.
-        increment: a known turn, a unit vector (d,).
+        increment: a known rotation, a unit vector (d,).
     """
     before = columns.copy()
     for k in range(columns.shape[1]):
@@ -234,10 +235,10 @@ def turn_columns(columns: NDArray, increment: NDArray) -> None:
 
 
 def framed(matrix: NDArray, frame: Vector, out: NDArray) -> None:
-    """Fill L matrix L^T, L y = frame (+) y: a moment or parameter matrix in another frame.
+    """Write L matrix L^T, where L y = frame (+) y: a moment or parameter matrix in another frame.
 
     Args:
-        matrix, out: (d, d), not the same.
+        matrix, out: (d, d), different arrays.
         frame: a unit vector (d,).
     """
     half = np.empty(out.shape)
@@ -249,7 +250,7 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
     """Write columns diag(weights) columns^T to `out`.
 
     Args:
-        columns, out: (d, d), not the same.
+        columns, out: (d, d), different arrays.
         weights: (d,).
     """
     d = len(weights)
@@ -264,10 +265,10 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
 def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
     """Write the second moment of x (+) y to `out`, for independent x and y: lemmas 2 and 4.
 
-    Lemma 2 stands as printed; its proof, (111)-(115), has wrong signs.
+    Lemma 2 is correct as printed; its proof, (111)-(115), has wrong signs.
 
     Args:
-        left, right, out: E(x x^T), E(y y^T) and that of x (+) y, (d, d); `out` is neither of the others.
+        left, right, out: second moments of x, y and x (+) y, (d, d); `out` is a different array.
     """
     d = len(out)
     for i in range(d):
@@ -283,7 +284,8 @@ def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
 def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
     """Predict x (+) w in place: algorithm 1, whose second input is Z^w, not the printed Z^v.
 
-    It works in the frame of the mode, where small moments keep their digits next to large ones.
+    The computation is in the frame of the mode, in which small moments keep their digits next to large
+    ones.
 
     Args:
         axes: principal axes (d, d) in columns, the mode last.
@@ -304,7 +306,7 @@ def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
 
 
 def inverse(x: NDArray, out: NDArray) -> None:
-    """Fill the inverse of a unit complex number or quaternion.
+    """Write the inverse of a unit complex number or quaternion to `out`.
 
     Args:
         x, out: (d,).
@@ -314,9 +316,9 @@ def inverse(x: NDArray, out: NDArray) -> None:
 
 
 def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> None:
-    """Fill the moments along the axes, and the second moment in the frame of the mode.
+    """Compute the moments along the axes, and the second moment in the frame of the mode.
 
-    There small moments keep their digits next to large ones.
+    In that frame, small moments keep their digits next to large ones.
 
     Args:
         axes, z: as for `predict`.
@@ -331,7 +333,7 @@ def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> 
 
 
 def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vector) -> None:
-    """Update by one measurement in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
+    """Update with one measurement in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
 
     Args:
         axes: principal axes (d, d) in columns, the mode last.
@@ -364,7 +366,7 @@ def _predict_one(
 
 
 def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArray:
-    """Apply `predict` to every distribution and its noise; return which (n,) converged.
+    """Apply `predict` to every distribution and its noise; return which of them (n,) converged.
 
     Args:
         axes, z: (n, d, d) and (n, d), changed in place.
@@ -382,7 +384,7 @@ def _fit_one(n: int, covariance: NDArray, axes: NDArray, z: NDArray, converged: 
 
 
 def fit_each(covariance: NDArray, axes: NDArray, z: NDArray) -> NDArray:
-    """Fit a distribution to every second moment; return which (n,) converged.
+    """Fit a distribution to every second moment; return which fits (n,) converged.
 
     Args:
         covariance: second moments (n, d, d), destroyed.

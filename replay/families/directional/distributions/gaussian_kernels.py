@@ -1,4 +1,4 @@
-"""Computes with Gaussians in kernels: small definite systems and direct measurements."""
+"""Kernels of Gaussians: small positive definite systems and measurements of the state itself."""
 
 import math
 
@@ -11,7 +11,7 @@ def solve_in_place(matrix: NDArray, right: NDArray) -> None:
     A block that is not positive definite gives NaN.
 
     Args:
-        matrix: n or more rows and columns; its block is overwritten by the factor.
+        matrix: n or more rows and columns; its leading block is overwritten by the factor.
         right: (n, m), overwritten by the solution.
     """
     n, columns = right.shape
@@ -34,7 +34,7 @@ def solve_in_place(matrix: NDArray, right: NDArray) -> None:
 
 
 def condition(mean: NDArray, covariance: NDArray, innovation: NDArray, noise: NDArray) -> None:
-    """Apply Kalman's update in place for a measurement of the state itself, z = x + v.
+    """Apply the Kalman update in place for a measurement of the state itself, z = x + v.
 
     Args:
         mean: (d,).

@@ -1,7 +1,8 @@
-"""Fits mixtures on the torus by maximum likelihood: wrapped normals and von Mises densities.
+"""Maximum-likelihood mixtures on the torus: wrapped normals and von Mises densities.
 
-Angles (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximisation over components
-and turns; one of bivariate von Mises densities by its gradient, from the mixture of wrapped normals.
+Angles are (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximization over
+components and turns. A mixture of bivariate von Mises densities is fitted by L-BFGS-B, starting at the
+mixture of wrapped normals.
 """
 
 from typing import Literal, NamedTuple
@@ -18,39 +19,40 @@ from fuselog.replay.engine.arrays import Floats
 
 Interaction = Literal["sine", "cosine"]
 
-# As many standard deviations of a component are told from none.
+# Standard deviations at which the density of a component is cut off.
 _REACH = 6.0
-# A variance (rad^2) below which no component goes, so that none shrinks to a single sample: (1 deg)^2.
+# Added to every variance (rad^2), so that no component shrinks to a single sample: (1 deg)^2.
 _LEAST_VARIANCE = np.radians(1.0) ** 2
 _MOST_CONCENTRATION = 500.0
 _NODES = 2.0 * np.pi / 1024 * np.arange(1024)
 
 
 class WrappedMixture(NamedTuple):
-    """Holds wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of angles unwrapped."""
+    """Wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of the unwrapped angles."""
 
     weights: Floats
     mean: Floats
     covariance: Floats
 
     def log_density(self, angles: Floats) -> Floats:
-        """Return the logarithm of the density (n,) at every angle."""
+        """Compute the logarithm of the density (n,) at every pair of angles."""
         return np.asarray(logsumexp(_log_parts(self, angles)[0], axis=(1, 2)))
 
 
 class VonMisesMixture(NamedTuple):
-    """Represents bivariate von Mises densities of one kind.
+    """A mixture of bivariate von Mises densities of one kind.
 
-    exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, a and b the deviations from the mean
-    (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular variables", 2002), or with
-    k3 cos(a - b) in place of the product of sines (Mardia, Taylor, Subramaniam, "Protein bioinformatics
-    and mixtures of bivariate von Mises distributions for angular data", 2007).
+    The density is exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, with a and b the
+    deviations from the mean (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular
+    variables", 2002), or has k3 cos(a - b) in place of the product of sines (Mardia, Taylor,
+    Subramaniam, "Protein bioinformatics and mixtures of bivariate von Mises distributions for angular
+    data", 2007).
 
     Attributes:
         weights: (k,).
         mean: (k, 2).
         concentration: k1, k2, k3 of every component, (k, 3).
-        interaction: which of the two.
+        interaction: "sine" for the first density, "cosine" for the second.
     """
 
     weights: Floats
@@ -59,7 +61,7 @@ class VonMisesMixture(NamedTuple):
     interaction: Interaction
 
     def log_density(self, angles: Floats) -> Floats:
-        """Return the logarithm of the density (n,) at every angle."""
+        """Compute the logarithm of the density (n,) at every pair of angles."""
         log_norm, _ = _normalisation(self.concentration, self.interaction)
         features = _features(angles, self.mean, self.interaction)[0]
         parts = np.log(self.weights) + (features * self.concentration).sum(axis=2) - log_norm
@@ -67,25 +69,25 @@ class VonMisesMixture(NamedTuple):
 
 
 def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) -> WrappedMixture:
-    """Return the most likely wrapped normals near the clusters that k-means finds.
+    """Fit the most likely wrapped normals near the clusters that k-means finds.
 
-    With one component it is the maximum-likelihood fit of a wrapped normal. Raises BadInput where there
-    are fewer than ten angles a component.
+    With one component, this is the maximum-likelihood fit of a wrapped normal. Raises BadInput if there
+    are fewer than ten pairs of angles for each component.
 
     Args:
         angles: (n, 2), in rad.
-        components: how many densities are fitted.
-        iterations: of the search, at most.
+        components: number of densities to fit.
+        iterations: maximum number of iterations.
     """
     if len(angles) < 10 * components:
         raise BadInput(
-            f"{len(angles)} pairs of angles for {components} components; give at least 10 for each"
+            f"{len(angles)} pairs of angles for {components} components; give at least 10 per component"
         )
     embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
     with extra("papers", "a mixture on the torus"):
         from sklearn.cluster import KMeans  # which takes long to import
 
-    with threadpool_limits(1):  # points this few only keep a second core spinning
+    with threadpool_limits(1):  # with so few points, a second core would only spin
         labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]
     mean = np.angle(share.T @ np.exp(1j * angles))
@@ -111,7 +113,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
 
 
 def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Return logarithms of weighted densities (n, k, turns), and as many deviations from both means."""
+    """Return the logarithms of weighted densities (n, k, turns), and the deviations from both means."""
     (c11, c12), (_, c22) = np.moveaxis(mixture.covariance, 0, 2)[..., None]
     determinant = c11 * c22 - c12**2
     most = int(_REACH * np.sqrt(max(c11.max(), c22.max())) / (2.0 * np.pi) + 0.5)
@@ -127,12 +129,12 @@ def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[F
 def fit_von_mises_mixture(
     angles: Floats, interaction: Interaction, start: WrappedMixture
 ) -> VonMisesMixture:
-    """Fit the most likely von Mises densities, as many as the wrapped normals of the start.
+    """Fit as many von Mises densities as the start has wrapped normals, by maximum likelihood.
 
     Args:
         angles: (n, 2), in rad.
         interaction: how the two angles of a density depend on each other.
-        start: where the search begins.
+        start: the mixture at which the search begins.
     """
     k = len(start.weights)
     precision = np.linalg.inv(start.covariance)
@@ -168,7 +170,7 @@ def fit_von_mises_mixture(
         logits = share.sum(axis=0) - len(angles) * mixture.weights
         mean = -np.einsum("nk,nkfd,kf->kd", share, slopes, kappa)
         by_kappa = np.einsum("nk,nkf->kf", share, features - expected)
-        # k3 = r sqrt(k1 k2): half of its slope goes to the logarithm of each
+        # k3 = r sqrt(k1 k2): half of its derivative goes to the logarithm of each
         logs = by_kappa[:, :2] * kappa[:, :2] + 0.5 * (by_kappa[:, 2] * kappa[:, 2])[:, None]
         third = by_kappa[:, 2] * np.sqrt(kappa[:, 0] * kappa[:, 1])
         slope = np.concatenate([logits, mean.ravel(), logs.ravel(), third])
@@ -179,7 +181,7 @@ def fit_von_mises_mixture(
 
 
 def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """Return what concentrations weigh (n, k, 3), and its slopes (n, k, 3, 2) in the deviations."""
+    """Return the functions that the concentrations weight (n, k, 3), and their slopes (n, k, 3, 2)."""
     a, b = np.moveaxis(angles[:, None] - mean, -1, 0)
     none = np.zeros_like(a)
     if interaction == "sine":
@@ -192,10 +194,10 @@ def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[F
 
 
 def _normalisation(kappa: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """Return logarithms (k,) of the integrals, and their slopes in the concentrations (k, 3).
+    """Return the logarithms (k,) of the integrals, and their derivatives by the concentrations (k, 3).
 
-    Over the second angle the integral is a Bessel function; over the first, a sum over equal steps,
-    which for a smooth periodic function is exact to rounding.
+    Over the second angle, the integral is a Bessel function. Over the first, it is a sum over equal
+    steps, which is exact to rounding for a smooth periodic function.
     """
     k1, k2, k3 = kappa.T[:, :, None]
     if interaction == "sine":

@@ -1,8 +1,8 @@
-"""Computes with bivariate wrapped normals on the torus, and draws their deterministic samples.
+"""Bivariate wrapped normals on the torus and their deterministic samples.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. Angles
-in rad; every function takes batch axes first and is accurate for variances from 1e-6 to where the
-density is uniform.
+are in rad. Every function takes batch axes first and is accurate for variances from 1e-6 up to those at
+which the density is uniform.
 """
 
 from collections.abc import Callable
@@ -22,14 +22,14 @@ _product_mixture = compiled(kernels.product_mixture)
 
 
 class WrappedNormal(NamedTuple):
-    """Holds wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of angles unwrapped."""
+    """Wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of the unwrapped angles."""
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
 
 class CircularMoments(NamedTuple):
-    """Makes samples that preserve the first trigonometric moments exp(i mean - variance / 2).
+    """Circular moments; the first trigonometric moments are exp(i mean - variance / 2).
 
     Attributes:
         mean: circular means (..., 2).
@@ -43,41 +43,38 @@ class CircularMoments(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Holds weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
+    """Weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
 
     positions: NDArray[np.float64]
     weights: NDArray[np.float64]
 
 
 def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal:
-    """Make a checked distribution.
+    """Make a wrapped normal from a checked mean and covariance.
 
     Args:
-        mean: (..., 2), in rad; it is wrapped.
+        mean: (..., 2), in rad; is wrapped.
         covariance: (..., 2, 2), in rad^2.
 
-    Raises BadInput where a number is not finite, or the covariance not symmetric and positive definite.
+    Raises BadInput if a number is not finite or the covariance is not symmetric and positive definite.
     """
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
-            f"wrapped normal with mean {mean.shape}, covariance {covariance.shape}; "
-            "give (..., 2) and (..., 2, 2)"
+            f"a wrapped normal has a mean of shape {mean.shape} and a covariance of shape "
+            f"{covariance.shape}; give (..., 2) and (..., 2, 2)"
         )
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        raise BadInput("mean and covariance of a wrapped normal must be finite; give finite numbers")
+        raise BadInput("the mean and covariance of a wrapped normal must be finite")
     if not np.allclose(
         covariance[..., 0, 1], covariance[..., 1, 0], rtol=1e-9, atol=0.0
     ) or not _is_definite(covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]):
-        raise BadInput(
-            "the covariance of a wrapped normal must be symmetric and positive definite; give such a "
-            "matrix"
-        )
+        raise BadInput("the covariance of a wrapped normal must be symmetric and positive definite")
     return WrappedNormal(wrap_angle(mean), covariance)
 
 
 def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
-    """Return the density (...) at angles x (..., 2).
+    """Compute the density (...) at angles x (..., 2).
 
     Args:
         distribution: with batch axes (...).
@@ -90,7 +87,7 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def circular_moments(distribution: WrappedNormal) -> CircularMoments:
-    """Return circular moments in closed form: the distribution's mean, and its variances."""
+    """Compute circular moments in closed form; the means and variances are those of the distribution."""
     c = distribution.covariance
     correlation = kernels.circular_correlation(c[..., 0, 0], c[..., 0, 1], c[..., 1, 1])
     return CircularMoments(distribution.mean, np.diagonal(c, axis1=-2, axis2=-1), correlation)
@@ -106,15 +103,15 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
     """Make five samples with exactly these circular moments: algorithm 1.
 
     Args:
-        moments: of any distribution on the torus.
-        central_weight: w5, 0 to 1/2. The paper's .2 gives equal weights without correlation; .45 keeps
-            the covariance better in figure 3's experiment, and the mean less well.
+        moments: moments of any distribution on the torus.
+        central_weight: w5, 0 to 1/2. The paper's 0.2 gives equal weights without correlation; 0.45
+            preserves the covariance better in the experiment of figure 3, and the mean less well.
 
-    Raises BadInput where w5 leaves no real positions or |r_c| > 1.
+    Raises BadInput if no real positions exist for w5, or if |r_c| > 1.
     """
     require_central_weight(central_weight)
     if not np.all(np.abs(moments.correlation) <= 1.0):
-        raise BadInput("a circular correlation must lie in [-1, 1]; check the moments")
+        raise BadInput("a circular correlation must be in [-1, 1]; check the moments")
     a, b, w1, w3 = kernels.diracs(
         moments.variance[..., 0], moments.variance[..., 1], moments.correlation, central_weight
     )
@@ -124,22 +121,22 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 
 
 def require_central_weight(central_weight: float) -> None:
-    """Raise BadInput where w5 is not in [0, 1/2], where samples have real positions for every m_1."""
+    """Raise BadInput if w5 is outside [0, 1/2], where real positions exist for every m_1."""
     if not 0.0 <= central_weight <= 0.5:
-        raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, such as 0.2, the paper's")
+        raise BadInput(f"central weight {central_weight:g} is not in [0, 0.5]; the paper uses 0.2")
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:
     """Return the wrapped normal with these circular moments.
 
-    Raises BadInput where a variance is not positive and finite, or no positive definite covariance has
-    this r_c; `fit_mixed_mle` always finds one.
+    Raises BadInput if a variance is not positive and finite, or if no positive definite covariance has
+    this r_c; `fit_mixed_mle` always finds a covariance.
     """
     c11, c22 = moments.variance[..., 0], moments.variance[..., 1]
     if not np.all((moments.variance > 0.0) & (moments.variance <= kernels.UNIFORM)):
         raise BadInput(
-            "a circular variance -2 ln|m| is not in (0, 80]: a first moment has the length 0, or 1 or "
-            "more; check the moments"
+            "a circular variance -2 ln|m| is not in (0, 80]: the length |m| of a first moment must be "
+            "above 0 and below 1; check the moments"
         )
     c12 = kernels.covariance_of(moments.correlation, c11, c22)
     if not _is_definite(c11, c12, c22):
@@ -152,13 +149,13 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
 def fit_mixed_mle(samples: Samples) -> WrappedNormal:
     """Fit as Kurz and Hanebeck, CDC 2015: moments, and the most likely C_12 (over three wraps).
 
-    It is no inverse of `five_samples`: for sigma (.8, 1.3) and a correlation of .5 it returns .461.
+    This does not invert `five_samples`: for sigma (0.8, 1.3) and a correlation of 0.5 it returns 0.461.
     """
     return _assemble(_of_samples(kernels.fit_mixed_mle_each, samples))
 
 
 def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
-    """Return the normalised product of two densities, exactly; both without batch axes."""
+    """Compute the normalized product of two densities exactly; both without batch axes."""
     made = kernels.blank_mixture(np.diagonal(first.covariance + second.covariance))
     count = _product_mixture(*first, *second, made)
     return Mixture(made.mean[:count], made.weights[:count], made.covariance)
@@ -179,14 +176,14 @@ def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
 def sample(
     distribution: WrappedNormal, count: int, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw `count` samples (..., count, 2) of every distribution, in [-pi, pi)."""
+    """Draw `count` samples (..., count, 2) from every distribution, in [-pi, pi)."""
     root = np.linalg.cholesky(distribution.covariance)
     normal = generator.standard_normal((*distribution.mean.shape[:-1], count, 2))
     return wrap_angle(distribution.mean[..., None, :] + normal @ np.swapaxes(root, -1, -2))
 
 
 def _of_samples(kernel: Callable[[NDArray, NDArray], NDArray], samples: Samples) -> NDArray[np.float64]:
-    """Return what `kernel` makes of every sample set, (..., 5)."""
+    """Return the result (..., 5) of `kernel` for every sample set."""
     n = samples.positions.shape[-2]
     batch = np.broadcast_shapes(samples.positions.shape[:-2], samples.weights.shape[:-1])
     fitted = kernel(flatten(samples.positions, batch, n, 2), flatten(samples.weights, batch, n))

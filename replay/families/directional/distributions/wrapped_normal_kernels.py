@@ -1,6 +1,6 @@
-"""Computes bivariate wrapped normals in kernels: fits to samples and products.
+"""Kernels of bivariate wrapped normals: fits to samples and products.
 
-Component-first functions run on arrays as well. A covariance is handed on as c11, c12, c22.
+Functions of `Component` values also accept arrays. A covariance is passed as c11, c12, c22.
 """
 
 import math
@@ -15,7 +15,7 @@ from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.planar import Component, Components, wrap_angle
 
 TURN = 2.0 * math.pi
-# exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.
+# exp(-UNIFORM / 2) is below the rounding of 1: a larger variance is the same as a uniform distribution.
 UNIFORM = 80.0
 # exp(-REACH^2 / 2) is below the rounding of 1
 _REACH = 8.6
@@ -28,7 +28,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 class Mixture(NamedTuple):
-    """Holds a wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
+    """A wrapped Gaussian mixture: means (n, 2), weights (n,), and a common covariance (2, 2)."""
 
     mean: NDArray[np.float64]
     weights: NDArray[np.float64]
@@ -38,22 +38,22 @@ class Mixture(NamedTuple):
 def circular_correlation(c11: Component, c12: Component, c22: Component) -> Component:
     """Compute r_c of a wrapped normal: sinh(c12) / sqrt(sinh(c11) sinh(c22)), without overflow.
 
-    The print's definition in section II lacks the square root of the denominator.
+    The definition printed in section II lacks the square root of the denominator.
     """
     scale = np.exp(abs(c12) - 0.5 * (c11 + c22)) * np.sign(c12)
     return -scale * np.expm1(-2.0 * abs(c12)) / np.sqrt(np.expm1(-2.0 * c11) * np.expm1(-2.0 * c22))
 
 
 def covariance_of(correlation: Component, c11: Component, c22: Component) -> Component:
-    """Return the c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
+    """Compute the c12 for which a wrapped normal has this r_c; inverse of `circular_correlation`."""
     return np.arcsinh(correlation * np.sqrt(np.sinh(c11) * np.sinh(c22)))
 
 
 def diracs(c11: Component, c22: Component, correlation: Component, w5: Component) -> Components:
-    """Return offsets a, b in (0, pi) from the mean, and weights w1 = w2, w3 = w4, of algorithm 1.
+    """Compute the offsets a, b in (0, pi) from the mean, and the weights w1 = w2, w3 = w4: algorithm 1.
 
-    cos a = 1 - (1 - m) / (2 w~) where 1 - m = 1 - exp(-c11 / 2); the print misplaces the bracket. It is
-    taken by half angles, which keeps all digits of small variances.
+    cos a = 1 - (1 - m) / (2 w~) with 1 - m = 1 - exp(-c11 / 2); the paper misplaces the bracket. The
+    computation uses half angles, which keeps all digits of small variances.
     """
     w = 0.5 - 0.5 * w5
     a = 2.0 * np.arcsin(np.sqrt(-np.expm1(-0.5 * c11) / (4.0 * w)))
@@ -64,7 +64,7 @@ def diracs(c11: Component, c22: Component, correlation: Component, w5: Component
 def five_samples(
     mean: NDArray, covariance: NDArray, central_weight: float, x: NDArray, weights: NDArray
 ) -> None:
-    """Fill the samples of algorithm 1 for a wrapped normal.
+    """Write the samples of algorithm 1 for a wrapped normal.
 
     Args:
         mean, covariance: (2,), (2, 2).
@@ -87,7 +87,7 @@ def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Component
         weights: (n,), with sum 1.
         spread: the covariance (2, 2) of every component; 0 for samples.
 
-    Nothing is taken as a difference from 1, so that small variances keep their digits.
+    No step subtracts from 1, so that small variances keep their digits.
     """
     means, variances, fading, squares = np.empty(2), np.empty(2), np.empty(2), np.empty(2)
     for k in range(2):
@@ -122,15 +122,15 @@ def mixed_mle(
     c22: float,
     deviations: NDArray,
 ) -> float:
-    """Find the c12 that maximises the weighted likelihood of samples, the rest given by moments.
+    """Find the c12 that maximizes the weighted likelihood of samples, given the other moments.
 
-    Kurz and Hanebeck, CDC 2015. The likelihood has several maxima, so that a grid over the whole range
-    comes first. Its wraps are cut at three, as in the source.
+    Kurz and Hanebeck, CDC 2015. The likelihood has several maxima, so the search starts with a grid over
+    the whole range. The wraps are truncated at three, as in the source.
 
     Args:
         x, weights: samples (n, 2), weights (n,).
         m1, m2, c11, c22: the circular means and variances.
-        deviations: (n, 2), to work in.
+        deviations: (n, 2), scratch memory.
     """
     for n in range(len(x)):
         deviations[n, 0] = wrap_angle(x[n, 0] - m1) / math.sqrt(c11)
@@ -161,7 +161,7 @@ def mixed_mle(
 
 
 def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float, float]) -> float:
-    """Sum it over samples (n, 2) in standard deviations, up to a constant; `turns` is 2 pi in these."""
+    """Compute the log likelihood, up to a constant, of samples (n, 2) in standard deviations."""
     scale = 0.5 / (1.0 - rho * rho)
     total = 0.5 * math.log(scale)
     for n in range(len(weights)):
@@ -173,15 +173,15 @@ def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float
                 density += math.exp(
                     -scale * (first * first - 2.0 * rho * first * second + second * second)
                 )
-        # a sample beyond the reach of doubles must not hide the others
+        # a sample whose density underflows must not make the sum infinite
         total += weights[n] * math.log(density + 1e-300)
     return total
 
 
 def fit_samples(x: NDArray, weights: NDArray) -> Components:
-    """Return (m1, m2, c11, c12, c22) of the wrapped normal with the circular moments and r_c of samples.
+    """Fit a wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of samples.
 
-    Where no positive definite covariance has them, c12 is the mixed maximum-likelihood estimate.
+    If no positive definite covariance has this r_c, c12 is the mixed maximum-likelihood estimate.
 
     Args:
         x, weights: samples (n, 2), weights (n,) with sum 1.
@@ -194,7 +194,7 @@ def fit_samples(x: NDArray, weights: NDArray) -> Components:
 
 
 def blank_mixture(variance: NDArray) -> Mixture:
-    """Allocate memory for the product of densities whose variances (2,) add up to these at most."""
+    """Allocate memory for the product of two densities whose variances (2,) sum to at most these."""
     most = (2 * _turns(variance[0]) + 1) * (2 * _turns(variance[1]) + 1)
     return Mixture(np.empty((most, 2)), np.empty(most), np.empty((2, 2)))
 
@@ -202,10 +202,10 @@ def blank_mixture(variance: NDArray) -> Mixture:
 def product_mixture(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
 ) -> int:
-    """Fill the product of two wrapped normal densities, exactly a wrapped Gaussian mixture.
+    """Compute the product of two wrapped normal densities, which is exactly a wrapped Gaussian mixture.
 
-    It has a component for every number of turns between the two means, with Kalman's update each;
-    returns how many.
+    The mixture has a component for every number of turns between the two means, each from a Kalman
+    update. Returns the number of components.
 
     Args:
         mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
@@ -256,7 +256,7 @@ def _multiply(left: NDArray, right: NDArray, product: NDArray) -> None:
 
 
 def _limit(covariance: NDArray, limited: NDArray) -> None:
-    """Fill the covariance, or where it stands for a uniform distribution, the least one that does."""
+    """Write the covariance, or UNIFORM times the identity if the distribution is uniform."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     least = 0.5 * (c11 + c22) - math.hypot(0.5 * (c11 - c22), c12)
     for i in range(2):
@@ -266,20 +266,21 @@ def _limit(covariance: NDArray, limited: NDArray) -> None:
 
 
 def _turns(variance: float) -> int:
-    """Count the turns either way that a normal density reaches to the last digit of its wrapped sum."""
+    """Return the number of turns in each direction that the wrapped sum needs for full precision."""
     return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
 
 
 def fit_product(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
 ) -> Components:
-    """Return the wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
+    """Fit a wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
-    Where no positive definite covariance has them (modes far apart), the components' correlation stays.
+    If no positive definite covariance has this r_c (modes far apart), c12 keeps the correlation of the
+    components.
 
     Args:
         mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
-        mixture: to work in, see `blank_mixture`.
+        mixture: scratch memory, see `blank_mixture`.
     """
     count = product_mixture(mean, covariance, other_mean, other, mixture)
     means, weights, spread = mixture.mean[:count], mixture.weights[:count], mixture.covariance
@@ -291,7 +292,7 @@ def fit_product(
 
 
 def density(x1: float, x2: float, covariance: NDArray) -> float:
-    """Compute the density at a deviation from the mean: the wrapped sum, or Fourier's where shorter.
+    """Compute the density at a deviation from the mean by the wrapped sum or, if shorter, Fourier's.
 
     Args:
         x1, x2: the deviation, in rad.
@@ -362,7 +363,7 @@ def _mixed_mle_one(n: int, x: NDArray, weights: NDArray, out: NDArray, deviation
 
 
 def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
-    """Return m1, m2, c11, c12, c22 (n, 5) of sample sets, c12 by `mixed_mle`.
+    """Fit m1, m2, c11, c12, c22 (n, 5) to sample sets, with c12 by `mixed_mle`.
 
     Args:
         x, weights: samples (n, samples, 2), weights (n, samples).

@@ -1,10 +1,11 @@
-"""Estimates orientation by common methods: Madgwick's, Mahony's, and Laidig and Seel's VQF.
+"""Orientation by common methods: Madgwick's, Mahony's, and VQF by Laidig and Seel.
 
-They are what filters are compared with, and tell no covariance: one is assumed. Madgwick, "An
-efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
-Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
-Automatic Control 53(5), 2008; VQF is its authors' library, as it is. Gains and parameters are the
-authors' own. Quaternions turn body vectors into east, north, up; each begins with its first sample.
+These methods serve as a comparison for filters. They estimate no covariance, so one is assumed.
+Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010;
+Mahony, Hamel, Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE
+Transactions on Automatic Control 53(5), 2008; VQF is its authors' library, unchanged. Gains and
+parameters are those of the authors. Quaternions rotate body vectors into east, north, up. Each estimate
+begins with the first sample.
 """
 
 from typing import Any, NamedTuple
@@ -32,36 +33,36 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """States what is assumed, since the method estimates no covariance.
+    """The assumed uncertainty, since the method estimates no covariance.
 
     Attributes:
-        sigma_deg: standard deviation about each axis that is stated.
+        sigma_deg: standard deviation about each axis.
     """
 
     sigma_deg: PositiveFloat = 3.0
 
     @property
     def covariance(self) -> Floats:
-        """Return the covariance of the rotation vector, rad^2, (3, 3)."""
+        """Return the covariance of the rotation vector (3, 3), rad^2."""
         return np.radians(self.sigma_deg) ** 2 * np.eye(3)
 
 
 class MadgwickParameters(AssumedParameters):
-    """States the gain; the default is the author's for such a unit.
+    """The gain; its default is the author's value for such a unit.
 
     Attributes:
-        gain: gain of the gradient's direction, in rad/s.
+        gain: step along the normalized gradient, in rad/s.
     """
 
     gain: NonNegativeFloat = 0.041
 
 
 class MahonyParameters(AssumedParameters):
-    """States the gains.
+    """The gains of orientation and bias.
 
     Attributes:
         gain: gain of the correction, in 1/s.
-        bias_gain: gain of the correction of the bias, in 1/s^2.
+        bias_gain: gain of the bias correction, in 1/s^2.
     """
 
     gain: NonNegativeFloat = 1.0
@@ -69,11 +70,11 @@ class MahonyParameters(AssumedParameters):
 
 
 class VqfParameters(AssumedParameters):
-    """States the time constants.
+    """The time constants of VQF.
 
     Attributes:
-        inclination_s: time constant of the correction of inclination.
-        heading_s: time constant of the correction of heading.
+        inclination_s: time constant of the inclination correction.
+        heading_s: time constant of the heading correction.
     """
 
     inclination_s: PositiveFloat = 3.0
@@ -81,7 +82,7 @@ class VqfParameters(AssumedParameters):
 
 
 class ComplementarySettings(NamedTuple):
-    """Holds the gains, and the covariance (3, 3) that is assumed."""
+    """Gains, and the assumed covariance (3, 3)."""
 
     gain: float
     bias_gain: float
@@ -89,7 +90,7 @@ class ComplementarySettings(NamedTuple):
 
 
 class ComplementaryState(NamedTuple):
-    """Carries orientations (runs, 4), zero for none yet; biases; stamps."""
+    """Orientations (runs, 4), zero before the first sample; biases; time stamps."""
 
     orientation: Floats
     bias: Floats
@@ -97,7 +98,7 @@ class ComplementaryState(NamedTuple):
 
 
 def start(given: Given[Any]) -> tuple[ComplementarySettings, ComplementaryState]:
-    """Start with nothing known."""
+    """Start without any knowledge."""
     values = given.parameters
     settings = ComplementarySettings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
     return settings, ComplementaryState(
@@ -112,14 +113,14 @@ def follow_madgwick(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """Take a step of the gyro, and one down the gradient of what force and field contradict."""
+    """Integrate the gyro and take a gradient step that aligns gravity and magnetic field."""
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])
         if not can_follow(run, force, rate, field, state):
             continue
         q = began(run, messages, row, state)
         duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
-        # the author's north is x, see (46)
+        # in the paper, x points north, see (46)
         w, x, y, z = product((HALF, 0.0, 0.0, -HALF), q)
         across, ahead, up = into_plane((w, x, y, z), field)
         north = np.sqrt(across * across + ahead * ahead)
@@ -155,7 +156,7 @@ def follow_mahony(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """Take a step of the gyro less its bias, turned towards what force and field say, (48)."""
+    """Integrate the gyro minus its bias, corrected towards gravity and magnetic field: (48)."""
     bias = state.bias[run]
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])
@@ -185,10 +186,10 @@ def follow_mahony(
 
 
 def unit_vectors(value: Floats) -> Any:
-    """Return the directions of force and field, and the turn rate between them.
+    """Return the directions of specific force and magnetic field, and the turn rate between them.
 
-    A field that is not finite is none, as between two samples of a slower magnetometer: zero, which
-    turns nothing.
+    If the field is not finite, as between two samples of a slower magnetometer, its direction is zero,
+    which causes no correction.
     """
     rate = value[3], value[4], value[5]
     if not np.isfinite(value[6] + value[7] + value[8]):
@@ -197,7 +198,7 @@ def unit_vectors(value: Floats) -> Any:
 
 
 def can_follow(run: int, force: Any, rate: Any, field: Any, state: ComplementaryState) -> bool:
-    """Tell whether a sample says anything: force and turn rate, and the first one the field too."""
+    """Test whether a sample has finite force and turn rate and, if it is the first, a field."""
     if not np.isfinite(force[0] + force[1] + force[2] + rate[0] + rate[1] + rate[2]):
         return False
     q = state.orientation[run]
@@ -206,7 +207,7 @@ def can_follow(run: int, force: Any, rate: Any, field: Any, state: Complementary
 
 
 def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
-    """Return the orientation so far; of the first sample that of its force and field."""
+    """Return the current orientation; initialize it by the first sample's force and field."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
         q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
@@ -223,7 +224,7 @@ def keep(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """Normalise, carry and tell an orientation."""
+    """Normalize an orientation, and write it to the state and the results."""
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     for part in range(4):
         state.orientation[run, part] = q[part] / length
@@ -233,16 +234,18 @@ def keep(
 
 
 def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
-    """Return the library's estimate at every stamp; samples are taken to be evenly spaced.
+    """Return the library's estimate at every stamp, assuming evenly spaced samples.
 
-    Raises BadInput where the library is not installed.
+    Raises BadInput if the library is not installed.
     """
     try:
         from vqf import VQF
     except ImportError:
-        raise BadInput("estimator vqf needs the package vqf: pip install vqf") from None
+        raise BadInput("estimator vqf needs the package vqf; run pip install vqf") from None
     samples = streams["inertial"]
-    is_last = np.diff(samples.publish_time_ns, append=-1) != 0  # of one stamp, which have their mean
+    is_last = (
+        np.diff(samples.publish_time_ns, append=-1) != 0
+    )  # samples with equal stamps hold their mean
     force, rate, field = (np.ascontiguousarray(samples[name][is_last]) for name in FIELDS)
     time_ns = samples.publish_time_ns[is_last]
     step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)
@@ -269,12 +272,15 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
 
 MADGWICK = of_nine_axes(
     of_inertial_samples(
-        "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+        "Madgwick's gradient-descent filter for orientation",
+        MadgwickParameters,
+        start,
+        follow=follow_madgwick,
     )
 )
 MAHONY = of_nine_axes(
     of_inertial_samples(
-        "Mahony's complementary filter of orientation and bias",
+        "Mahony's complementary filter for orientation and gyro bias",
         MahonyParameters,
         start,
         follow=follow_mahony,
@@ -282,7 +288,7 @@ MAHONY = of_nine_axes(
 )
 VQF = with_magnetometer(
     batch(
-        "VQF of Laidig and Seel, by the package vqf",
+        "VQF by Laidig and Seel, from the package vqf",
         parameters=VqfParameters,
         streams={"inertial": schemas.INERTIAL_SAMPLE},
         static={},

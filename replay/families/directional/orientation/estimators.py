@@ -1,4 +1,4 @@
-"""Offers the estimators of orientation from inertial samples to a replay; see `inertial`."""
+"""Estimators of orientation from inertial samples for replay; see `inertial`."""
 
 import math
 from collections.abc import Callable
@@ -36,14 +36,14 @@ Advance = Callable[
 
 
 class InertialParameters(Parameters):
-    """States noise and averaging of inertial samples, the same for all logs.
+    """Noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
-        rest_s: the body rests for so long first; without it that is found, up to 20 s.
-        block_s: an attitude of accelerometer and magnetometer is averaged over so long.
+        rest_s: duration of the rest at the start; if not set, it is found in the log, up to 20 s.
+        block_s: averaging time of an attitude from accelerometer and magnetometer.
         attitude_sigma_deg: standard deviation of such an attitude.
         drift_sigma_deg: random walk of the gyro's orientation, in deg/sqrt(s).
-        gap_s: a longer silence is a gap.
+        gap_s: time without samples above which there is a gap.
     """
 
     rest_s: NonNegativeFloat | None = None
@@ -54,7 +54,7 @@ class InertialParameters(Parameters):
 
     @property
     def model(self) -> InertialModel:
-        """Return the same in radians."""
+        """Return the model with angles in radians."""
         return InertialModel(
             rest_s=LONGEST_S if self.rest_s is None else self.rest_s,
             block_s=self.block_s,
@@ -65,10 +65,10 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """States how the gyro's bias is treated.
+    """Noise and averaging of inertial samples, and how the gyro's bias is treated.
 
     Attributes:
-        unbiased: whether the gyro's mean over the rest is subtracted.
+        unbiased: whether the gyro's mean during the rest is subtracted.
     """
 
     unbiased: bool = True
@@ -77,7 +77,7 @@ class GyroParameters(InertialParameters):
 def _follow_all(
     settings: tuple[InertialModel, Advance], messages: Messages, state: Any, results: Results
 ) -> None:
-    """Take all runs through their samples; `value` is specific force, turn rate, magnetic field."""
+    """Process the samples of all runs; `value` is specific force, turn rate, magnetic field."""
     model, advance = settings
     force, rate, field = np.split(messages.value, 3, axis=1)
     samples = InertialSamples(messages.offsets, messages.time_ns, rate, force, field)
@@ -94,7 +94,7 @@ def of_inertial_samples(
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
 ) -> Estimator[Any]:
-    """Return an estimator of orientation from nine-axis samples; see `recursive`."""
+    """Make an estimator of orientation from nine-axis samples; see `recursive`."""
     return recursive(
         summary,
         parameters=parameters,
@@ -131,7 +131,7 @@ def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel,
 
 BINGHAM_INERTIAL = of_nine_axes(
     of_inertial_samples(
-        "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
+        "recursive Bingham filter for gyro increments and averaged TRIAD attitudes",
         InertialParameters,
         _start_bingham,
         follow_all=_follow_all,
@@ -139,7 +139,7 @@ BINGHAM_INERTIAL = of_nine_axes(
 )
 GYRO = of_nine_axes(
     of_inertial_samples(
-        "the gyro alone, from the attitude of the rest at the start on",
+        "dead reckoning with the gyro only, from the attitude of the initial rest",
         GyroParameters,
         _start_gyro,
         follow_all=_follow_all,
@@ -147,7 +147,7 @@ GYRO = of_nine_axes(
 )
 TRIAD = with_magnetometer(
     of_inertial_samples(
-        "the TRIAD attitude of every sample's accelerometer and magnetometer",
+        "TRIAD attitude from the accelerometer and magnetometer of every sample",
         InertialParameters,
         _start_triad,
         follow_all=_follow_all,

@@ -1,11 +1,13 @@
-"""Estimates orientation from inertial and magnetic samples by dead reckoning and Bingham filter.
+"""Orientation from inertial and magnetic samples by dead reckoning and a Bingham filter.
 
-Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
+The module also has the baseline that uses the attitude of every single sample; dead reckoning from the
+gyro only is in `reckoning`.
 
-Made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021). The body rests
-first, which gives the bias of the gyro. Then the accelerometer and the magnetometer are carried to the
-end of a block by the gyro and averaged, which tells gravity from motion; the TRIAD attitude of the
-averages is a quaternion measurement for the filter. Quaternions turn body vectors into east, north, up.
+The filter was made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021).
+The body rests first, which gives the bias of the gyro. Then, for each block of time, the gyro rotates
+the accelerometer and magnetometer samples to the end of the block, where they are averaged, which
+separates gravity from motion. The TRIAD attitude of the averages is a quaternion measurement for the
+filter. Quaternions rotate body vectors into east, north, up.
 """
 
 import math
@@ -40,14 +42,14 @@ _NS = 1e-9
 
 
 class InertialModel(NamedTuple):
-    """Holds what the filter takes for granted, the same for all logs.
+    """Assumptions of the filter, the same for all logs.
 
     Attributes:
-        rest_s: how long the body rests at the start, at most.
-        block_s: how much time is averaged into one attitude.
+        rest_s: longest duration of the rest at the start.
+        block_s: averaging time of one attitude.
         attitude_sigma_rad: standard deviation of a block's attitude about each axis.
         drift_sigma_rad: standard deviation of one second's dead reckoning about each axis.
-        gap_s: a longer gap between two samples makes the orientation unknown.
+        gap_s: time between two samples above which the orientation becomes unknown.
     """
 
     rest_s: float = 20.0
@@ -58,13 +60,13 @@ class InertialModel(NamedTuple):
 
 
 class InertialSamples(NamedTuple):
-    """Holds the samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
+    """Samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
         time_ns: (rows,).
         rate: gyro, rad/s, (rows, 3).
-        force: accelerometer, (rows, 3), any unit: at rest it points up.
+        force: accelerometer, (rows, 3), any unit; points up at rest.
         field: magnetometer, (rows, 3), any unit.
     """
 
@@ -76,19 +78,20 @@ class InertialSamples(NamedTuple):
 
 
 class InertialState(NamedTuple):
-    """Holds what the filter carries from sample to sample, first axis runs.
+    """State of the filter between samples, first axis runs.
 
     Attributes:
-        time_ns: of the first sample, the last one, the start of the block, (runs, 3); -1 for none yet.
-        rate_sum: the gyro's sum over the rest (runs, 3).
-        rest_samples: how many samples rate_sum has (runs,).
-        axes: of the Bingham distribution at the start of the block (runs, 4, 4).
+        time_ns: stamps of the first sample, the last sample and the start of the block, (runs, 3); -1
+            before they exist.
+        rate_sum: sum of the gyro's samples during the rest, (runs, 3).
+        rest_samples: number of samples in rate_sum, (runs,).
+        axes: axes of the Bingham distribution at the start of the block, (runs, 4, 4).
         concentrations: (runs, 4), all 0 while the orientation is unknown.
-        covariance: of its error as a rotation vector in the body's frame, rad^2, (runs, 3, 3).
-        increment: the rotation since, (runs, 4).
-        force: sum over the block, carried to the last sample, (runs, 3).
-        field: the same of the magnetometer, (runs, 3).
-        rest_s: how long the body rests, if that is less than the model says, (runs,).
+        covariance: covariance of its error as a rotation vector in the body frame, rad^2, (runs, 3, 3).
+        increment: the rotation since the start of the block, (runs, 4).
+        force: sum over the block, rotated into the frame of the last sample, (runs, 3).
+        field: the same for the magnetometer, (runs, 3).
+        rest_s: duration of the rest if shorter than in the model, (runs,).
     """
 
     time_ns: Integers
@@ -104,9 +107,9 @@ class InertialState(NamedTuple):
 
 
 class OrientationEstimates(NamedTuple):
-    """Holds per sample the orientation (rows, 4), and covariance in the body frame (rows, 3, 3).
+    """Orientation (rows, 4) of every sample, and covariance in the body frame (rows, 3, 3).
 
-    NaN while the orientation is unknown, and where a sample is not finite.
+    Both are NaN while the orientation is unknown and if a sample is not finite.
     """
 
     orientation: Floats
@@ -117,8 +120,8 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
     """Return the state before the first sample.
 
     Args:
-        runs: how many.
-        rest_s: (runs,), rests that end before the model's.
+        runs: number of runs.
+        rest_s: (runs,), durations of rests that are shorter than in the model.
     """
     return InertialState(
         np.full((runs, 3), -1),
@@ -136,7 +139,7 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 
 @cache
 def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    """Return the loop over runs of what takes one run through its samples, compiled."""
+    """Compile a function that processes the samples of one run into a loop over runs."""
     return compile_over_runs(run_once)
 
 
@@ -146,10 +149,10 @@ def run_inertial_filter(
     samples: InertialSamples,
     estimates: OrientationEstimates | None = None,
 ) -> tuple[InertialState, OrientationEstimates]:
-    """Go through the samples of an ensemble; returns the state after them and the estimates.
+    """Process the samples of an ensemble; return the state after them and the estimates.
 
-    These are filled into `estimates`, all NaN, where given. Raises BadInput where the columns have
-    different lengths or the model's numbers are not positive.
+    The estimates are written to `estimates`, which must be NaN everywhere, if given. Raises BadInput if
+    the columns have different lengths or the model's numbers are not positive.
     """
     samples, estimates = prepared(model, samples, estimates)
     state = InertialState._make(part.copy() for part in state)
@@ -160,9 +163,9 @@ def run_inertial_filter(
 def attitudes(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
 ) -> OrientationEstimates:
-    """Return the TRIAD attitude of every sample alone: gravity is taken for all that is felt.
+    """Compute the TRIAD attitude of every single sample, taking the whole specific force for gravity.
 
-    Args and errors as `run_inertial_filter`.
+    Args and errors as for `run_inertial_filter`.
     """
     samples, estimates = prepared(model, samples, estimates)
     rows = len(samples.force)
@@ -174,21 +177,23 @@ def attitudes(
 def prepared(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
 ) -> tuple[InertialSamples, OrientationEstimates]:
-    """Check samples, and return them with estimates to fill; see `run_inertial_filter`.
+    """Check samples and return them with the estimates to fill; see `run_inertial_filter`.
 
     Args:
-        model: the filter's.
-        samples: of all runs.
-        estimates: to fill, all NaN; made where it is None.
+        model: assumptions of the filter.
+        samples: samples of all runs.
+        estimates: estimates to fill, all NaN; made if None.
     """
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
         raise BadInput(
-            "inertial samples: give for each a time, and turn rate, specific force and magnetic field "
-            "of 3 numbers"
+            "every inertial sample needs a time, and 3 numbers each for turn rate, specific force and "
+            "magnetic field"
         )
     if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
-        raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
+        raise BadInput(
+            "block_s, gap_s and the standard deviations of an inertial filter must be positive"
+        )
     if estimates is None:
         estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
     return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
@@ -221,8 +226,9 @@ def _accumulate(
 ) -> float:
     """Add one sample to the rest and to the block, in place.
 
-    Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
-    A field that is not finite is none, as between two samples of a slower magnetometer.
+    Returns the time (s) since the block's start, or NaN if the sample is not finite and is skipped. If
+    only the field is not finite, as between two samples of a slower magnetometer, the rest of the sample
+    is used.
     """
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
@@ -268,7 +274,7 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
 
 
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
-    """Predict once over the block and update once with its attitude, in place."""
+    """Predict over the block and update with its attitude, in place."""
     axes, z = state.axes[run], state.concentrations[run]
     moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
@@ -298,7 +304,7 @@ def _dead_reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Write the orientation that the block's increment leads to, and the error that it adds."""
+    """Write the orientation after the block's increment, and the covariance that it adds."""
     increment, covariance = state.increment[run], estimates.covariance[row]
     compose(state.axes[run, :, 3], increment, estimates.orientation[row])
     covariance[:, :] = state.covariance[run]

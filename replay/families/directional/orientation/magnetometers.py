@@ -1,7 +1,7 @@
-"""Gives estimators of nine-axis samples the fields of a magnetometer that has a topic of its own.
+"""Magnetometers with their own topic, for estimators of nine-axis samples.
 
-A field belongs to the next sample of the unit, as if its message had had it; between two fields there is
-none. So a magnetometer may have any rate.
+A field is assigned to the unit's next sample, as if it were part of that message; the samples between
+two fields have no field. So a magnetometer may have any rate.
 """
 
 from collections.abc import Mapping
@@ -33,22 +33,23 @@ from fuselog.replay.engine.streams.blocks import (
 
 FIELD = "magnetic_field_ut"
 REFUSAL = (
-    "has no magnetic field, by which the heading is found, and no topic magnetic_field has it; import "
-    "it, as fields.magnetic_field_ut = [...] in the mapping"
+    "has no magnetic field, which the heading needs, and there is no topic magnetic_field; import "
+    "the field with fields.magnetic_field_ut = [...] in the mapping"
 )
 
 
 class _Waiting(NamedTuple):
-    """Carries fields (runs, 3) that no sample has come after, NaN for none, and a state."""
+    """Fields (runs, 3) not yet assigned to a sample, NaN if none, and the estimator's state."""
 
     field: Floats | None
     inner: Any
 
 
 def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator, which takes the fields of a topic beside the unit's where there is one.
+    """Return the estimator with support for a magnetometer on its own topic.
 
-    Samples of one stamp have the mean of their forces and turn rates, so that each of them counts.
+    Samples with equal stamps are replaced by the mean of their forces and turn rates, so that each of
+    them contributes.
     """
 
     def bind(name: str, topics: Mapping[str, Topic], values: Any) -> list[Bound]:
@@ -65,7 +66,7 @@ def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
 
 
 def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> str:
-    """Find a unit's magnetometer: in its namespace, or the only one of a log with one unit."""
+    """Find the magnetometer of a unit: in its namespace, or the only one if the log has one unit."""
     own = f"{unit.rpartition('/')[0]}/magnetic_field"
     kind = schemas.MAGNETIC_FIELD.full_name
     there = [name for name, topic in topics.items() if topic.schema_name == kind]
@@ -75,7 +76,7 @@ def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> s
 
 
 def _averaging(bound: Bound) -> Bound:
-    """Return an estimator of a unit's samples that is given the means of those with one stamp."""
+    """Wrap a bound estimator so that samples with equal stamps are averaged."""
     unit = bound.streams[0]
     if isinstance(bound, Batch):
         solve = bound.solve
@@ -89,7 +90,7 @@ def _averaging(bound: Bound) -> Bound:
 
 
 def with_means(samples: Ragged) -> Ragged:
-    """Return inertial samples, in the order of time, of which those of one stamp have their mean."""
+    """Return inertial samples, in time order, with samples of equal stamps replaced by their mean."""
     stream, run = samples.stream, run_of_rows(samples.offsets)
     is_new = (np.diff(stream.publish_time_ns, prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0)
     if is_new.all():
@@ -105,7 +106,7 @@ def with_means(samples: Ragged) -> Ragged:
 
 
 def _joining(bound: Bound, magnetometer: str) -> Bound:
-    """Return an estimator of a unit's samples as one of these and a magnetometer's fields."""
+    """Wrap a bound estimator of a unit's samples so that it also uses the fields of a magnetometer."""
     unit = bound.streams[0]
     if not magnetometer:
         return replace(bound, needed={unit: Needed(FIELD, REFUSAL)})
@@ -144,19 +145,19 @@ def _find(
 
 
 def _joined_whole(given: Mapping[str, Ragged], streams: tuple[str, str], clock: Clock) -> Ragged:
-    """Join the fields of a magnetometer to the samples of a unit, of whole streams."""
+    """Assign the fields of a magnetometer to the samples of a unit, for whole streams."""
     both = {topic: given[topic] for topic in streams}
     joined, _ = _joined(Block(both, merge_events(both, clock)), streams, None)
     return joined.streams[streams[0]]
 
 
 def _joined(block: Block, streams: tuple[str, str], waiting: Floats | None) -> tuple[Block, Floats]:
-    """Return a block of the unit's samples with the fields of a magnetometer, and what fields wait.
+    """Return a block of the unit's samples with fields assigned, and the fields not yet assigned.
 
     Args:
-        block: messages of both.
+        block: messages of both topics.
         streams: the topics of the unit and the magnetometer.
-        waiting: (runs, 3), fields that came after the last sample; None before the first block.
+        waiting: (runs, 3), fields after the last sample; None before the first block.
     """
     unit, fields = (block.streams[topic] for topic in streams)
     events, names = block.events, list(block.streams)

@@ -1,4 +1,4 @@
-"""Follows the gyro alone, from the attitude of the rest at the start on; see `inertial`."""
+"""Dead reckoning from the gyro only, from the attitude of the initial rest on; see `inertial`."""
 
 from typing import NamedTuple
 
@@ -20,14 +20,14 @@ NS = 1e-9
 
 
 class ReckoningState(NamedTuple):
-    """Holds what dead reckoning carries from sample to sample, first axis runs.
+    """State of dead reckoning between samples, first axis runs.
 
     Attributes:
         orientation: (runs, 4), zero until the rest is over, NaN after a gap.
-        time_ns: of the first sample and the last one, (runs, 2); -1 for none yet.
-        sums: of gyro, accelerometer and magnetometer over the rest, (runs, 3, 3).
-        rest_samples: how many samples they have (runs,).
-        rest_s: how long the body rests, if that is less than the model says, (runs,).
+        time_ns: stamps of the first and the last sample, (runs, 2); -1 before they exist.
+        sums: sums of gyro, accelerometer and magnetometer during the rest, (runs, 3, 3).
+        rest_samples: number of samples in the sums, (runs,).
+        rest_s: duration of the rest if shorter than in the model, (runs,).
     """
 
     orientation: Floats
@@ -41,8 +41,8 @@ def start_reckoning(runs: int, rest_s: Floats | None = None) -> ReckoningState:
     """Return the state before the first sample.
 
     Args:
-        runs: how many.
-        rest_s: (runs,), rests that end before the model's.
+        runs: number of runs.
+        rest_s: (runs,), durations of rests that are shorter than in the model.
     """
     none_yet = np.full((runs, 2), -1)
     return ReckoningState(
@@ -62,9 +62,9 @@ def run_dead_reckoning(
     *,
     unbiased: bool,
 ) -> tuple[ReckoningState, OrientationEstimates]:
-    """Follow the gyro alone from the attitude of the rest on, less its mean there where `unbiased`.
+    """Integrate the gyro from the attitude of the rest on, minus its mean during the rest if `unbiased`.
 
-    There are no estimates before the rest is over, nor after a gap. Args and errors as
+    There are no estimates before the end of the rest or after a gap. Args and errors as for
     `run_inertial_filter`.
     """
     samples, estimates = prepared(model, samples, estimates)
@@ -94,7 +94,7 @@ def _reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Take in one sample; one that is not finite is passed over, or only its field."""
+    """Process one sample; skip it if force or turn rate is not finite, or only its field."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
     if not all_finite(rate, force, force):

@@ -1,7 +1,7 @@
-"""Finds how long a unit rests at its start, by its gyro, its force and its magnetic field.
+"""Detection of a unit's initial rest from its gyro, specific force and magnetic field.
 
-Over the rest the gyro's mean is its bias. Means over short windows are compared with those of all
-windows before: the rest is over where one differs by more than its noise explains.
+The mean of the gyro during the rest is its bias. Means over short windows are compared with the mean of
+all previous windows: the rest ends when a window differs by more than its noise explains.
 """
 
 from collections.abc import Mapping
@@ -25,19 +25,19 @@ from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.families.directional.orientation.magnetometers import with_magnetometer
 from fuselog.replay.inference.run.first_messages import Fact, started
 
-REST = "rest"  # what `start` finds the samples of the rest under
-LONGEST_S, LEAST_S = 20.0, 1.0  # no more is needed, and less says too little of a bias
+REST = "rest"  # the key under which `start` finds the samples of the rest
+LONGEST_S, LEAST_S = 20.0, 1.0  # more is not needed; less is too short to estimate a bias
 WINDOW_S = 0.25
-SIGMAS = 6.0  # of noise, beyond which a window's mean is another one
-LEAST_RATE_RADPS, LEAST_ANGLE_RAD = 0.02, np.radians(2.0)  # what is less is no motion
+SIGMAS = 6.0  # of noise, above which a window's mean counts as different
+LEAST_RATE_RADPS, LEAST_ANGLE_RAD = 0.02, np.radians(2.0)  # below this there is no motion
 LARGEST_BIAS_RADPS = 0.35
 
 
 def resting(stream: Stream) -> int:
-    """Count the samples of a unit's rest at its start, of at most `LONGEST_S`; zero if it moves at once.
+    """Count the samples of a unit's initial rest of at most `LONGEST_S`; 0 if it moves immediately.
 
     Args:
-        stream: inertial samples in order of time.
+        stream: inertial samples in time order.
     """
     since_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[:1])
     stream = stream.take(since_s < LONGEST_S)
@@ -51,12 +51,12 @@ def resting(stream: Stream) -> int:
             moves |= _differing(values, of_window, len(moves), is_rate=is_rate)
     if not moves.any():
         return len(stream)
-    last = int(np.argmax(moves)) - 1  # in which the motion may begin slowly
+    last = int(np.argmax(moves)) - 1  # the motion may begin slowly in this window
     return int(np.count_nonzero(of_window < last))
 
 
 def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> Booleans:
-    """Tell which windows (count,) differ in their mean from all before them."""
+    """Find the windows (count,) whose mean differs from that of all previous windows."""
     known = np.isfinite(values).all(axis=1)
     values, of_window = values[known], of_window[known]
     sizes = np.bincount(of_window, minlength=count)
@@ -68,7 +68,7 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
     with np.errstate(invalid="ignore", divide="ignore"):
         mean, usual = sums / sizes[:, None], of_before / before[:, None]
         within = np.maximum(squares / sizes[:, None] - mean**2, 0.0).sum(axis=1)
-        # the noise of what rests is that of its quietest windows
+        # the noise at rest is that of the quietest window so far
         variance = np.minimum.accumulate(np.where(sizes > 1, within, np.inf))
         noise = SIGMAS * np.sqrt(variance * (1.0 / sizes + 1.0 / before))
         apart = np.linalg.norm(mean - usual, axis=1)
@@ -82,10 +82,10 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
 
 
 def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator, which finds how long its unit rests.
+    """Return the estimator with automatic detection of its unit's initial rest.
 
-    That is found if it has a parameter `rest_s` that is not set. Its `start` is given the samples of the
-    rest as `REST`.
+    The rest is detected if the estimator has a parameter `rest_s` and it is not set. The estimator's
+    `start` finds the samples of the rest under `REST`.
     """
 
     def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
@@ -106,7 +106,7 @@ def _find(
     static: Mapping[str, Ragged],
     clock: Clock,
 ) -> Initialized:
-    """Find the rest of every run.
+    """Find the initial rest of every run.
 
     Raises BadInput if a unit moves within `LEAST_S` of its start.
     """
@@ -119,9 +119,9 @@ def _find(
         rests_s.append(1e-9 * float(np.ptp(stamps_ns)) if len(stamps_ns) else 0.0)
         if len(own) and rests_s[-1] < LEAST_S:
             raise BadInput(
-                f"topic {topic}: the unit moves within {LEAST_S:g} s of its first sample, and the "
-                "gyro's bias is its mean over a rest; cut the log so that it begins at rest, or state "
-                "with --set rest_s=SECONDS how long the unit rests"
+                f"topic {topic}: the unit moves within {LEAST_S:g} s of its first sample, but the bias "
+                "of the gyro is estimated at rest; cut the log so that it begins at rest, or give the "
+                "duration of the rest with --set rest_s=SECONDS"
             )
     firsts_ns = np.array([_first_ns(samples.of_run(run)) for run in range(samples.runs)], np.int64)
     for rest_s in dict.fromkeys(round(each, 2) for each in rests_s if each):
@@ -137,7 +137,7 @@ def _first_ns(samples: Stream) -> int:
 
 
 def rests_of(given: Mapping[str, Ragged], runs: int) -> Floats:
-    """Return how long the unit of every run (runs,) rests, in s; infinite where that was not sought."""
+    """Return the rest's duration of every run (runs,), in s; infinite if it was not detected."""
     if REST not in given:
         return np.full(runs, np.inf)
     rest = given[REST]

@@ -1,4 +1,4 @@
-"""Steps an orientation by a turn, and fills what filters of it begin with."""
+"""Rotations of vectors and quaternions, and matrices that orientation filters start from."""
 
 import math
 
@@ -8,7 +8,7 @@ from fuselog.replay.families.directional.distributions.bingham_kernels import Ve
 
 
 def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
-    """Tell whether no component of the three vectors is NaN or infinite.
+    """Test whether all components of three vectors are finite.
 
     Args:
         rate, force, field: (3,).
@@ -20,7 +20,7 @@ def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
 
 
 def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
-    """Fill concentrations about the identity, in the order of a quaternion's components.
+    """Write isotropic concentrations about the identity, in the order of a quaternion's components.
 
     Args:
         sigma_rad: standard deviation of a turn about each axis.
@@ -39,11 +39,11 @@ def turn_quaternion(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, fl
 
 
 def turn_back(turned: Vector, vector: NDArray) -> None:
-    """Turn a fixed vector, in place, into the frame of a body that has turned by a quaternion.
+    """Transform a fixed vector, in place, into the frame of a body that has rotated by a quaternion.
 
     Args:
-        turned: the unit quaternion (4,), w first.
-        vector: (3,), changed.
+        turned: unit quaternion (4,), w first.
+        vector: (3,), overwritten.
     """
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
     a, b, c = vector[0], vector[1], vector[2]
@@ -54,7 +54,7 @@ def turn_back(turned: Vector, vector: NDArray) -> None:
 
 
 def fill_diagonal(values: NDArray, out: NDArray) -> None:
-    """Fill a diagonal matrix.
+    """Write a diagonal matrix.
 
     Args:
         values: (n,).

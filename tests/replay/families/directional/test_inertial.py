@@ -174,7 +174,7 @@ def test_bad_input_is_told():
     _, samples = simulate(1.0, 8)
     with pytest.raises(BadInput, match="must be positive"):
         run_inertial_filter(InertialModel(block_s=0.0), start_inertial_filter(1), samples)
-    with pytest.raises(BadInput, match="give for each a time"):
+    with pytest.raises(BadInput, match="sample needs a time"):
         run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(rate=samples.rate[:-1]))
 
 
@@ -299,5 +299,5 @@ def test_a_unit_without_a_magnetometer_is_refused(settings: dict[str, str]) -> N
     samples = source.streams["/body/inertial"]
     field = np.full_like(samples["magnetic_field_ut"], np.nan)
     blind = replace(samples, columns={**samples.columns, "magnetic_field_ut": field})
-    with pytest.raises(BadInput, match="has no magnetic field, by which the heading is found"):
+    with pytest.raises(BadInput, match="has no magnetic field, which the heading needs"):
         fl.replay(replace(source, streams={samples.topic: blind}), {"of": settings})
