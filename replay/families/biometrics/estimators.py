@@ -44,7 +44,7 @@ from fuselog.replay.families.biometrics.pairs import (
     user_folds,
 )
 
-NEEDS = f"a stream {TOPIC} of at least two matchers' score vectors"
+NEEDS = f"a stream {TOPIC} with score vectors of at least two matchers"
 LEAST_PROBABILITY = 1e-300
 LOG_LIKELIHOOD_RATIO = "log_likelihood_ratio"
 LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
@@ -267,7 +267,7 @@ def _sequence(
         return 1, len(chosen)
     if len(counts) > 1:
         raise BadInput(
-            f"{', '.join(modalities)}: an HMM needs the same number of matchers of every modality; "
+            f"{', '.join(modalities)}: an HMM needs the same number of matchers for every modality; "
             'choose another subset, or topology = "joint"'
         )
     return len(chosen) // counts.pop(), modalities.count(modalities[0])
@@ -311,7 +311,7 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
     of_logarithm = [matcher.modality in parameters.logarithmic for matcher in compared.matchers]
     if np.nanmin(scores[:, :, of_logarithm], initial=0.0) < 0:
         raise BadInput(
-            f"logarithmic: {', '.join(parameters.logarithmic)} has scores below zero; leave it out"
+            f"logarithmic: {', '.join(parameters.logarithmic)} has negative scores; leave it out"
         )
     shifted = np.where(of_logarithm, scores, 0.0)
     return normalise(np.where(of_logarithm, np.log1p(shifted), scores), "z")
@@ -372,13 +372,13 @@ def _solve(fuse: Callable[..., Stream], given: Given[Any]) -> list[Ragged]:
 
 _fusing = partial(batch, find=_find, requirements=NEEDS)
 RULE = _fusing(
-    "normalise scores and combine them by a rule",
+    "scores normalized and combined by a rule",
     parameters=RuleParameters,
     variant="rule",
     solve=partial(_solve, _by_rule),
 )
 CLASSIFIER = _fusing(
-    "classify score vectors, cross-validated by user",
+    "classifier of score vectors, cross-validated by user",
     parameters=ClassifierParameters,
     variant="classifier",
     solve=partial(_solve, _by_classifier),

@@ -61,7 +61,7 @@ def _deviations(scores: Floats) -> Floats:
     if unusable.any():
         raise BadInput(
             f"topic {TOPIC}: the scores of matcher {np.argmax(unusable) + 1} of {len(unusable)} have a "
-            f"standard deviation of {deviations[unusable][0]:g}; leave the matcher out, or scale it"
+            f"standard deviation of {deviations[unusable][0]:g}; remove the matcher or rescale it"
         )
     return deviations
 

@@ -48,7 +48,7 @@ def thresholds(rates: Rates) -> tuple[float, float]:
     accept, reject = rates
     if not (accept > 0.0 and reject > 0.0 and accept + reject < 1.0):
         raise BadInput(
-            f"rates of error {accept:g} and {reject:g}: both must be above 0, and their sum below 1"
+            f"error rates {accept:g} and {reject:g}: both must be above 0, and their sum below 1"
         )
     return float(np.log(reject / (1.0 - accept))), float(np.log((1.0 - reject) / accept))
 

@@ -32,8 +32,8 @@ BINS = 60
 UPDATES = 50
 # Share of the genuine scores that are below the histogram's upper end.
 SHOWN_SHARE = 0.95
-# What is plotted of a probe's comparisons.
-OF_PROBE = "genuine and greatest impostor of each probe"
+# The scores of a probe's comparisons that are plotted.
+OF_PROBE = "genuine and greatest impostor score of each probe"
 
 
 class Fusion(NamedTuple):
@@ -103,7 +103,7 @@ def _draw_rates(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusio
         found = roc(fused.score, fused.genuine)
         curves[estimator] = np.stack([found.false_accept, 1.0 - found.genuine_accept], axis=1)
         strokes[estimator] = stroke_of(scene, estimator)
-    name = "ROC: genuine rejected (share) over impostors accepted (share)"
+    name = "ROC: false reject rate over false accept rate"
     return curve_view(canvas, entity_path("rates", case), CurvePanel(name, curves, strokes))
 
 
@@ -203,7 +203,7 @@ def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
         fused = Fused(score[known], probe[known], gallery[known], None, None, False)
         _draw_probes(canvas, plot, fused, stream.publish_time_ns[known])
         left_out = len(np.unique(probe[~known]))
-        without = f", without {left_out} that it could not enrol" if left_out else ""
+        without = f", failures to enrol left out: {left_out}" if left_out else ""
         extent = below_legend([fused.score[fused.genuine], fused.score[~fused.genuine]])
         title, note = f"{matchers[index].name}: score", f"{without}; {OF_PROBE}"
         views.append(plot_view(plot, title, "-", extent, note=note, legend=False, zoom_lock=False))

@@ -250,7 +250,8 @@ def _find(
         if anchor not in numbers:
             raise BadInput(
                 f"estimator {name}: anchor {anchor} is not one of the robots "
-                f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
+                f"{', '.join(map(str, numbers))}; list the robots that know the map with "
+                "--set anchors=[...]"
             )
 
     def stated(leaf: str, *names: str) -> Floats:
@@ -277,7 +278,7 @@ COOPERATIVE = recursive(
     "robots that share position estimates when they see each other: alone, naive, ci, joint",
     parameters=CooperativeParameters,
     find=_find,
-    requirements="/landmarks and, for two robots or more, .../odometry, .../range_bearing and .../prior",
+    requirements="/landmarks and, for two or more robots, .../odometry, .../range_bearing, .../prior",
     start=start,
     advance=advance,
     variant="mode",

@@ -272,7 +272,7 @@ def fuse_together(
 def rule_number(name: str) -> int:
     """Return the number of a rule of RULES; raise BadInput for an unknown name."""
     if name not in RULES:
-        raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
+        raise BadInput(f"no fusion rule '{name}'; choose one of {', '.join(RULES)}")
     return RULES.index(name)
 
 
@@ -323,27 +323,28 @@ def fuse(
     mean, covariance = np.asarray(means, float), np.asarray(covariances, float)
     if mean.ndim < 2 or covariance.shape != (*mean.shape, mean.shape[-1]) or mean.shape[-2] == 0:
         raise BadInput(
-            f"means {mean.shape} and covariances {covariance.shape}: (..., K, n) and (..., K, n, n) "
-            "of one estimate or more are needed"
+            f"means have shape {mean.shape} and covariances {covariance.shape}; give (..., K, n) and "
+            "(..., K, n, n) with at least one estimate"
         )
     known = np.zeros_like(covariance) if independents is None else np.asarray(independents, float)
     if known.shape != covariance.shape:
         raise BadInput(
-            f"independent parts {known.shape}, covariances {covariance.shape}; give one part for each "
-            "covariance"
+            f"independent parts have shape {known.shape} and covariances {covariance.shape}; give one "
+            "part for each covariance"
         )
     for part in (mean, covariance, known):
         if not np.isfinite(part).all():
-            raise BadInput("an estimate is not finite; leave it out")
+            raise BadInput("an estimate is not finite; remove it")
     if not np.allclose(covariance, np.swapaxes(covariance, -1, -2), rtol=1e-9, atol=0):
         raise BadInput("a covariance is not symmetric; give the full matrix")
     least = np.linalg.eigvalsh(covariance)[..., 0]
     if np.any(least <= 0):
         raise BadInput(
-            "a covariance is singular; a certain component cannot be fused by rules; give it a variance"
+            "a covariance is singular, but the rules need a positive variance of every component; give "
+            "each component a variance"
         )
     if np.any(np.linalg.eigvalsh(covariance - known)[..., 0] < -1e-9 * least):
-        raise BadInput("an independent part exceeds its covariance; give at most the covariance")
+        raise BadInput("an independent part exceeds its covariance; it can be at most the covariance")
     batch, (count, size) = mean.shape[:-2], mean.shape[-2:]
     runs = int(np.prod(batch))
     fused = Fusions(
@@ -363,11 +364,11 @@ def fuse(
     )
     if np.any(np.isinf(fused.gap)):
         raise BadInput(
-            "a covariance is singular to working precision; choose units in which its variances are "
-            "alike"
+            "a covariance is numerically singular; choose units in which its variances have similar "
+            "magnitudes"
         )
     if np.any(fused.gap > tolerance):
         raise BadInput(
-            f"the weights did not converge: the certificate is {fused.gap.max():.1e}, not {tolerance}"
+            f"the weights did not converge: the certificate is {fused.gap.max():.1e}, above {tolerance}"
         )
     return Fusions(*(part.reshape(batch + part.shape[1:]) for part in fused))

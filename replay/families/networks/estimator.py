@@ -89,7 +89,7 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
     name, liar = parameters.rule, parameters.liar
     if liar is not None and liar not in sensors:
         raise BadInput(
-            f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; name one of them"
+            f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; give one of these"
         )
     rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
     return NodeFusion(
@@ -191,14 +191,14 @@ def _schedule(
     for end in ("sender_id", "receiver_id"):
         if not np.isin(links[end], numbers).all():
             raise BadInput(
-                f"topic /links: {end} names a node that has no topic /nodeN/sensor; record the topic, "
-                "or leave out the link"
+                f"topic /links: {end} refers to a node without a topic /nodeN/sensor; record the topic, "
+                "or remove the link"
             )
         ends[end] = np.searchsorted(numbers, links[end])
     sent_ns, arrival_ns = links.stream.publish_time_ns, links["arrival_time_ns"]
     if np.any(arrival_ns < sent_ns):
         raise BadInput(
-            "topic /links: a message arrives before it was sent; correct the clocks of the link"
+            "topic /links: a message arrives before it was sent; synchronize the clocks of the link"
         )
     arrived = links["lost"] == 0
     if centralised or name == ALONE:
@@ -269,13 +269,13 @@ def _sensing(
             density[number] = float(topic.metadata["acceleration_density"])
         except (KeyError, ValueError):
             raise BadInput(
-                f"topic {topic.name}: the channel's metadata must name components of the state, sigmas "
+                f"topic {topic.name}: the channel's metadata must state components, sigmas "
                 "and acceleration_density"
             ) from None
         if part["value"].size != len(part) * len(seen):
             raise BadInput(
                 f"topic {topic.name}: its values do not have the {len(seen)} components that its "
-                "channel names; name as many as there are"
+                "channel states; state as many components as each value has"
             )
         value = np.full((len(part), len(components)), np.nan)
         value[:, seen] = part["value"].reshape(len(part), len(seen))
@@ -283,7 +283,7 @@ def _sensing(
         index.append(np.full(len(part), number))
     if not np.all(np.nan_to_num(variance, nan=1.0) > 0):
         raise BadInput(
-            "a sensor's sigma is not positive, which makes covariances singular; give one above zero"
+            "a sensor's sigma is not positive, which makes covariances singular; give a positive sigma"
         )
     return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
 
@@ -309,8 +309,8 @@ def state_of(prior: Topic) -> list[str]:
     components = [*positions, *(f"v{name.removesuffix('_m')}_mps" for name in positions)]
     if not positions or sorted(components) != sorted(stated):
         raise BadInput(
-            f"topic {prior.name}: its channel states {', '.join(stated) or 'no components'}; "
-            "positions such as x_m, and for each a velocity such as vx_mps, are needed"
+            f"topic {prior.name}: its channel states {', '.join(stated) or 'no components'}; expected "
+            "positions such as x_m, and for each a velocity such as vx_mps"
         )
     return components
 

@@ -115,7 +115,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
     return rrb.Spatial2DView(
         origin="/",
         contents=[f"{escaped(GRAPH)}/**"],
-        name="Network: links, messages that arrive and that are lost",
+        name="Network: links, arriving and lost messages",
         visual_bounds=rrb.VisualBounds2D(x_range=extent, y_range=extent),
     )
 

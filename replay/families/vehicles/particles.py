@@ -55,9 +55,9 @@ from fuselog.replay.families.vehicles.vehicles import (
 from fuselog.replay.inference.sampling.resampling import choose_systematically
 
 KINDS = {
-    "set": "states, weighted by the exact likelihood of the unordered pairs (x, y)",
-    "axes": "states, weighted by the exact likelihoods of unordered x and unordered y",
-    "associations": "associations, a Kalman filter each (Rao-Blackwellised)",
+    "set": "states weighted by the exact likelihood of unordered pairs (x, y)",
+    "axes": "states weighted by the exact likelihoods of unordered x and of unordered y",
+    "associations": "associations with a Kalman filter each (Rao-Blackwellized)",
 }
 LEAST_EFFECTIVE_SHARE = 0.5
 _choose = compiled(choose_systematically)
@@ -265,7 +265,7 @@ def _estimate(method: Method, cloud: Cloud, run: int) -> tuple[Floats, Floats]:
 
 
 VEHICLE_PARTICLES = recursive(
-    "particle filters of unordered fixes; the method follows the name, as in vehicle-particles:set-1000",
+    "particle filters for unordered fixes; the method follows the name: vehicle-particles:set-1000",
     parameters=ParticlesParameters,
     find=_find,
     requirements="/vehicleN/prior, /network and, with topology, /infrastructure",

@@ -134,7 +134,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
     fixes, sensor = split_method(parameters.method)
     if fixes not in FIXES:
         sensors = " or ".join(f"-{each}" for each in SENSOR if each)
-        known = f"{choices(fixes, FIXES)}, and {sensors} may follow"
+        known = f"{choices(fixes, FIXES)}, optionally followed by {sensors}"
         raise BadInput(f"estimator {name}: no method '{fixes}'; {known}")
     found = find_vehicles(name, topics, fixes, sensor)
     scan, sigma_m = parameters.registration_scan, parameters.sigma_fix_m
@@ -382,7 +382,7 @@ def outputs_of(
     yield failures_by_run(f"/estimates/{setup.name}", failures, runs)
     if setup.fixes == "known":
         at_run, at_frame, which = np.nonzero(frames.skipped)
-        mend = "its fixes lack a covariance; give --set sigma_fix_m=..."
+        mend = "its fixes have no covariance; give --set sigma_fix_m=..."
         stream = reason_stream(
             f"/estimates/{setup.name}/skipped",
             schemas.SKIPPED,
@@ -394,7 +394,7 @@ def outputs_of(
 
 
 VEHICLES = recursive(
-    "cooperative vehicles; the method follows the name, as in vehicles:hungarian-topology",
+    "cooperative vehicles; the method follows the name: vehicles:hungarian-topology",
     parameters=VehiclesParameters,
     find=_find,
     requirements="/vehicleN/prior and, by method, /vehicleN/fix, /network and /infrastructure",

@@ -111,11 +111,11 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     whole = plane_view(canvas, f"{ROOT}/map", [], paths, places, trail_s=run_s)
     sensor = plane_view(canvas, SENSOR, [], [], raw.places if len(raw.places) else places)
     close = plane_view(canvas, CLOSE, [], [], cells)
-    sensor.name = "Raw detections, sensor's frame"
-    close.name = f"Close-up about the true places, {CELL_M:g} m each"
+    sensor.name = "Raw detections in the sensor's frame"
+    close.name = f"Close-up about the true positions, {CELL_M:g} m each"
     has_links = bool(len(_links(scene)[0]))
     if has_links:
-        close.name += "; white lines: predicted place to associated fix"
+        close.name += "; white lines: prediction to associated fix"
     board: Board = rrb.Vertical(
         rrb.Tabs(
             whole,
@@ -398,7 +398,7 @@ def _draw_errors(
             colour = scene.colour(found.estimator)
             curve, style = (colour, found.time_ns), line(scene.width(found.estimator))
             draw_curve(canvas, "plots/gospa", found.estimator, *curve, found.gospa, style)
-    labelled = plot_view("plots/error", "Error of all vehicles together", "m", (0.0, 4.0))
+    labelled = plot_view("plots/error", "Joint error of all vehicles", "m", (0.0, 4.0))
     unlabelled = plot_view("plots/gospa", f"GOSPA, cutoff {CUTOFF_M:g} m", "m", (0.0, 4.0))
     return [unlabelled, labelled] if tracks else [unlabelled]
 

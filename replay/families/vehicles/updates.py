@@ -42,20 +42,20 @@ from fuselog.replay.families.vehicles.vehicles import (
 )
 
 FIXES = {
-    "known": "every vehicle's fixes are known to be its own",
-    "hungarian": "unordered fixes, the most probable map",
+    "known": "fixes with known vehicles",
+    "hungarian": "unordered fixes, most probable map",
     "set": "unordered fixes, exact collapse over all maps",
-    "axes": "unordered x and unordered y, exact collapse of each: what separate sums of powers tell",
-    "powers": "sums of powers of x and of y, linearised",
-    "unscented-powers": "the same, sampled",
-    "products": "sums of products of x and of y, linearised",
-    "complex": "sums of powers of x + iy, linearised",
+    "axes": "unordered x and unordered y, exact collapse of each: what separate sums of powers contain",
+    "powers": "sums of powers of x and of y, linearized",
+    "unscented-powers": "sums of powers of x and of y, sampled",
+    "products": "sums of products of x and of y, linearized",
+    "complex": "sums of powers of x + iy, linearized",
 }
 SENSOR = {
     "": "not used",
     "topology": "the sum of squared distances between all detections",
-    "registration": "detections from a pose that is another one in every scan",
-    "static": "detections from a pose that stays",
+    "registration": "detections from a pose that differs in every scan",
+    "static": "detections from a constant pose",
 }
 
 

@@ -284,7 +284,7 @@ def test_a_network_has_messages_on_their_way_and_the_errors_of_its_nodes(tmp_pat
     made = [estimate(name, node, truth) for name in ESTIMATORS for node in ("node1", "node3")]
     run = drawn(tmp_path, source, made)
     wanted: dict[str, Wanted] = {}
-    titles: Titles = {("Network: links, messages that arrive and that are lost", "map/graph")}
+    titles: Titles = {("Network: links, arriving and lost messages", "map/graph")}
     for node in ("node1", "node3"):
         plots, own = run.quality(node)
         wanted |= plots
@@ -343,13 +343,13 @@ def test_vehicles_are_on_the_map_close_up_and_in_the_sensors_frame(tmp_path: Pat
         each["covariance"][2] *= 1e3
     run = drawn(tmp_path, source, [*made, innovations])
     wanted: dict[str, Wanted] = {}
-    close_up = "Close-up about the true places, 8 m each; white lines: predicted place to associated fix"
+    close_up = "Close-up about the true positions, 8 m each; white lines: prediction to associated fix"
     titles: Titles = {
         ("Map", "map/map"),
-        ("Raw detections, sensor's frame", "map/sensor"),
+        ("Raw detections in the sensor's frame", "map/sensor"),
         (close_up, "map/close"),
         ("OpenStreetMap", "geodetic"),
-        ("Error of all vehicles together (m)", "plots/error"),
+        ("Joint error of all vehicles (m)", "plots/error"),
         ("GOSPA, cutoff 10 m (m)", "plots/gospa"),
         ("Events", "events"),
     }

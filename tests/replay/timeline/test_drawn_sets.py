@@ -88,7 +88,7 @@ def test_scores_are_those_of_each_probe_and_wrong_decisions_are_counted(tmp_path
             "fusion/finger/one/distribution",
         ),
         ("Wrong decisions so far (%)", "errors/finger"),
-        ("ROC: genuine rejected (share) over impostors accepted (share)", "rates/finger"),
+        ("ROC: false reject rate over false accept rate", "rates/finger"),
         (f"left: score (-); {OF_PROBE}", "matchers/finger/left"),
         (f"right: score (-); {OF_PROBE}", "matchers/finger/right"),
     }
@@ -118,7 +118,7 @@ def test_a_failure_to_enrol_is_no_score(tmp_path: Path) -> None:
     drawn_scores = np.ravel(run.picture.moving["/matchers/finger/left/genuine"]["Scalars:scalars"])
     assert drawn_scores == pytest.approx(np.diag(given[:, :, 0])[[0, 2, 3]])
     names = {view.name for view in run.picture.views}
-    assert f"left: score (-), without 1 that it could not enrol; {OF_PROBE}" in names
+    assert f"left: score (-), failures to enrol left out: 1; {OF_PROBE}" in names
     assert f"right: score (-); {OF_PROBE}" in names
 
 

@@ -21,7 +21,7 @@ RATES = Rates(0.01, 0.05)
 def test_thresholds_are_walds():
     assert thresholds(Rates(0.01, 0.05)) == pytest.approx((np.log(0.05 / 0.99), np.log(95.0)))
     assert wald_bounds(Rates(0.01, 0.05)) == pytest.approx((0.01 / 0.95, 0.05 / 0.99))
-    with pytest.raises(BadInput, match=r"rates of error 0 and 0\.1: both must be above 0"):
+    with pytest.raises(BadInput, match=r"error rates 0 and 0\.1: both must be above 0"):
         thresholds(Rates(0.0, 0.1))
     with pytest.raises(BadInput, match="their sum below 1"):
         thresholds(Rates(0.5, 0.5))

@@ -236,7 +236,7 @@ def test_registration_finds_pose_and_order() -> None:
     assert not register(square, square, 0.5).is_clear.any()
     assert not register(places, seen + rng.normal(scale=20.0, size=seen.shape), 0.5).is_clear.any()
     assert not register(places[:, :1], seen[:, :1], 0.5).is_clear.any()
-    with pytest.raises(BadInput, match="9 vehicles; give 8 at most"):
+    with pytest.raises(BadInput, match="permutations of 9 vehicles; give at most 8"):
         register(np.zeros((1, 9, 2)), np.zeros((1, 9, 2)), 0.5)
 
 
