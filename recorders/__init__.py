@@ -1,4 +1,4 @@
-"""Holds the log, sensor and motion models, the simulators and the importers of real data.
+"""The log, sensor and motion models, the simulators and the importers of real data.
 
-Begin with `recording`, which says what a recorder is, and `log`.
+Begin with `recording`, which defines what a recorder is, and `log`.
 """

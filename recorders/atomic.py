@@ -1,14 +1,14 @@
-"""Writes files and folders that appear whole or not at all.
+"""Files and folders that are written completely or not at all.
 
-What is being written lies in a working folder of its own, beside its place:
+While something is being written, it is in a working folder next to its destination:
 
-    .NAME.RANDOM.part/     made exclusively, for this user alone
-        fuselog.lock       locked by the writer; the lock goes when the writer does, however that ends
-        new.SUFFIX         the file or folder that is written, renamed to NAME when it is whole
-        old                the folder that was in the place, for the moment between two renames
+    .NAME.RANDOM.part/     created exclusively, accessible only to this user
+        fuselog.lock       locked by the writer; the system releases the lock if the writer is killed
+        new.SUFFIX         the file or folder being written, renamed to NAME when it is complete
+        old                the folder that NAME replaces, between the two renames
 
-Two writers of one place never touch each other's working folder. What a killed writer left is removed by
-the next one, and only where nobody holds its lock and nothing else is in it.
+Two writers of one destination never touch each other's working folder. The next writer removes what a
+killed writer left, but only if nobody holds the lock and the folder contains nothing else.
 """
 
 import logging
@@ -30,25 +30,25 @@ _LOG = logging.getLogger(__name__)
 
 
 def settled(place: Path) -> Path:
-    """Return the place that is written where a name leads to, once missing folders are made.
+    """Resolve `..` in a path as if its missing folders already existed.
 
-    `MISSING/../FILE` is no other file than FILE, though no system finds it before MISSING is there. What
-    is in the place may be a link, and is not followed.
+    `MISSING/../FILE` is the same file as FILE, although no system finds it before MISSING exists. If the
+    path itself is a link, the link is not followed.
     """
-    if place.name in ("", ".."):  # as `.` is
+    if place.name in ("", ".."):  # `.` has an empty name
         return Path(os.path.realpath(place))
     return Path(os.path.realpath(place.parent), place.name) if ".." in place.parts else place
 
 
 @contextmanager
 def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
-    """Yield a path to write; what is there when all went well replaces `place`, in one step.
+    """Yield a path to write; if no exception occurs, the file there replaces `place` in one step.
 
     Args:
-        place: where the file is to be.
-        parents: whether folders that are missing are made.
+        place: destination of the file.
+        parents: whether missing folders are created.
 
-    Raises BadInput where it cannot be written.
+    Raises BadInput if the file cannot be written.
     """
     named, place = place, settled(place) if parents else place
     _clear_leftovers(place)
@@ -62,12 +62,12 @@ def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a folder to fill; when all went well it replaces `place`.
+    """Yield a folder to fill; if no exception occurs, it replaces `place`.
 
-    `check` is given the folder that is to be replaced, before anything is written and again when it has
-    been moved aside; it raises where that folder must stay, and then it does.
+    `check` gets the folder that would be replaced, before anything is written and again after it has
+    been moved aside. If `check` raises an exception, the folder stays.
 
-    Raises BadInput where the folder cannot be written, or another process is writing it.
+    Raises BadInput if the folder cannot be written, or another process is writing it.
     """
     named, place = place, settled(place)
     if _clear_leftovers(place):
@@ -88,9 +88,9 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
 
 @contextmanager
 def scratch_folder(name: str) -> Iterator[Path]:
-    """Yield a private folder among the system's temporary ones, which is removed at the end.
+    """Yield a private temporary folder that is removed at the end.
 
-    Raises BadInput where it cannot be made.
+    Raises BadInput if the folder cannot be created.
     """
     place = Path(tempfile.gettempdir()) / name
     _clear_leftovers(place)
@@ -111,7 +111,7 @@ def _working_folder(place: Path) -> Iterator[Path]:
 
 
 def is_being_written(file: Path) -> bool:
-    """Tell whether a file is in a working folder: half an output, or its lock."""
+    """Test whether a file is in a working folder: a partial output, or the lock."""
     return any(
         each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
         for each in file.parents
@@ -119,29 +119,29 @@ def is_being_written(file: Path) -> bool:
 
 
 def _make(place: Path) -> tuple[Path, FileLock]:
-    """Make a new working folder and its lock, held."""
+    """Create a working folder and lock it."""
     while True:
         work = Path(tempfile.mkdtemp(".part", f".{place.name}.", place.parent))
         lock = FileLock(work / _LOCK, timeout=0)
         try:
             lock.acquire()
         except (Timeout, FileNotFoundError, FileExistsError):
-            continue  # taken for a leftover before it was locked; filelock may make the folder again
+            continue  # removed as a leftover before it was locked; filelock may recreate the folder
         return work, lock
 
 
 def _clear_leftovers(place: Path) -> bool:
-    """Remove what killed writers of a place left; whether one is at work."""
+    """Remove what killed writers of a destination left; return whether a writer is active."""
     at_work = False
     for work in place.parent.glob(f".{escape(place.name)}.*.part"):
         if "." in work.name.removeprefix(f".{place.name}.").removesuffix(".part"):
-            continue  # of another place, whose name goes on
+            continue  # belongs to a destination with a longer name
         if not _is_ours(work):
-            if os.path.lexists(work):  # or else its maker has removed it since
+            if os.path.lexists(work):  # otherwise its creator has removed it meanwhile
                 _LOG.warning("%s: was not written by this user's fuselog; it is left as it is", work)
             continue
         with suppress(OSError):
-            work.rmdir()  # its maker was killed before anything was in it
+            work.rmdir()  # its creator was killed before it wrote anything
             continue
         lock = FileLock(work / _LOCK, timeout=0)
         try:
@@ -149,13 +149,13 @@ def _clear_leftovers(place: Path) -> bool:
         except (Timeout, OSError):
             at_work = True
             continue
-        with suppress(FileNotFoundError):  # its maker, who has just released the lock, was faster
+        with suppress(FileNotFoundError):  # its creator, which has just released the lock, was faster
             _remove(work, place, lock)
     return at_work
 
 
 def _is_ours(work: Path) -> bool:
-    """Tell whether a folder holds what working folders hold and nothing else, and is this user's."""
+    """Test whether a folder belongs to this user and contains only what working folders contain."""
     try:
         state = work.lstat()
         if not stat.S_ISDIR(state.st_mode) or (hasattr(os, "geteuid") and state.st_uid != os.geteuid()):
@@ -170,12 +170,12 @@ def _is_ours(work: Path) -> bool:
 
 
 def _remove(work: Path, place: Path, lock: FileLock) -> None:
-    """Remove a working folder whose lock is held; what was moved out of the place goes back there.
+    """Remove a working folder whose lock is held; move a replaced folder back to its place.
 
-    The lock file goes last, so that what remains where this is stopped is known as a leftover.
+    The lock file is removed last, so that after an interruption the rest is recognised as a leftover.
     """
     old, new = work / _OLD, work / _NEW
-    if old.exists() and new.exists():  # stopped between the two renames
+    if old.exists() and new.exists():  # interrupted between the two renames
         try:
             old.rename(place)
         except OSError:
@@ -195,9 +195,9 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
 
 @contextmanager
 def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
-    """Make the folders that a place is in; those that are made and of which nothing comes go again.
+    """Create the parent folders of a path; after an exception, remove those that are still empty.
 
-    Raises BadInput where they cannot be made.
+    Raises BadInput if they cannot be created.
     """
     missing = [folder for folder in place.parents if not folder.exists()] if make else []
     with _telling(place):
@@ -214,9 +214,9 @@ def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _telling(place: Path, work: Path | None = None) -> Iterator[None]:
-    """Tell errors of the system as BadInput, where a folder is given only those of what is in it.
+    """Convert the system's errors to BadInput; with a working folder, only errors on its contents.
 
-    Errors that code raises of its own have no number; they go through, as do those of other files.
+    Errors without a number, which Python code raised, and errors on other files are passed on.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Makes the streams that recorders have in common: truths, priors, fixes and outages.
+"""Streams that recorders have in common: truth, priors, position fixes and outages.
 
 Begin with `truth_stream`.
 """
@@ -17,10 +17,10 @@ def truth_stream(topic: str, time_ns: ArrayLike, components: Sequence[str], stat
     """Make the stream of true states.
 
     Args:
-        topic: its name.
-        time_ns: (n,) stamps.
-        components: of the state, m names.
-        state: (n, m), in the components' units.
+        topic: name of the topic.
+        time_ns: (n,) stamps, in ns.
+        components: names of the m components of the state.
+        state: (n, m), in the units of the components.
     """
     return make_stream(
         topic, schemas.TRUTH_STATE, time_ns, metadata=state_metadata(components), state=state
@@ -35,15 +35,16 @@ def prior_stream(
     covariance: ArrayLike,
     stated: Mapping[str, str] | None = None,
 ) -> Stream:
-    """Make the stream with the one message that filters start from.
+    """Make the stream with the one message from which filters start.
 
     Args:
-        topic: its name.
-        time_ns: one stamp.
-        components: of the state, n names.
-        mean: (n,) of the state.
-        covariance: (m, m) of the error, with one dimension less for each rotation in the state.
-        stated: further metadata of the channel, such as numbers of the motion.
+        topic: name of the topic.
+        time_ns: the stamp, in ns.
+        components: names of the n components of the state.
+        mean: (n,) mean of the state.
+        covariance: (m, m) covariance of the error, with one dimension less for each rotation in the
+            state.
+        stated: further metadata of the channel, such as parameters of the motion.
     """
     return make_stream(
         topic,
@@ -56,13 +57,13 @@ def prior_stream(
 
 
 def fix_stream(topic: str, time_ns: ArrayLike, position_m: ArrayLike, variance_m2: float) -> Stream:
-    """Make the stream of measured positions whose axes have errors of one variance.
+    """Make the stream of measured positions with the same, independent error along each axis.
 
     Args:
-        topic: its name.
-        time_ns: (n,) stamps.
-        position_m: (n, 2) in the plane, or (n, 3).
-        variance_m2: of the error along each axis.
+        topic: name of the topic.
+        time_ns: (n,) stamps, in ns.
+        position_m: (n, 2) in the local tangent plane, or (n, 3), in m.
+        variance_m2: variance of the error along each axis.
     """
     count, axes = np.shape(position_m)
     return make_stream(
@@ -75,15 +76,15 @@ def fix_stream(topic: str, time_ns: ArrayLike, position_m: ArrayLike, variance_m
 
 
 def outage_stream(topic: str, spans_ns: NDArray[np.int64]) -> Stream:
-    """Make the stream of spans over which a sensor is silent.
+    """Make the stream of outages, in which a sensor sends nothing.
 
     Args:
-        topic: its name.
-        spans_ns: (n, 2) begins and ends.
+        topic: name of the topic.
+        spans_ns: (n, 2) begins and ends, in ns.
     """
     return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
 
 
 def stated_numbers(parameters: Parameters, *names: str) -> dict[str, str]:
-    """Return these parameters as a channel states them, as text that gives the same numbers again."""
+    """Format parameters as a channel states them: text that gives the same numbers when read back."""
     return {name: repr(getattr(parameters, name)) for name in names}

@@ -1,4 +1,4 @@
-"""Reads the environment variables that fuselog heeds, and refuses what they cannot be."""
+"""The environment variables that fuselog reads, and their validation."""
 
 import os
 import re
@@ -12,31 +12,31 @@ CORES = "NUMBA_NUM_THREADS"
 
 
 def is_on(name: str) -> bool:
-    """Tell whether a switch is 1."""
+    """Test whether a switch is 1."""
     return os.environ.get(name) == "1"
 
 
 def is_set(name: str) -> bool:
-    """Tell whether a variable is stated and not empty."""
+    """Test whether a variable is set and not empty."""
     return bool(os.environ.get(name))
 
 
 def core_count() -> int | None:
-    """Return how many cores kernels may use, if that is stated."""
+    """Return the number of cores that kernels may use, or None if the variable does not state it."""
     stated = os.environ.get(CORES, "")
     return int(stated) if _is_count(stated) and int(stated) > 0 else None
 
 
 def processor() -> tuple[str | None, str | None]:
-    """Return the processor and its features that code is compiled for, as numba reads them."""
+    """Return the processor and the features that code is compiled for, from numba's variables."""
     return os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
 
 
 def cache_folder() -> Path:
-    """Find where this user's computed results are kept.
+    """Find the folder for this user's cached results.
 
-    FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. By XDG's specification a relative
-    path there does not count.
+    The folder is FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. As in the XDG
+    specification, a relative XDG_CACHE_HOME is ignored.
     """
     stated = os.environ.get("FUSELOG_CACHE")
     if stated:
@@ -46,10 +46,10 @@ def cache_folder() -> Path:
 
 
 def check() -> None:
-    """Raise BadInput if a variable is set to what it cannot be.
+    """Raise BadInput if a variable has an invalid value.
 
-    What libraries heed and no command needs is dropped: MPLBACKEND names a window system, RERUN switches
-    off what a command was asked to draw, and RERUN_FLUSH_... say how its rows are packed.
+    Variables that would disturb commands are removed: MPLBACKEND selects a window system, RERUN disables
+    drawings that a command was asked for, and RERUN_FLUSH_... controls how rows are batched.
     """
     for name, (is_valid, expected) in _EXPECTED.items():
         stated = os.environ.get(name)
@@ -67,7 +67,7 @@ def _is_switch(text: str) -> bool:
     return text in ("", "0", "1")
 
 
-# What is valid of each variable, and what a sentence says of it.
+# For each variable, a test of its value, and the expected values in words.
 _EXPECTED: dict[str, tuple[Callable[[str], bool], str]] = {
     UNCOMPILED: (_is_switch, "1"),
     BOUNDSCHECK: (_is_switch, "1"),

@@ -1,30 +1,30 @@
-"""Defines the one exception for what a user can mend, and what reaches standard error."""
+"""The exception for errors that a user can correct, and helpers for messages on standard error."""
 
 import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from itertools import islice
 
-# So many names stand in a sentence; among so many, none of them longer, one nearly the same is sought.
+# How many names a message lists; how many names, and how long ones, are searched for a similar name.
 _NAMED, _COMPARED = 50, 2000
 
 
 class BadInput(Exception):
-    """States why input cannot be used: one sentence with the file, topic, field or option, and the mend.
+    """An error in the input: the message names the file, topic, field or option, and how to correct it.
 
-    The command line prints the sentence and exits with 2; it never shows a traceback for it.
+    The command line prints the message and exits with code 2, without a traceback.
     """
 
 
 class UnknownName(BadInput, KeyError):
-    """Says that a name is not in a mapping; `in` and `get` take it as any KeyError."""
+    """A name that is not in a mapping; also a KeyError, so that `in` and `get` work as usual."""
 
-    __str__ = Exception.__str__  # the sentence, which KeyError would put in quotes
+    __str__ = Exception.__str__  # KeyError would quote the message
 
 
 def choices(name: str, known: Collection[str]) -> str:
-    """End a sentence on an unknown name: by the one that was probably meant, else all there are."""
-    from difflib import get_close_matches  # for a mistake alone, not for every start
+    """Write the end of a message on an unknown name: the most similar name, or the available ones."""
+    from difflib import get_close_matches  # imported only after a mistake, not at every start
 
     few = len(known) <= _COMPARED and all(len(each) <= _COMPARED for each in (name, *known))
     near = [each for each in known if each.lower() == name.lower()]
@@ -34,13 +34,13 @@ def choices(name: str, known: Collection[str]) -> str:
 
 
 def some_of(names: Collection[object]) -> str:
-    """Write names in a sentence: the first ones, and how many more there are."""
+    """Join names for a message: the first ones, and how many more there are."""
     more = len(names) - _NAMED
     return ", ".join(map(str, islice(names, _NAMED))) + (f" and {more} more" if more > 0 else "")
 
 
 def check_format(path: object, stated: object, read: int) -> None:
-    """Raise BadInput where a file states another format than the one that this fuselog reads."""
+    """Raise BadInput if a file states a format other than the one that this version of fuselog reads."""
     if type(stated) is not int:
         raise BadInput(f"{path}: its format {stated!r} is none of fuselog's; write it again")
     if stated != read:
@@ -52,23 +52,23 @@ def check_format(path: object, stated: object, read: int) -> None:
 
 
 def ignore_warnings_of_numbers() -> None:
-    """Keep NumPy's warnings of single operations off standard error, unless warnings are asked for.
+    """Suppress NumPy's warnings on single operations, unless the user enables warnings.
 
-    What overflows, or is not a number, is a finding, a doubt or an empty cell, each in its own words.
+    Overflows and NaN are reported where they matter: as findings, warnings or empty cells.
     """
     warnings.simplefilter("ignore", RuntimeWarning, append=True)
 
 
 @contextmanager
 def without_warnings_of_numbers() -> Iterator[None]:
-    """Ignore them for a while: for a command, or, as a decorator, for a call from Python."""
+    """Ignore NumPy's warnings in a `with` block, or in the function that this decorates."""
     with warnings.catch_warnings():
         ignore_warnings_of_numbers()
         yield
 
 
 def printable(text: str) -> str:
-    """Write a text for a line of a terminal: control characters are shown by their numbers."""
+    """Escape control characters, so that a text fits on a line of a terminal."""
     return "".join(
         each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
     )

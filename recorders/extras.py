@@ -1,4 +1,4 @@
-"""Imports packages of an extra when they are first used, or says in one sentence how to install them."""
+"""Imports of optional dependencies at first use; if a package is missing, the error names its extra."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,11 +11,11 @@ from fuselog.recorders.errors import BadInput
 
 @contextmanager
 def extra(name: str, what: str) -> Iterator[None]:
-    """Guard imports of an extra's packages; raises BadInput where one of them is not installed.
+    """Guard imports of an extra's packages; raise BadInput if one of them is not installed.
 
     Args:
-        name: of the extra in pyproject.toml, such as "papers".
-        what: the user asked for, as the sentence names it: "the BROAD benchmark".
+        name: the extra in pyproject.toml, such as "papers".
+        what: the feature that needs the package, as the message names it, such as "the BROAD benchmark".
     """
     try:
         yield
@@ -27,7 +27,7 @@ def extra(name: str, what: str) -> Iterator[None]:
 
 
 class AtFirstUse(ModuleType):
-    """Represents a module of an extra, imported when its first attribute is asked for."""
+    """A module of an extra that is imported when one of its attributes is first accessed."""
 
     def __init__(self, module: str, name: str, what: str) -> None:
         super().__init__(module)

@@ -1,4 +1,4 @@
-"""Reads parameters of scenarios, estimators, experiments: typed, bounded, refused with a sentence."""
+"""Typed and bounded parameters of scenarios, estimators and experiments, with clear error messages."""
 
 import math
 import re
@@ -24,16 +24,16 @@ from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.parsing import DEEPEST, parse_toml
 from fuselog.recorders.units import unit_of
 
-_POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML does not take
+_POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML rejects
 
 
 class Parameters(BaseModel):
-    """Is the base of all parameter types: immutable, no unknown names, no NaN and no infinity.
+    """The base class of all parameter types: immutable, without unknown names, NaN or infinity.
 
-    A default is of the declared type as what is given is: `sigma_m: float = 1` is 1.0.
+    Defaults are converted to the declared type, as given values are: `sigma_m: float = 1` is 1.0.
 
-    What a parameter means stands in one place, under `Attributes:` in the docstring of its type; its
-    unit is the end of its name, or stands there too. `describe` has both.
+    The meaning of a parameter is in one place: under `Attributes:` in the docstring of its type. Its
+    unit is the ending of its name, or is written there too. `describe` returns both.
     """
 
     model_config = ConfigDict(
@@ -44,7 +44,7 @@ class Parameters(BaseModel):
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        """Return the JSON schema, with what every parameter means and its unit."""
+        """Build the JSON schema, with the meaning and unit of every parameter."""
         schema = handler(core_schema)
         table = handler.resolve_ref_schema(schema)
         table["description"] = _prose(cls)
@@ -56,13 +56,13 @@ class Parameters(BaseModel):
         return schema
 
 
-# What a number is to its estimator: a standard deviation or density of noise, another number whose value
-# may be wrong, or how the estimator is run, which no log can tell.
+# The role of a number in its estimator: a standard deviation or density of noise, another number whose
+# value may be wrong, or a setting of the algorithm, which no log can determine.
 Role = Literal["process noise", "measurement noise", "parameter", "setting"]
 
 
 def has_role(role: Role) -> Any:
-    """Return the annotation of a number that has this role, see `Parameter`."""
+    """Return the annotation that gives a number this role, see `Parameter`."""
     return Field(json_schema_extra={"role": role})
 
 
@@ -74,9 +74,9 @@ ParametersType = TypeVar("ParametersType", bound=Parameters)
 def build(
     kind: type[ParametersType], values: Mapping[str, Any], where: str, what: str = "parameter"
 ) -> ParametersType:
-    """Check `values` against a parameter type; raises BadInput that names `where` and the parameter.
+    """Validate `values` against a parameter type; raise BadInput that names `where` and the parameter.
 
-    `what` is what messages call a parameter.
+    `what` is the word for a parameter in messages.
     """
     try:
         return kind.model_validate(merge(_nested_defaults(kind), values))
@@ -95,14 +95,14 @@ def build(
             raise BadInput(f"{where}: {message}") from None
         given = shorten(repr(first["input"]), 60)
         raise BadInput(f"{where}: {what} '{name}' is {given}; {message}") from None
-    except PydanticUserError as error:  # a type is completed when it is first used, which starts sooner
+    except PydanticUserError as error:  # types are completed at first use, for a faster start
         why = str(error.message).partition(". ")[0]
         raise BadInput(f"{where}: its parameters, {kind.__name__}, cannot be checked: {why}") from error
 
 
 @cache
 def _nested_defaults(kind: type[Parameters]) -> Mapping[str, Any]:
-    """Return defaults that are tables of their own, so that a setting of one entry keeps the others."""
+    """Return the defaults that are tables, so that setting one entry keeps the others."""
     defaults = {name: entry.default for name, entry in kind.model_fields.items()}
     return {
         name: value.model_dump() for name, value in defaults.items() if isinstance(value, Parameters)
@@ -110,7 +110,7 @@ def _nested_defaults(kind: type[Parameters]) -> Mapping[str, Any]:
 
 
 def _names_at(kind: type[BaseModel], path: Sequence[str]) -> list[str]:
-    """Return the parameters' names in the table at `path`, which may lead through lists and by keys."""
+    """List the parameters in the table at `path`, which may lead through lists and tables by name."""
     names = _annotations(kind)
     for part in path:
         table = _table_in(names.get(part))
@@ -123,7 +123,7 @@ def _annotations(kind: type[BaseModel]) -> dict[str, Any]:
 
 
 def _table_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the type of the tables that an annotation such as list[Matcher] speaks of."""
+    """Return the type of the tables in an annotation such as list[Matcher], or None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next(filter(None, map(_table_in, get_args(annotation))), None)
@@ -133,15 +133,15 @@ _ATTRIBUTES = re.compile(r"^Attributes:\n(?P<entries>(?: .*(?:\n|$)|\n)*)", re.M
 _ENTRY = re.compile(r"^    (?P<names>\w+(?:, \w+)*): (?P<meaning>\S.*(?:\n {5,}\S.*)*)", re.MULTILINE)
 
 
-MOST_WORDS = 8  # of a name
+MOST_WORDS = 8  # in a name
 
 
 @cache
 def meanings(kind: type[BaseModel]) -> dict[str, str]:
-    """Return what the parameters of a type mean, by name: its `Attributes:`, over those of its bases.
+    """Return the meanings of a type's parameters by name: its `Attributes:` and those of its bases.
 
-    An entry is `name: meaning`, or `name, name: meaning` where several mean alike. Raises BadInput where
-    one names no parameter.
+    An entry is `name: meaning`, or `name, name: meaning` if several share a meaning. Raises BadInput if
+    an entry names no parameter.
     """
     meaning_of: dict[str, str] = {}
     for base in reversed(kind.__mro__):
@@ -159,7 +159,7 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
 
 
 def in_few_words(meaning: str) -> str:
-    """Return the first words of what a parameter means, where they name it; empty where they tell of it.
+    """Return the first words of a parameter's meaning if they can serve as its name, else nothing.
 
     >>> in_few_words("standard deviation of a range, as the sensor states it.")
     'standard deviation of a range'
@@ -172,7 +172,7 @@ def in_few_words(meaning: str) -> str:
 
 
 def _prose(kind: type[BaseModel]) -> str:
-    """Return what a type and its bases say of their parameters as a whole."""
+    """Join what the docstrings of a type and its bases say apart from `Attributes:`."""
     texts = [
         _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
         for each in reversed(kind.__mro__)
@@ -182,19 +182,19 @@ def _prose(kind: type[BaseModel]) -> str:
 
 
 class Parameter(NamedTuple):
-    """Describes one parameter, to a person and to whatever varies it.
+    """A description of one parameter, for people and for code that varies it.
 
     Attributes:
-        name: in full.
-        default: its default; where it is varied, its value there.
-        unit, meaning: empty where the type does not say them.
-        accepts: in words.
-        role: what a number is to its estimator; empty for anything else.
-        low, high: between what bounds a number lies, or is varied.
-        is_log: whether its logarithm is varied.
-        is_assumed: whether neither a setting nor the log states the value.
-        useful: the standard error that a calibration wants; zero of what is none.
-        group: what it is shown with, such as a topic.
+        name: full name.
+        default: default value; the current value while the parameter is varied.
+        unit, meaning: empty if the type does not state them.
+        accepts: the accepted values, in words.
+        role: role of a number in its estimator; empty for anything else.
+        low, high: bounds of a number, or of the range in which it is varied.
+        is_log: whether the logarithm is varied.
+        is_assumed: whether the value comes neither from a setting nor from the log.
+        useful: standard error that a calibration aims at; zero if there is none.
+        group: heading under which it is shown, such as a topic.
     """
 
     name: str
@@ -212,29 +212,29 @@ class Parameter(NamedTuple):
 
     @property
     def fixed(self) -> "Parameter":
-        """Return the same, fixed at its value."""
+        """Return a copy that is fixed at its value."""
         return self._replace(low=self.default, high=self.default)
 
     @property
     def is_fixed(self) -> bool:
-        """Tell whether it stays at its value."""
+        """Test whether the parameter is fixed at its value."""
         return self.low == self.high
 
 
 def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Parameter]:
-    """List all parameters of a type, nested ones by full names; `values` stand for defaults.
+    """List all parameters of a type, nested ones by full names; `values` replace defaults.
 
-    In a list of tables names are such as `nodes[].sigma_m`, in tables by name `cases.NAME.sigma_m`.
+    In a list of tables, names look like `nodes[].sigma_m`; in tables by name, like `cases.NAME.sigma_m`.
     """
     schema = kind.model_json_schema()
     return list(_described(schema, schema.get("$defs", {}), "", values or {}))
 
 
 def explain(kind: type[BaseModel]) -> dict[str, str]:
-    """Return what a type and those of its nested tables say as a whole, by where these are.
+    """Collect the general descriptions of a type and its nested tables, by location.
 
-    A place is how the names in a table begin, such as `range_bearing.`, empty for the type itself;
-    several tables that say the same stand together. What a type inherits comes first.
+    A location is the prefix of the names in a table, such as `range_bearing.`; it is empty for the type
+    itself. Tables with the same description share an entry. Inherited text comes first.
     """
     schema = kind.model_json_schema()
     places: dict[str, list[str]] = {}
@@ -256,7 +256,7 @@ def _tables(
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
 ) -> Iterator[Parameter]:
-    """Walk a JSON schema; `given` are defaults that the table above states for this one."""
+    """Walk a JSON schema; `given` holds defaults that the enclosing table states for this one."""
     for name, entry in table["properties"].items():
         value = given.get(name, entry.get("default"))
         below = next(_below(entry, definitions, f"{prefix}{name}"), None)
@@ -287,7 +287,7 @@ def _parameter(
 def _below(
     schema: Mapping[str, Any], definitions: Mapping[str, Any], name: str
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the schemas of the tables in a value, with how the names in them begin."""
+    """Yield the prefix of names and the schema of each table in a value."""
     schema = _resolved(schema, definitions)
     if "properties" in schema:
         yield f"{name}.", schema
@@ -303,7 +303,7 @@ def _resolved(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapp
 
 
 def _accepts(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
-    """Say what a schema of one value accepts: its type and bounds, or its choices."""
+    """Describe the values that a schema accepts: type and bounds, or choices."""
     schema = _resolved(schema, definitions)
     if "anyOf" in schema:
         return " or ".join(_accepts(each, definitions) for each in schema["anyOf"])
@@ -329,7 +329,7 @@ _SIGNS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "ma
 
 
 def field_of(key: str) -> str:
-    """Return the name under which parameters hold a number; a topic's own is set as TOPIC.NAME.
+    """Return the field that holds a number; numbers of a topic are set as TOPIC.NAME.
 
     >>> field_of("/gps2/fix.lever_x_m"), field_of("lever_x_m")
     ('gps2_fix_lever_x_m', 'lever_x_m')
@@ -341,7 +341,7 @@ def field_of(key: str) -> str:
 
 
 def numbers_of(kind: type[Parameters]) -> dict[str, Parameter]:
-    """Describe the numbers of a type by name, without those of its tables.
+    """Describe the numbers of a type by name, without those in nested tables.
 
     >>> class Own(Parameters):
     ...     drift_density: ProcessNoise | None = None
@@ -354,9 +354,9 @@ def numbers_of(kind: type[Parameters]) -> dict[str, Parameter]:
 
 
 def number_of(kind: type[BaseModel], name: str) -> Parameter:
-    """Describe a number of a type by its full name, in which a table's own names may stand for `NAME`.
+    """Describe one number of a type by its full name; `NAME` may stand for the user's name of a table.
 
-    Raises BadInput where a type has no number of this name.
+    Raises BadInput if the type has no number of this name.
     """
     schema = kind.model_json_schema()
     tables: list[Mapping[str, Any]] = [schema]
@@ -382,11 +382,11 @@ def number_of(kind: type[BaseModel], name: str) -> Parameter:
     return found
 
 
-_OTHERS = "additionalProperties"  # of a table whose names are the user's
+_OTHERS = "additionalProperties"  # the key of JSON schemas for tables with user-defined names
 
 
 def nested(name: str, value: Any) -> dict[str, Any]:
-    """Return the tables in which a value of this full name stands.
+    """Build the nested tables that hold a value of this full name.
 
     >>> nested("range.rate_hz", 5.0)
     {'range': {'rate_hz': 5.0}}
@@ -396,7 +396,7 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 
 
 def flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested tables by their full names.
+    """Yield the values of nested tables with their full names.
 
     >>> dict(flat({"seed": 1, "range": {"rate_hz": 5.0}}))
     {'seed': 1, 'range.rate_hz': 5.0}
@@ -409,10 +409,10 @@ def flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
-    """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
+    """Parse `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
 
-    A right side that is no TOML value is taken as text; a key that begins with a slash (of a
-    topic) stays whole. Raises BadInput where there is no `=`.
+    A right side that is not a TOML value is read as text. A key that begins with a slash (the name of a
+    topic) is not split. Raises BadInput if there is no `=`.
 
     >>> parse_settings(["duration_s=30", "range.rate_hz=.5", "name=walk", "/fix.delay_s=.3"])
     {'duration_s': 30, 'range': {'rate_hz': 0.5}, 'name': 'walk', '/fix.delay_s': 0.3}
@@ -445,7 +445,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge the values of `over` into a copy of `base`, nested tables as well.
+    """Merge the values of `over` into a copy of `base`, including nested tables.
 
     >>> merge({"seed": 1, "range": {"rate_hz": 5.0, "sigma_m": 0.1}}, {"range": {"rate_hz": 2.0}})
     {'seed': 1, 'range': {'rate_hz': 2.0, 'sigma_m': 0.1}}

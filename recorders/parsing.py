@@ -1,7 +1,7 @@
-"""Parses JSON and TOML from outside, or refuses them as the one kind of error that says why.
+"""Parsers for JSON and TOML from untrusted sources; anything unusable raises ValueError with a reason.
 
-The parsers of the standard library also raise RecursionError, and accept what is nested so deeply that
-any code that walks it would.
+The parsers of the standard library also raise RecursionError, and accept values nested so deeply that
+other code would exceed the recursion limit.
 """
 
 import json
@@ -21,10 +21,10 @@ DEEPEST = 50
 
 
 def parse_json(text: str, *, constants: bool = False) -> Any:
-    """Read the value that a JSON text states; raises ValueError where there is none, or one too deep.
+    """Parse a JSON text; raise ValueError if it is malformed or nested too deeply.
 
-    Numbers that JSON does not know (NaN, and what is beyond the range of a double) are none, unless
-    `constants` takes them as Python writes them.
+    NaN, infinity and numbers beyond the range of a double are rejected, unless `constants` allows them
+    as Python writes them.
     """
     number = float if constants else _finite
     return _shallow(
@@ -33,14 +33,14 @@ def parse_json(text: str, *, constants: bool = False) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the values of a TOML text; raises ValueError where it is malformed or too deep."""
+    """Parse a TOML text; raise ValueError if it is malformed or nested too deeply."""
     if _DOTTED_TOO_DEEP.search(text):
         raise ValueError(_TOO_DEEP)
     return _shallow(_toml, text)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return a TOML file's values; raises BadInput where it is missing or malformed."""
+    """Read a TOML file; raise BadInput if it is missing or malformed."""
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -51,12 +51,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 _TOO_DEEP = f"it is nested more than {DEEPEST} levels deep"
 _TOO_LONG = f"it has a whole number of more than {sys.get_int_max_str_digits()} digits"
-# tomllib keeps every beginning of a dotted key: one of 100,000 parts would take all memory.
+# tomllib stores every prefix of a dotted key: a key of 100,000 parts would use all memory.
 _DOTTED_TOO_DEEP = re.compile(rf"(?<![^\s.])(?:[^\s.]++\s*+\.\s*+){{{DEEPEST}}}")
 
 
 def _shallow(parse: Callable[[str], Any], text: str) -> Any:
-    """Return the parsed value unless it is too deep; it goes by levels, as dotted keys never recurse."""
+    """Return the parsed value unless it is nested too deeply; a loop over levels avoids recursion."""
     try:
         value = parse(text)
     except RecursionError:

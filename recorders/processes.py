@@ -1,7 +1,7 @@
-"""Starts Python in further processes, which import nothing from the folder that fuselog runs in.
+"""Start of further Python processes that import nothing from the current folder.
 
-Python puts the current folder first on the path of `python -m` and `python -c`. In a folder of somebody
-else, a file such as `random.py` would then run in place of the standard library's.
+`python -m` and `python -c` put the current folder first on Python's path. In a folder of somebody else,
+a file such as `random.py` would then replace the module of the standard library.
 """
 
 import os
@@ -14,25 +14,26 @@ from typing import Any
 
 from fuselog.recorders.errors import BadInput
 
-# Where fuselog is, whatever the current folder is.
+# Where fuselog is installed, independent of the current folder.
 _ROOT = str(Path(str(sys.modules["fuselog"].__file__)).parents[1])
-# Python's variable that keeps the current folder off the path, and the value that says it is ours.
+# Python's variable that keeps the current folder off the path, and the value that marks it as set by us.
 _SAFE_PATH, _OURS = "PYTHONSAFEPATH", "fuselog"
-# Libraries read these in the current folder. Numba loads code from a cache that its file names, and
-# matplotlib's file can have LaTeX run.
+# Libraries read these files in the current folder. numba loads code from a cache that its file names,
+# and matplotlib's file can make it run LaTeX.
 _OF_NUMBA, _OF_MATPLOTLIB = ".numba_config.yaml", "matplotlibrc"
 
 
 def start_module(
     module: str, *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
 ) -> "subprocess.Popen[bytes]":
-    """Start one of our modules in a process of its own.
+    """Start one of our modules in another process.
 
     Args:
-        module: the module's full name.
-        arguments: what follows it on the command line.
-        environment: the process's variables; by default those of this process.
-        options: of subprocess.Popen. By default standard input is a pipe, and standard error is dropped.
+        module: full name of the module.
+        arguments: arguments on its command line.
+        environment: variables of the process; by default those of this process.
+        options: options of subprocess.Popen. By default standard input is a pipe, and standard error is
+            discarded.
     """
     variables = os.environ if environment is None else environment
     paths = os.pathsep.join(filter(None, [_ROOT, variables.get("PYTHONPATH")]))
@@ -45,7 +46,7 @@ def start_module(
 
 @contextmanager
 def safe_spawning() -> Iterator[None]:
-    """Keep the current folder off the path of all processes that multiprocessing starts meanwhile."""
+    """Keep the current folder off the path of processes that multiprocessing starts in this context."""
     if os.environ.get(_SAFE_PATH):
         yield
         return
@@ -57,16 +58,16 @@ def safe_spawning() -> Iterator[None]:
 
 
 def users_environment() -> dict[str, str]:
-    """Return the variables as the user set them, for programs that the user names."""
+    """Return the variables as the user set them, for programs that the user runs through fuselog."""
     return {name: value for name, value in os.environ.items() if (name, value) != (_SAFE_PATH, _OURS)}
 
 
 def keep_off_settings_here() -> None:
-    """Keep libraries from the settings in the current folder.
+    """Prevent libraries from reading settings in the current folder.
 
-    Matplotlib reads its file once, as it is imported: that is done from another folder.
+    matplotlib reads its file once, on import, so it is imported from another folder.
 
-    Raises BadInput if the folder holds a file that numba would follow.
+    Raises BadInput if the folder holds settings that numba would use.
     """
     if os.path.lexists(_OF_NUMBA):
         raise BadInput(

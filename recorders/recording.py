@@ -1,4 +1,4 @@
-"""Defines a recorder: something that turns parameters, or a folder of real data, into streams."""
+"""Recorders: they turn parameters, or a folder of real data, into streams."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -16,20 +16,20 @@ from fuselog.recorders.log.streams import concatenate
 from fuselog.recorders.parameters import Parameters, ParametersType, build
 from fuselog.recorders.registry import foreign_code, load
 
-# Simulated runs start at 2026-01-01T00:00:00Z: stamps are never negative and tools show a date.
+# Simulated runs start at 2026-01-01T00:00:00Z, so that stamps are positive and tools show a date.
 SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
 
 
 def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
-    """Compute the stamps of times since the epoch of simulations.
+    """Compute stamps from times since the start of a simulation.
 
     Args:
-        elapsed_s: of any shape, in s.
+        elapsed_s: times of any shape, in s.
 
     Returns:
-        The stamps, of the same shape, in ns.
+        Stamps of the same shape, in ns.
 
-    Raises BadInput where a stamp would be beyond what a log can hold.
+    Raises BadInput if a log cannot hold one of the stamps.
     """
     with np.errstate(over="ignore"):
         elapsed_ns = np.rint(np.asarray(elapsed_s, float) * 1e9)
@@ -45,12 +45,13 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
 def named_generator(
     rng: np.random.Generator, name: str, numbers: Mapping[str, int] | None = None
 ) -> np.random.Generator:
-    """Return a generator of its own for what has this name: one more name changes no other's numbers.
+    """Return a generator for this name; further names do not change the numbers of existing ones.
 
     Args:
-        rng: of the run, or of a part of it; it is not drawn from.
-        name: such as a sensor's, of two letters at least; the same name gives the same numbers again.
-        numbers: of names that drew from `rng.spawn(...)` before they had a generator by name.
+        rng: generator of the run, or of a part of it; nothing is drawn from it.
+        name: name of a sensor, for example, with at least two letters; the same name gives the same
+            numbers.
+        numbers: indices of names that used `rng.spawn(...)` before generators had names.
     """
     seed = rng.bit_generator.seed_seq
     assert isinstance(seed, np.random.SeedSequence)
@@ -63,12 +64,12 @@ def named_generator(
 
 @dataclass(frozen=True)
 class Recording:
-    """Holds streams in memory, before they are a log: one for every topic.
+    """The streams of one run in memory, one for every topic.
 
     Attributes:
         streams: one for every topic.
         epoch_ns: the run's time zero.
-        notes: facts that the recorder met, one short text each.
+        notes: facts that the recorder reports, each with a short text.
     """
 
     streams: list[Stream]
@@ -85,11 +86,11 @@ class Recording:
 
 @dataclass
 class Blocks:
-    """Yields streams block by block, so that they may be more than memory holds.
+    """Streams that come block by block, so that they may exceed memory.
 
     Attributes:
-        blocks: the streams of each; a topic may come again in every block.
-        epoch_ns, notes: as those of a `Recording`; whole when the last block has been drawn.
+        blocks: lists of streams; a topic may appear in every block.
+        epoch_ns, notes: as in `Recording`; complete after the last block.
     """
 
     blocks: Iterator[list[Stream]]
@@ -97,7 +98,7 @@ class Blocks:
     notes: dict[str, str] = field(default_factory=dict)
 
     def together(self) -> Recording:
-        """Read all of it into memory."""
+        """Read all blocks into memory."""
         parts: dict[str, list[Stream]] = {}
         for block in self.blocks:
             for stream in block:
@@ -107,11 +108,11 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Recorder(Generic[ParametersType]):
-    """Holds what recorders have in common: what they are in one line, and their parameters.
+    """What simulators and importers have in common: a summary and parameters.
 
     Attributes:
-        summary: what it is, in a line.
-        parameters: their type.
+        summary: description in one line.
+        parameters: type of the parameters.
     """
 
     summary: str
@@ -120,10 +121,10 @@ class Recorder(Generic[ParametersType]):
 
 @dataclass(frozen=True)
 class Simulator(Recorder[ParametersType]):
-    """Describes a scenario that can be recorded often, each run from its own random stream.
+    """A scenario that can be simulated repeatedly, each run with its own random numbers.
 
     Attributes:
-        simulate: (parameters, generator) -> a run.
+        simulate: function of (parameters, generator) that returns a run.
     """
 
     simulate: Callable[[ParametersType, np.random.Generator], Recording]
@@ -131,10 +132,10 @@ class Simulator(Recorder[ParametersType]):
 
 @dataclass(frozen=True)
 class Importer(Recorder[ParametersType]):
-    """Reads real data: a file or folder as its publishers lay it out, at once or block by block.
+    """A reader of real data in the layout of its publishers, as a whole or block by block.
 
     Attributes:
-        read: (path, parameters) -> what is there.
+        read: function of (path, parameters) that returns the recording.
     """
 
     read: Callable[[Path, ParametersType], Recording | Blocks]
@@ -143,9 +144,9 @@ class Importer(Recorder[ParametersType]):
 def record_run(
     scenario: str, values: Mapping[str, Any], seed: int, run: int = 0
 ) -> tuple[Recording, RunMetadata]:
-    """Record run number `run` of a scenario; (scenario, values, seed, run) give the same streams.
+    """Simulate run number `run` of a scenario; the same arguments give the same streams.
 
-    Raises BadInput for an unknown scenario or parameter, or one that only imports.
+    Raises BadInput for an unknown scenario or parameter, or if the name is an importer's.
 
     >>> recording, run = record_run("landmarks", {"duration_s": 2.0, "robots": 2}, seed=7)
     >>> sorted(stream.topic for stream in recording.streams if stream.topic.startswith("/robot2"))
@@ -167,7 +168,7 @@ def record_run(
 
 
 def import_run(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Recording, RunMetadata]:
-    """Import real data; raises BadInput for an unknown importer or parameter, or data it cannot read."""
+    """Import real data; raise BadInput for an unknown importer or parameter, or unreadable data."""
     importer, parameters = _importer(source, path, values)
     with foreign_code(f"importer {source}"):
         found = importer.read(path, parameters)
@@ -182,16 +183,16 @@ def import_log(
     target: Path,
     stated: Mapping[str, Any] | None = None,
 ) -> tuple[RunMetadata, int]:
-    """Import real data into a log, block by block where they come so; errors as `import_run`.
+    """Import real data into a log, block by block if possible; raises errors like `import_run`.
 
     Args:
-        source: the importer's name.
-        path: the data.
-        values: the importer's parameters.
-        target: the log.
-        stated: parameters that the log states in place of those values.
+        source: name of the importer.
+        path: file or folder with the data.
+        values: parameters of the importer.
+        target: path of the log.
+        stated: parameters that the log states instead of those values.
 
-    Returns what the run is, and how many messages the log has.
+    Returns the metadata of the run, and the number of messages in the log.
     """
     importer, parameters = _importer(source, path, values)
     messages = 0

@@ -1,9 +1,9 @@
-"""Finds recorders, estimators, metrics and studies by name.
+"""Lookup of recorders, estimators, metrics and studies by name.
 
-All register in one way, ours and third parties' alike: as entry points of an installed distribution
+Ours and those of third parties register in the same way: as entry points of an installed distribution
 (groups `fuselog.recorders`, `fuselog.models`, `fuselog.estimators`, `fuselog.judges`, `fuselog.metrics`,
-`fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`). Listing names imports
-nothing.
+`fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`). Listing names does not
+import anything.
 """
 
 from collections.abc import Iterator
@@ -20,16 +20,16 @@ SINGULAR = {"studies": "study"}
 
 @cache
 def available(kind: str) -> dict[str, EntryPoint]:
-    """Return the registered names of a kind ("recorders", say), sorted, with where each comes from."""
+    """Return the registered entry points of a kind, such as "recorders", sorted by name."""
     found = entry_points(group=f"fuselog.{kind}")
     return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
 
 
 def load(kind: str, name: str, expected: type = object) -> Any:
-    """Return the object registered under `name`.
+    """Load the object registered under `name`.
 
-    Raises BadInput where there is none, with the names there are, where it does not import, or where it
-    is not of the `expected` type.
+    Raises BadInput with the available names if the name is unknown, and if the object cannot be imported
+    or is not of the `expected` type.
     """
     known = available(kind)
     one = SINGULAR.get(kind, kind.removesuffix("s"))
@@ -52,9 +52,9 @@ def _object_of(entry: EntryPoint) -> Any:
 
 @contextmanager
 def foreign_code(what: str) -> Iterator[None]:
-    """Guard calls of registered code: what it raises becomes one sentence that says whose code it was.
+    """Guard calls of registered code: convert its exceptions to BadInput that names the code.
 
-    Bad input, a lack of memory or disk, and interrupts go through as they are.
+    BadInput, MemoryError, OSError and interrupts are passed on unchanged.
     """
     try:
         yield

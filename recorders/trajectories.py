@@ -1,9 +1,10 @@
-"""Reads and writes trajectories as benchmarks exchange them: TUM, KITTI and (read only) EuRoC.
+"""Readers and writers of trajectories as benchmarks exchange them: TUM, KITTI and (read only) EuRoC.
 
-A line of a TUM file is time (s), position and quaternion x, y, z, w; of a KITTI file the upper three
-rows of a pose's matrix, without a stamp; of a EuRoC file, with commas, time (ns), position, quaternion
-w, x, y, z, and more that is no part of the pose. Stamps tell TUM, with spaces or commas, from EuRoC:
-where they may be either, the file is refused.
+A line of a TUM file has the time (s), the position and the quaternion x, y, z, w. A line of a KITTI file
+has the upper three rows of a pose's matrix, without a stamp. A line of a EuRoC file, with commas, has
+the time (ns), the position, the quaternion w, x, y, z, and further columns that are not part of the
+pose. Stamps distinguish TUM, with spaces or commas, from EuRoC; if both are possible, the file is
+rejected.
 """
 
 import re
@@ -22,16 +23,16 @@ from fuselog.recorders.errors import BadInput, choices
 Floats = NDArray[np.float64]
 Format = Literal["tum", "kitti", "euroc"]
 
-# How far quaternions may be from unit length, and matrices from orthogonal: they are printed numbers.
+# Tolerance for the length of quaternions and the orthogonality of matrices, which are printed numbers.
 TOLERANCE = 1e-3
-# From how far on a quaternion is no rounded one, but something else.
+# A quaternion farther from unit length than this is not just rounded.
 NEARLY = 0.1
-# Stamps in s end in 2262. Steps in s are less than the first of these, in ns more than the second.
+# Stamps in s end in 2262. Steps in s are below the second of these, steps in ns above the third.
 MOST_S, SLOWEST_S, FASTEST_NS = 9.2e9, 1e4, 1e6
 _NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
-# Squares of positions that are farther away, and their sums, may be no numbers any more.
+# Squares of larger positions, and sums of them, may overflow.
 FARTHEST_M = 1e100
-# Of a text's last line; a number that is cut off is still a number.
+# For the last line of a text: a number that is cut off is still a number.
 NO_END = (
     "the last line does not end with a newline, so it may be cut off within it; it was read as it is"
 )
@@ -39,15 +40,15 @@ NO_END = (
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Holds poses of a body along its way, in the order of time.
+    """Poses of a body in the order of time.
 
     Attributes:
-        name: what to call it in a message.
+        name: name in messages.
         position_m: (n, 3).
-        rotation: (n, 3, 3) from the body's frame to that of the positions, to as many digits as the
-            source states; None where there is none.
-        time_ns: (n,); None where there are no stamps.
-        notes: sentences on the format that was found, and on what was corrected or is doubtful.
+        rotation: (n, 3, 3) from the body's frame to that of the positions, with as many digits as the
+            source has; None if there are no orientations.
+        time_ns: (n,); None if there are no stamps.
+        notes: sentences on the format that was found, and on corrected or doubtful data.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Trajectory:
         return len(self.position_m)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Trajectory":
-        """Return the poses of `rows`."""
+        """Select the poses of `rows`."""
         return Trajectory(
             self.name,
             self.position_m[rows],
@@ -86,7 +87,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """Describes what a line holds: a word for it, its least and most numbers, and which is the time."""
+    """The layout of a line: a description, the numbers it may have, and where position and time are."""
 
     columns: str
     least: int
@@ -96,12 +97,12 @@ class _Layout(NamedTuple):
 
 
 def _seconds_ns(text: str) -> int:
-    """Read a time exactly to the nanosecond, where a double is to a quarter of a microsecond."""
+    """Read a time exactly to the nanosecond; a double would have steps of a quarter of a microsecond."""
     return round(_exact(text).scaleb(9))
 
 
 def _exact(text: str) -> Decimal:
-    """Read a number that is finite as a double; with an exponent beyond Decimal's, that is zero."""
+    """Read a number that is finite as a double; an exponent beyond Decimal's range gives zero."""
     try:
         return Decimal(text)
     except InvalidOperation:
@@ -122,17 +123,16 @@ LAYOUTS: dict[Format, _Layout] = {
 
 
 def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory:  # noqa: A002
-    """Read a trajectory file; poses that are not in the order of time are sorted, which a note tells.
+    """Read a trajectory file; poses that are not in the order of time are sorted, and a note says so.
 
     Args:
-        path: the file; lines that are empty or begin with # are passed over.
-        format: one of `Format`; by default the content tells.
+        path: the file; empty lines and lines that begin with # are skipped.
+        format: one of `Format`; by default it is recognised from the content.
 
     Returns:
-        The poses in the order of time; `notes` of them say as what they were read, and what was
-        corrected.
+        The poses in the order of time; their `notes` say which format was read, and what was corrected.
 
-    Raises BadInput that names the line where the file holds no trajectory, or may be of two formats.
+    Raises BadInput that names the line if the file is not a trajectory, or could have two formats.
     """
     text = _text(Path(path))
     comment, numbers, lines = _lines(path, text)
@@ -161,7 +161,7 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         _refuse(bad, path, numbers, "has a matrix that is not a rotation; give an orthogonal one")
     else:
         quaternion = values[:, 4:]
-        with np.errstate(over="ignore"):  # an infinite length is refused as any other
+        with np.errstate(over="ignore"):  # an infinite length is rejected like any other
             norm = np.linalg.norm(quaternion, axis=1)
         bad = np.abs(norm - 1) > TOLERANCE
         mend = (
@@ -194,7 +194,7 @@ def _text(path: Path) -> str:
 
 
 def _lines(path: object, text: str) -> tuple[str, list[int], list[str]]:
-    """Return the last comment before the poses, and the lines that hold something: numbers and texts."""
+    """Return the last comment before the poses, and the numbers and texts of the lines with content."""
     comment = ""
     numbers: list[int] = []
     lines: list[str] = []
@@ -216,9 +216,9 @@ def _fields(line: str) -> list[str]:
 def _recognised(
     path: object, numbers: Sequence[int], lines: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> Format:
-    """Find the format of poses, by the columns of the first and by the stamps of all.
+    """Recognise the format by the columns of the first pose and the stamps of all.
 
-    Raises BadInput where they are of no format, or may be of two.
+    Raises BadInput if the poses have no known format, or could have two.
     """
     count, has_commas = len(rows[0]), "," in lines[0]
     if count == LAYOUTS["kitti"].least and not (has_commas and _unit(rows) == "ns"):
@@ -253,15 +253,15 @@ def _recognised(
 
 
 def _unit(rows: Sequence[Sequence[str]]) -> str:
-    """Tell the unit of stamps, s, ms, us or ns, by their size and steps; empty where it is open.
+    """Determine the unit of stamps, s, ms, us or ns, by their size and steps; empty if it is ambiguous.
 
-    A pose comes more often than every three hours, and not more often than a thousand times a second.
-    Dates in ms and us are of 2001 to 2033.
+    Poses are assumed to be at most three hours apart, and to have a rate of at most 1 kHz. Dates in ms
+    and us are from 2001 to 2033.
     """
     try:
         stamps = np.array([float(fields[0]) for fields in rows])
     except ValueError:
-        return "s"  # whose reader names the line
+        return "s"  # the reader of seconds then names the line
     steps = np.abs(np.diff(stamps))
     typical, usual = float(np.median(stamps)), float(np.median(steps[steps > 0] if steps.any() else 0))
     if 1e15 < typical < 2e15 or (1e12 < typical < 2e12 and usual < FASTEST_NS):
@@ -274,13 +274,13 @@ def _unit(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _is_numbered(rows: Sequence[Sequence[str]]) -> bool:
-    """Tell whether the first column counts the poses, from 0 or 1."""
+    """Test whether the first column counts the poses, from 0 or 1."""
     first = [fields[0] for fields in rows]
     return first in ([str(row + begin) for row in range(len(rows))] for begin in (0, 1))
 
 
 def _check_header(path: object, comment: str, name: Format) -> None:
-    """Raise BadInput where the columns' names in a comment say another order of the quaternion."""
+    """Raise BadInput if column names in a comment give another order of the quaternion."""
     places = [re.search(rf"\bq\w*?_?{axis}\b", comment.lower()) for axis in "wx"]
     first, second = (place.start() if place else -1 for place in places)
     if name != "kitti" and min(first, second) >= 0 and (first < second) != (name == "euroc"):
@@ -323,7 +323,7 @@ def _in_order(
 
 
 def tum_lines(trajectory: Trajectory) -> list[str]:
-    """Write lines of a TUM file, with all digits; the identity stands for no rotation."""
+    """Format poses as lines of a TUM file, with all digits; without rotations, the identity is used."""
     assert trajectory.time_ns is not None
     seconds = (f"{Decimal(time).scaleb(-9):f}" for time in trajectory.time_ns.tolist())
     quaternion = Rotation.from_matrix(_rotation(trajectory)).as_quat()
@@ -332,7 +332,7 @@ def tum_lines(trajectory: Trajectory) -> list[str]:
 
 
 def kitti_lines(trajectory: Trajectory) -> list[str]:
-    """Write lines of a KITTI file, with all digits; the identity stands for no rotation."""
+    """Format poses as lines of a KITTI file, with all digits; without rotations, the identity is used."""
     matrix = np.concatenate([_rotation(trajectory), trajectory.position_m[:, :, None]], axis=2)
     return [" ".join(map(repr, row)) for row in matrix.reshape(-1, 12).tolist()]
 

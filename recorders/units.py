@@ -1,7 +1,7 @@
-"""Knows units: how big they are, which one a name ends with, and how a person writes them.
+"""Units: their sizes, the endings of names that imply them, and their written form.
 
-A product of powers of some names is all that logs need, and what a field is in ends its name
-(`range_m`, `turn_rate_radps`): a library of units would bring thousands more and half a second of start.
+Logs need only products of powers of a few names, and the name of a field ends with its unit (`range_m`,
+`turn_rate_radps`). A units library would add thousands of units and half a second to every start.
 """
 
 import re
@@ -14,7 +14,7 @@ from fuselog.recorders.errors import BadInput, choices
 
 
 class Unit(NamedTuple):
-    """Holds a size in SI units (angles in rad), and the powers of what it is a product of."""
+    """The size of a unit in SI units (angles in rad), and the powers of the base units in it."""
 
     size: float
     powers: Mapping[str, float]
@@ -36,7 +36,7 @@ _SIZES: tuple[tuple[dict[str, float], dict[str, float]], ...] = (
     *(({name: 1.0}, {name: 1.0}) for name in ("Pa", "dB", "degC", "%", "bytes")),
 )
 NAMED = {name: Unit(size, powers) for powers, sizes in _SIZES for name, size in sizes.items()}
-# By how the names of fields, components, parameters and metrics end.
+# Units by the ending of the name of a field, component, parameter or metric.
 ENDINGS = {
     "m": "m", "m2": "m^2", "mm": "mm", "km": "km", "s": "s", "s2": "s^2", "h": "h", "hz": "Hz",
     "rad": "rad", "rad2": "rad^2", "mrad": "mrad", "deg": "deg", "radps": "rad/s", "degps": "deg/s",
@@ -44,7 +44,7 @@ ENDINGS = {
     "degC": "degC", "percent": "%", "bytes": "bytes", "per_s": "1/s", "per_minute": "1/min",
     "per_m2": "1/m^2", "per_rad": "1/rad", "per_km2_h": "1/(km^2 h)",
 }  # fmt: skip
-# By the unit that is expected, those in which numbers come by mistake.
+# For each expected unit, the units in which numbers are often given by mistake.
 MISTAKEN = {
     "m/s": ("km/h", "ft/s", "mi/h", "kn"), "m": ("ft",), "rad/s": ("deg/s",), "rad": ("deg",),
     "m/s^2": ("g",),
@@ -56,9 +56,9 @@ _NUMBER = re.compile(r"\s*(-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?:\s+|(?=/))")
 
 
 def unit(text: str) -> Unit:
-    """Return the unit that a text such as `m/s^2`, `deg/sqrt(h)`, `m s^-2` or `1e-7 deg` names.
+    """Parse a unit such as `m/s^2`, `deg/sqrt(h)`, `m s^-2` or `1e-7 deg`.
 
-    Raises BadInput if it names none.
+    Raises BadInput if the text is not a unit.
 
     >>> unit("km/h").size, unit("0.5 m").size
     (0.2777777777777778, 0.5)
@@ -84,7 +84,7 @@ def unit(text: str) -> Unit:
 
 
 def parted(name: str) -> tuple[str, str]:
-    """Split the name of a field, component, parameter or metric from the unit that it ends with.
+    """Split the name of a field, component, parameter or metric into the name and its unit.
 
     >>> parted("clutter_per_m2"), parted("orientation_w")
     (('clutter', '1/m^2'), ('orientation_w', ''))
@@ -94,7 +94,7 @@ def parted(name: str) -> tuple[str, str]:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit that a name ends with; empty if it ends with none.
+    """Return the unit that a name ends with, or an empty string.
 
     >>> unit_of("turn_bias_radps"), unit_of("gate_probability")
     ('rad/s', '')
@@ -103,7 +103,7 @@ def unit_of(name: str) -> str:
 
 
 def written(unit: str) -> str:
-    """Return a unit as people write it.
+    """Format a unit with superscripts and symbols.
 
     >>> written("m^2/s^2"), written("uT"), written("deg/s"), written("1/(km^2 h)")
     ('m²/s²', 'µT', 'deg/s', '1/(km² h)')
@@ -113,16 +113,16 @@ def written(unit: str) -> str:
 
 
 def mistaken(unit_: str) -> dict[str, float]:
-    """Return the units in which numbers come instead, and how many times too large they then are."""
+    """Return the units often given by mistake, with the factor by which their numbers are too large."""
     return {name: unit(unit_).size / unit(name).size for name in MISTAKEN.get(unit_, ())}
 
 
 def conversion(given: str, name: str, *, is_root: bool = False) -> float:
-    """Return by what numbers in a unit are multiplied for the field or component `name`.
+    """Compute the factor that converts numbers in a unit to the unit of the field or component `name`.
 
-    `is_root` says that the numbers are square roots, as the standard deviations of a covariance are.
+    `is_root` says that the numbers are square roots, such as the standard deviations for a covariance.
 
-    Raises BadInput if the text names no unit, or one of another kind of quantity.
+    Raises BadInput if the text is not a unit, or measures another quantity.
 
     >>> conversion("g", "specific_force_mps2"), conversion("cm", "covariance_m2", is_root=True)
     (9.80665, 0.01)
