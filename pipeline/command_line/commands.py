@@ -1,6 +1,7 @@
-"""Does the commands' work, between the command line and the library.
+"""The work of the commands, between the command line and the library.
 
-Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
+Rerun, matplotlib, pandas and scipy are slow to import: only code that draws, tabulates or aligns does
+so.
 """
 
 import shutil
@@ -55,7 +56,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
 
-MOST_LOGS = 5  # whose findings are printed
+MOST_LOGS = 5  # number of logs whose findings are printed
 
 
 def replay_logs(
@@ -81,9 +82,9 @@ def replay_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> bool:
-    """Replay, write the estimates logs, judge them where there is truth, print the metrics.
+    """Replay logs, write the estimates logs, judge them if there is truth, and print the metrics.
 
-    Returns whether every estimator could follow one of the runs to its end.
+    Returns whether every estimator completed at least one run.
     """
     logs = [log for path in logs for log in logs_in(path)]
     paths = _estimate_paths(logs, out)
@@ -152,7 +153,7 @@ def replay_logs(
 
 
 def say_left_out(path: Path, foxglove: bool) -> None:
-    """Say which streams of a new log have no message for Foxglove, if these were asked for."""
+    """Warn about the streams of a new log that have no Foxglove message, if `foxglove` is set."""
     if foxglove:
         from fuselog.pipeline.logs.foxglove import left_out
 
@@ -161,7 +162,7 @@ def say_left_out(path: Path, foxglove: bool) -> None:
 
 
 def companions_if(foxglove: bool) -> Companions | None:
-    """Make the messages for Foxglove, where they are asked for; it takes long to import."""
+    """Import and return the Foxglove mirror if it is asked for; the import is slow."""
     if not foxglove:
         return None
     from fuselog.pipeline.logs.foxglove import companions
@@ -170,9 +171,9 @@ def companions_if(foxglove: bool) -> Companions | None:
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
-    """Return where the estimates of each log go: beside it, to the one file given, or to a folder.
+    """Name the estimates log of each log: next to it, the one given file, or in a folder.
 
-    Raises BadInput where two would be the same.
+    Raises BadInput if two of them would have the same path.
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
@@ -208,7 +209,7 @@ def evaluate_logs(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge estimates logs as `judge_estimates` does, and print the metrics."""
+    """Judge estimates logs with `judge_estimates`, and print the metrics."""
     from fuselog.pipeline.api.estimates import judge_estimates
 
     found = judge_estimates(
@@ -248,7 +249,7 @@ def evaluate_trajectory(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge a trajectory file against another."""
+    """Judge a trajectory file against a true one, and print the errors."""
     from fuselog.pipeline.api.trajectories import evaluate
 
     if len(estimates) > 1:
@@ -315,7 +316,7 @@ def _print_outcome(
         print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
-    runs = judge.runs_table if judge.runs > 1 else None  # which takes pandas, slow to import
+    runs = judge.runs_table if judge.runs > 1 else None  # builds on pandas, which is slow to import
     print_metrics(values, judge.bounds, runs)
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
@@ -355,7 +356,7 @@ def view_path(
     gap_limit_s: float,
     recover: bool,
 ) -> None:
-    """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    """Open a path in the viewer, take a screenshot of it, or write or stream its timeline."""
     from fuselog.replay.timeline import viewer
     from fuselog.replay.timeline.moments import read_moments, worst_at
 
@@ -417,7 +418,7 @@ def _draw_log(
     *,
     recover: bool,
 ) -> None:
-    """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
+    """Draw a span of a log in seconds, or of an estimates log together with its source log."""
     from fuselog.replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
@@ -426,7 +427,7 @@ def _draw_log(
     if is_estimates and log.run is not None and "log" in log.run.notes:
         source = source_of_estimates(log, recover=recover)
     elif not is_estimates:
-        source = alter(source, {})  # of several planes, it is drawn in one
+        source = alter(source, {})  # draws a log with several local tangent planes in one of them
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     worst = at if isinstance(at, str) else None

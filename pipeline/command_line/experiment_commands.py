@@ -1,4 +1,4 @@
-"""Runs experiments, or logs as one, at one point or many: `fuselog run` and `fuselog sweep`."""
+"""The work of `fuselog run` and `fuselog sweep`, for experiments and for logs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,7 +55,7 @@ def run_named(
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims.
 
-    With `tells_parameters` only print the parameters of its estimators.
+    With `tells_parameters`, print only the parameters of its estimators.
     """
     stated, values = _stated_experiment(named, labels, over, settings_file, settings)
     if data is not None and stated.source.endswith(".mcap"):
@@ -95,7 +95,7 @@ def run_named(
     for cause in result.causes:
         say(f"likeliest cause of {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
-        from fuselog.pipeline.output.report.kinds import run_sentences  # it takes long to import
+        from fuselog.pipeline.output.report.kinds import run_sentences  # slow to import
 
         say(" ".join(run_sentences(result, done.folder)))
     runs = done.folder / RUNS
@@ -115,7 +115,7 @@ def run_named(
 
 
 def _tell_parameters(experiment: Experiment, *, as_json: bool) -> None:
-    """Print the parameters of an experiment's estimators, defaults included."""
+    """Print the parameters of an experiment's estimators, including defaults."""
     parameters = {
         label: configure(label, values)[1].model_dump(mode="json", exclude_none=True)
         for label, values in experiment.estimators.items()
@@ -134,7 +134,7 @@ def _stated_experiment(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> tuple[Stated, dict[str, Any]]:
-    """Return the experiment of a name or TOML file, or of logs, and the settings that go over it."""
+    """Read the experiment (a name, a TOML file, or logs) and the settings that override its own."""
     files = [Path(each) for each in named if each.endswith(".mcap")]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
         raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
@@ -161,7 +161,7 @@ def sweep_named(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
+    """Run an experiment, or replay logs as one, at many points, and print its metrics at each."""
     overs = [parse_over(text) for text in swept]
     stated, values = _stated_experiment(named, labels, over, settings_file, settings)
     done = sweep(

@@ -1,4 +1,4 @@
-"""Has the commands for experiments: run one, run it at many points, report results."""
+"""The commands for experiments: run one, run it at many points, report results."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Defines the group `fuselog`: which commands there are, by what they are for."""
+"""The group `fuselog`, with all commands in sections by purpose."""
 
 import click
 
@@ -41,10 +41,10 @@ SECTIONS = {
 
 
 class _Sections(click.Group):
-    """Prints its commands in sections."""
+    """A group that lists its commands in sections."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        """Write a line for each command, all in the same columns."""
+        """Write one line per command, with aligned columns."""
         width = max(map(len, self.commands))
         for title, commands in SECTIONS.items():
             with formatter.section(title):
@@ -65,7 +65,7 @@ class _Sections(click.Group):
 )
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
-    """Hold all commands; from here on it is told how long one takes."""
+    """Start the timer that reports progress once a minute; all commands are subcommands of this one."""
     from fuselog.pipeline.output.terminal import once_a_minute
 
     once_a_minute.begin()

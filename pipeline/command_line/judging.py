@@ -1,4 +1,4 @@
-"""Has the commands that judge estimates: against the truth, against others, and why they differ."""
+"""The commands that judge estimates, compare them, and explain why they are inconsistent."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Has the commands that list what there is: scenarios, estimators, metrics, models and more."""
+"""The commands that list scenarios, estimators, metrics, models and more."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""Has the commands on a log as it is: describe, view, export, cut, merge, rename."""
+"""The commands for one log or several: describe, check, view, export, cut, merge, rename."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -175,7 +175,7 @@ def view(path: Path, **options: Any) -> None:
 
 
 def _say_next_of_view(path: Path, *, recover: bool) -> None:
-    """Print what one would type after looking at a result, a log or an estimates log."""
+    """Print the command that one would type after viewing a result, a log or an estimates log."""
     from fuselog.pipeline.output.terminal import say_next
     from fuselog.pipeline.runs.inputs import shipped
     from fuselog.recorders.log import open_log
@@ -340,7 +340,7 @@ def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **
 
 
 def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Read what an option gives as NAME=VALUE, each name once."""
+    """Split an option's NAME=VALUE texts into a dictionary; every name may occur once."""
     pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.rpartition("=")

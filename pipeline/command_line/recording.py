@@ -1,4 +1,4 @@
-"""Has the commands that make logs: of simulated scenarios, and of real data."""
+"""The commands that make logs: from simulated scenarios, and from real data."""
 
 import shlex
 from collections.abc import Iterator, Mapping
@@ -162,7 +162,7 @@ def _import(
     *,
     stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write their log, which states its parameters with those that are `stated`."""
+    """Import data and write their log; the log states `stated` in place of the parameters used."""
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
@@ -188,9 +188,9 @@ def _import(
 
 @contextmanager
 def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
-    """Write a mapping of tables to start from, and say what it assumes.
+    """Write a first mapping of tables, and print what it assumes.
 
-    Yields where it lies until all went well; only then is it in its place.
+    Yields the temporary path of the mapping; it is moved to its final place only if all goes well.
     """
     from fuselog.pipeline.output.outputs import MAPPING, check_files
     from fuselog.recorders.atomic import whole_file
@@ -206,7 +206,7 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
 
 def say_written(path: Path, messages: int) -> None:
-    """Print what was written: the log, its messages and its size; then what to do with it."""
+    """Print what was written (the log, its messages and its size), then a command to run next."""
     from fuselog.pipeline.output.terminal import say, say_next
 
     say(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
