@@ -58,7 +58,7 @@ _room.__class__ = _Replay
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
         new = _RENAMED[name]
-        message = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
+        message = f"fuselog.{name} was renamed to fuselog.{new}; the next release removes the old name"
         warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(sys.modules[__name__], new)
     if name not in _NAMES:

@@ -46,7 +46,7 @@ def assert_golden(
         there = read(place) if place.exists() else None
         write(place, make(runs, chosen or (there or {"settings": {}})["settings"]["estimators"]).golden)
         return
-    mend = f"if this is intended, run once with {UPDATE}=1, which writes the golden"
+    mend = f"if this change is intended, run once with {UPDATE}=1 to write the golden again"
     _require(check(runs, read(place), chosen), place, mend)
 
 

@@ -177,10 +177,10 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
-            raise BadInput(f"--out {out}: {len(logs)} logs give as many estimates logs; give a folder")
+            raise BadInput(f"--out {out}: {len(logs)} logs give one estimates log each; give a folder")
         return [out]
     if out is not None and out.suffix and not out.is_dir():
-        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder that exists")
+        raise BadInput(f"--out {out}: expected a name that ends in .mcap, or an existing folder")
     paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
     places = [path.resolve() for path in paths]
     for path, place in zip(paths, places, strict=True):
@@ -253,11 +253,12 @@ def evaluate_trajectory(
     from fuselog.pipeline.api.trajectories import evaluate
 
     if len(estimates) > 1:
-        raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
+        raise BadInput(f"{estimates[1]}: only one trajectory can be judged at a time; remove the others")
     if logs or metrics or errors or recover:
         raise BadInput(
-            "--log, --metric, --errors and --recover: are for logs, --truth is for trajectory files; "
-            "leave out one of both"
+            "--log, --metric, --errors and --recover apply to logs, --truth applies to trajectory "
+            "files; "
+            "use one or the other"
         )
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
@@ -276,9 +277,9 @@ def evaluate_trajectory(
         return
     print_pose_errors(done.metrics)
     if done.compared.time_offset_s:
-        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimate")
+        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimates")
     if done.comparison.align == "sim3":
-        say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
+        say(f"the estimates were scaled by {done.alignment['scale']:.6f}")
     for path in written:
         say(str(path))
 
@@ -299,7 +300,7 @@ def _print_outcome(
     for sentence in [*judge.components_without_truth, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
-        warn(f"{len(failures)} failures in all")
+        warn(f"{len(failures)} failures in total")
     if as_json:
         outcome = {
             "metrics": values,
@@ -321,9 +322,9 @@ def _print_outcome(
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
-            "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
-            "show that a filter is consistent, only that it is not far from it; nis_per_component says "
-            "more"
+            "nees: of one run; the interval is that of a single step, so a NEES inside it does not show "
+            "that the filter is consistent, only that it is not grossly inconsistent; see also "
+            "nis_per_component"
         )
     for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
@@ -363,7 +364,8 @@ def view_path(
     is_shown = save is None and connect is None and not web
     if at is not None and screenshot is None and not is_shown:
         raise BadInput(
-            f"--at {at}: places the cursor of the viewer and of --screenshot; leave it out with --save, "
+            f"--at {at}: sets the time cursor of the viewer and of --screenshot; leave it out with "
+            f"--save, "
             "--connect and --web"
         )
     rrd = path / "timeline.rrd" if path.is_dir() else path
@@ -378,7 +380,7 @@ def view_path(
                 _draw_log(path, rrd, connect, focus, at, span, gap_limit_s, recover=recover)
         elif any(given is not None for given in (start_s, end_s, focus, connect)):
             raise BadInput(
-                f"{rrd}: is a finished timeline; --start, --end, --focus and --connect need a log"
+                f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log"
             )
         elif save is not None:
             _copy_timeline(rrd, save)
@@ -402,7 +404,7 @@ def view_path(
 
 def _copy_timeline(rrd: Path, save: Path) -> None:
     if not rrd.is_file():
-        raise BadInput(f"{rrd}: no such file; give a result that drew a timeline, or a log")
+        raise BadInput(f"{rrd}: no such file; give a result folder with a timeline, or a log")
     with whole_file(save) as new:
         shutil.copyfile(rrd, new)
 

@@ -131,15 +131,15 @@ def settings_option(function: Callable[..., None]) -> Callable[..., None]:
         "settings_file",
         type=ANY_PATH,
         metavar="FILE",
-        help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides "
-        "it.",
+        help="Read parameters of estimators from this TOML file, as written by fuselog tune; --set "
+        "overrides them.",
     )
     programs = click.option(
         "--allow-programs",
         is_flag=True,
         expose_value=False,
         callback=allow,
-        help="Also run programs (lib:, exec:) that a golden, a result or a settings file names.",
+        help="Also run programs (lib:, exec:) that are named by a golden, a result or a settings file.",
     )
     return file(programs(function))
 
@@ -153,20 +153,18 @@ workers_option = click.option(
 scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|local:N",
-    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
+    help="Share the work among the workers of a Dask scheduler, or among N local workers.",
 )
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-model_option = click.option(
-    "--model", type=MODEL, help="The model to estimate, if several fit the logs."
-)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+model_option = click.option("--model", type=MODEL, help="The model to use, if several fit the logs.")
 parameters_option = click.option(
-    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, including defaults."
 )
 parameters_alone_option = click.option(
     "--parameters",
     "tells_parameters",
     is_flag=True,
-    help="Print all parameters of the estimators, defaults included, and run nothing.",
+    help="Print all parameters of the estimators, including defaults, and run nothing.",
 )
 recover_option = click.option(
     "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
@@ -188,19 +186,19 @@ arrival_option = click.option(
 late_option = click.option(
     "--late",
     metavar="drop|wait:SECONDS|rewind:SECONDS",
-    help="With --arrival-order: process measurements in the order of their stamps all the same; drop "
-    "late ones, wait SECONDS for them, or rewind by up to SECONDS to take them in.",
+    help="With --arrival-order: process measurements in the order of their stamps. Drop out-of-sequence "
+    "measurements, wait SECONDS for them, or rewind by up to SECONDS and reprocess.",
 )
 origin_option = click.option(
     "--origin",
     type=PLACE,
     metavar="LATITUDE,LONGITUDE[,HEIGHT]",
-    help="The origin, in deg and m, of the plane of all topics that state none.",
+    help="The origin, in deg and m, of the local tangent plane of all topics that do not state one.",
 )
 foxglove_option = click.option(
     "--foxglove",
     is_flag=True,
-    help="Also write the messages that Foxglove's viewer shows.",
+    help="Also write messages for the Foxglove viewer.",
 )
 
 
@@ -263,7 +261,7 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
             takes=takes,
             multiple=True,
             metavar="KEY=VALUE",
-            help="Set a parameter (repeatable); KEY=? says what it means.",
+            help="Set a parameter (repeatable); KEY=? explains it.",
         )
         return origin_option(option(function)) if takes in _REPLAYING else option(function)
 

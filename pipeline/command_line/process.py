@@ -165,7 +165,7 @@ def _sentence(error: Exception, place: str) -> str:
         return f"{place}: {error.strerror or error}"
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
-        return f"not enough memory; ask for fewer runs or less time{why}"
+        return f"not enough memory; use fewer runs or a shorter duration{why}"
     return str(error)
 
 
