@@ -1,7 +1,7 @@
-"""Offers the public interface that programs, notebooks and plug-ins import; docs/python.md shows how.
+"""Public interface for programs, notebooks and plug-ins; see docs/python.md.
 
-Names are imported when they are first asked for, from the places that the stub beside this file lists:
-`import fuselog` is quick, and editors and type checkers see everything.
+Names are imported on first use, from the modules that the stub next to this file lists. `import fuselog`
+is therefore fast, and editors and type checkers still see every name.
 """
 
 import ast
@@ -14,15 +14,15 @@ from typing import Any
 _HERE = Path(__file__).parent
 _INSIDE, _BESIDE = _HERE / "recorders", _HERE.parent / "recorders"
 if not _INSIDE.exists() or (_BESIDE.exists() and _INSIDE.samefile(_BESIDE)):
-    __path__ = [str(_HERE.parent), str(_HERE)]  # in a clone the rooms stand beside this folder
+    __path__ = [str(_HERE.parent), str(_HERE)]  # in a clone, the packages are next to this folder
 
 from fuselog import replay as _room  # noqa: E402
 
-_RENAMED = {"Told": "Diagnostics"}  # names of the release before
+_RENAMED = {"Told": "Diagnostics"}  # names of the previous release
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """Return for each public name its module, and what it is called there."""
+    """Read the module of each public name, and its name there, from the stub."""
     stub = ast.parse((_HERE / "__init__.pyi").read_text(encoding="utf-8"))
     return {
         alias.asname or alias.name: (node.module or "", alias.name)
@@ -38,7 +38,7 @@ def _public(name: str) -> Any:
 
 
 class _Replay(ModuleType):
-    """The package `replay`, which can be called: a function of the interface has the same name."""
+    """The package `replay`, made callable because a public function has the same name."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         return _public("replay")(*arguments, **options)
@@ -58,7 +58,7 @@ _room.__class__ = _Replay
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
         new = _RENAMED[name]
-        message = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
+        message = f"fuselog.{name} was renamed to fuselog.{new}; the next release removes the old name"
         warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(sys.modules[__name__], new)
     if name not in _NAMES:

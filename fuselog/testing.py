@@ -1,4 +1,4 @@
-"""Tests estimators: a replay against a golden, as `fuselog check` does it.
+"""Assertions that compare replayed estimates with a golden file, as `fuselog check` does.
 
 >>> def test_my_estimator():
 ...     assert_golden("drive.mcap", "tests/mine.golden.xz", {"mine": MINE})
@@ -17,7 +17,7 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 __all__ = ["Golden", "Replayed", "assert_golden", "assert_same"]
 
-# Of the environment: where it is set, goldens are written in place of being compared.
+# Name of an environment variable: if it is set, goldens are written instead of compared.
 UPDATE = "FUSELOG_UPDATE_GOLDENS"
 
 
@@ -26,17 +26,18 @@ def assert_golden(
     golden: str | Path,
     estimators: str | Mapping[str, Kind] | list[str | Mapping[str, Kind]] | None = None,
 ) -> None:
-    """Replay estimators over logs, and compare with a golden field by field.
+    """Replay estimators over logs and compare the estimates with a golden field by field.
 
-    The golden is written, in place of being compared, where the environment has FUSELOG_UPDATE_GOLDENS.
+    If the environment variable FUSELOG_UPDATE_GOLDENS is set, the golden is written instead of
+    compared.
 
     Args:
         logs: a log, a folder of logs, or runs by name, such as `{"seed 7": fuselog.record(...)}`.
-        golden: the file, whose name ends in .golden.xz; it belongs beside the tests.
+        golden: the golden file. Its name ends in .golden.xz; keep it next to the tests.
         estimators: as for `fuselog.replay`; by default those that the golden names.
 
-    Raises AssertionError with the first difference: topic, run, stamp, component, both values, and the
-    innovation there. Raises BadInput where there is no golden, or it is of other runs.
+    Raises AssertionError with the first difference: topic, run, stamp, component, both values, and
+    the innovation there. Raises BadInput if the golden does not exist or was made from other runs.
     """
     runs = logs if isinstance(logs, Mapping) else runs_of(Path(logs))
     place = Path(golden)
@@ -45,12 +46,12 @@ def assert_golden(
         there = read(place) if place.exists() else None
         write(place, make(runs, chosen or (there or {"settings": {}})["settings"]["estimators"]).golden)
         return
-    mend = f"if this is intended, run once with {UPDATE}=1, which writes the golden"
+    mend = f"if this change is intended, run once with {UPDATE}=1 to write the golden again"
     _require(check(runs, read(place), chosen), place, mend)
 
 
 def assert_same(replayed: Replayed, golden: str | Path) -> None:
-    """Compare what was made by other means with a golden; raises as `assert_golden`."""
+    """Compare estimates that were made by other means with a golden; raise as `assert_golden` does."""
     _require(compared(read(Path(golden)), replayed), Path(golden))
 
 

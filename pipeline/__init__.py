@@ -1,1 +1,1 @@
-"""Holds the command line, experiments, Monte Carlo runs and reports; begin with `api`, then `runs`."""
+"""The command line, experiments, Monte Carlo runs and reports; begin with `api`, then `runs`."""

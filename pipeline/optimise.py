@@ -1,7 +1,8 @@
-"""Finds where a cost is least, how it bends there, and where 95 % of a likelihood end.
+"""Minimisation of a cost, its curvature at the minimum, and the ends of 95 % likelihood intervals.
 
-A cost takes points together, so that whoever computes it may share them out; minus a log-likelihood is
-one. Begin with `minimum`; `Beside` has differences about a point, `profile_ends` an interval by them.
+A cost is evaluated at many points per call, so that its evaluations can be distributed; minus a
+log-likelihood is such a cost. Begin with `minimum`. `Beside` holds costs around a point, and
+`profile_ends` finds intervals.
 """
 
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -14,25 +15,25 @@ from scipy.optimize import minimize
 from scipy.special import ndtri
 
 Floats = NDArray[np.float64]
-# Points (n, k) -> what each costs (n,); infinity where it cannot be used.
+# Points (n, k) -> cost of each (n,); infinite for a point that cannot be evaluated.
 Cost = Callable[[Floats], Floats]
-# A search yields what it asks for, is sent what that gains, and returns what it found.
+# A search yields values to try, is sent their gains, and returns its result.
 Asked = TypeVar("Asked")
 Found = TypeVar("Found")
 Search = Generator[Sequence[Asked], Sequence[float], Found]
 
 QUANTILE = float(ndtri(0.975))
-DROP_95 = 0.5 * QUANTILE**2  # of the log-likelihood, from its greatest to where 95 % of a number end
+DROP_95 = 0.5 * QUANTILE**2  # drop of the log-likelihood from its maximum to an end of the 95 % interval
 ROOT_95 = DROP_95**0.5
-STEP = 1e-4  # of the differences for a gradient
+STEP = 1e-4  # step of the finite differences for a gradient
 ITERATIONS = 200
-TOLERANCE = 1e-13  # of a cost: what a step has to gain
-FIRST_SIMPLEX = 0.7  # the sides of the first one
-END = 1e-3  # of how far an end is: what it need not be known better by
-SHARES = 0.05, 0.95  # of a bracket, between which its next value is
-DOUBLINGS = 12  # of the way to an end
-NARROWINGS = 40  # of the bracket of an end at most
-LARGEST = 1e12  # a loss, of what cannot be used
+TOLERANCE = 1e-13  # smallest relative decrease of the cost per iteration
+FIRST_SIMPLEX = 0.7  # edge length of the initial simplex
+END = 1e-3  # relative accuracy of an interval end
+SHARES = 0.05, 0.95  # bounds of the next value, as shares of the bracket
+DOUBLINGS = 12  # most doublings of the step while an end is bracketed
+NARROWINGS = 40  # most iterations that narrow a bracket
+LARGEST = 1e12  # largest drop of a gain, for values that cannot be evaluated
 
 
 def minimum(
@@ -43,25 +44,25 @@ def minimum(
     is_smooth: bool = True,
     tolerance: float = TOLERANCE,
 ) -> tuple[Floats, bool]:
-    """Find the minimum that a cost falls to from a start, by L-BFGS-B, or by a simplex if it is rough.
+    """Minimise a cost from a start, by L-BFGS-B, or by the Nelder-Mead simplex if the cost is rough.
 
     Args:
         cost: of points (n, k).
         start: (k,).
-        bounds: (k,), (k,).
-        is_smooth: whether the cost has a gradient, so that the search may follow it.
-        tolerance: the share of a smooth cost that a step has to gain for the search to go on.
+        bounds: lower (k,) and upper (k,).
+        is_smooth: whether the cost has a usable gradient.
+        tolerance: the relative decrease of a smooth cost below which the search stops.
 
     Returns:
         The minimum (k,), and whether the search converged.
     """
     low, high = bounds
-    # what cannot be used is a wall that a search turns back from
+    # points that cannot be evaluated get a high finite cost, so that the search turns back
     at_start = float(cost(start[None])[0])
     wall = (10.0 * abs(at_start) if np.isfinite(at_start) else 0.0) + 1e6
 
     def with_gradient(point: Floats) -> tuple[float, Floats]:
-        """Return the cost and its slopes; none towards a side that cannot be used, as at a bound."""
+        """Compute the cost and its slopes; a slope towards a wall is zero, as at a bound."""
         steps = STEP * np.eye(len(point))
         points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
         here, ahead, behind = np.split(np.fmin(cost(points), wall), [1, 1 + len(point)])
@@ -98,12 +99,12 @@ def minimum(
 
 
 class Beside(NamedTuple):
-    """Holds what a point (k,) costs, and what it costs beside it along m of its coordinates.
+    """Costs at a point (k,) and at steps on both sides of it along m of its coordinates.
 
     Attributes:
-        here: at the point.
-        ahead, behind: (m,) a step further and less far.
-        steps: (m,) how far.
+        here: the cost at the point.
+        ahead, behind: (m,) the costs one step forwards and one step backwards.
+        steps: (m,) the steps.
     """
 
     here: float
@@ -118,19 +119,19 @@ class Beside(NamedTuple):
 
     @property
     def bends(self) -> Floats:
-        """Return the second derivatives (m,); not finite where a cost is not."""
+        """Return the second derivatives (m,); not finite if a cost is not finite."""
         with np.errstate(invalid="ignore"):
             return (self.ahead - 2.0 * self.here + self.behind) / self.steps**2
 
 
 def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floats) -> Beside:
-    """Compute what it costs beside a point.
+    """Evaluate a cost at a point and at steps on both sides of it.
 
     Args:
         cost: of points (n, k).
         point: (k,).
-        places: m of the k coordinates.
-        steps: how far along each of these, for all of them or (m,).
+        places: indices of m of the k coordinates.
+        steps: the step along each of these, one for all of them or (m,).
     """
     return _differences(cost, point, list(places), steps, [])[0]
 
@@ -138,16 +139,16 @@ def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floa
 def curvature(
     cost: Cost, point: Floats, places: Iterable[int], steps: float | Floats
 ) -> tuple[Beside, Floats]:
-    """Compute the second derivatives of a cost at a point by m of its coordinates.
+    """Compute the second derivatives of a cost at a point with respect to m of its coordinates.
 
     Args:
         cost: of points (n, k).
         point: (k,).
-        places: m of the k coordinates.
-        steps: of the differences, of all coordinates or (m,).
+        places: indices of m of the k coordinates.
+        steps: of the finite differences, one for all coordinates or (m,).
 
     Returns:
-        What it costs beside the point, and (m, m); not finite where the cost beside the point is not.
+        The costs around the point, and the derivatives (m, m); not finite if a cost is not finite.
     """
     rows = list(places)
     pairs = list(combinations(range(len(rows)), 2))
@@ -167,7 +168,7 @@ def _differences(
     steps: float | Floats,
     pairs: Sequence[tuple[int, int]],
 ) -> tuple[Beside, Floats]:
-    """Compute the costs along coordinates, and at four corners of each pair of these, all together."""
+    """Compute the costs along coordinates and at the four corners of each pair, in one call."""
     m, h = len(places), np.broadcast_to(steps, len(places))
     along = h[:, None] * np.eye(len(point))[places]
     corners = [
@@ -189,22 +190,23 @@ def profile_ends(
     within: float = END,
     doublings: int = DOUBLINGS,
 ) -> tuple[Floats, Floats]:
-    """Find the ends of the 95 % intervals of numbers: along each, all others follow by the curvature.
+    """Find the ends of the 95 % interval of each number; the other numbers follow it by the curvature.
 
     Args:
         cost: minus the log-likelihood, of points (n, k).
-        point: (k,) where it is least.
-        curvature: (k, k) its second derivatives there.
-        corrections: Newton's steps of the others at each value, where the curvature alone leads astray.
-        within: the share of an end that it need not be known better by.
-        doublings: of the way to an end.
+        point: (k,) the minimum.
+        curvature: (k, k) the second derivatives at the minimum.
+        corrections: the number of Newton steps that re-optimise the other numbers at each value, for
+            costs that the curvature alone does not describe.
+        within: the relative accuracy of an end.
+        doublings: the most doublings of the step while an end is bracketed.
 
     Returns:
-        The ends (k,), (k,); infinite where none is found.
+        The lower ends (k,) and the upper ends (k,); infinite if no end is found.
     """
     covariance = np.linalg.pinv(curvature)
     errors = np.sqrt(np.diagonal(covariance))
-    along = covariance / errors  # a column for each number
+    along = covariance / errors  # one column per number
     ways = [(place, way * QUANTILE) for place in range(len(point)) for way in (-1.0, 1.0)]
 
     def gains(asked: Sequence[tuple[int, float]]) -> Sequence[float]:
@@ -225,11 +227,11 @@ def profile_ends(
 def end(
     at: float, gain: float, scale: float, within: float = END, doublings: int = DOUBLINGS
 ) -> Search[float, float]:
-    """Search for an end of the 95 % interval of a number: where its gain is DROP_95 below its greatest.
+    """Search for an end of the 95 % interval of a number, at which its gain has dropped by DROP_95.
 
-    `scale` is how far off it is about, with its side. An end that is not found is infinite. The gain is
-    about a parabola, so that the root of what it falls by is about a line. If the gain is a spike, the
-    bracket stops narrowing after `NARROWINGS` values and its outer end is returned.
+    `scale` is an estimate of the signed distance from `at` to the end. An end that is not found is
+    infinite. The gain is nearly a parabola, so the root of its drop is nearly linear. If the gain is
+    a spike, the bracket stops narrowing after `NARROWINGS` values and its outer end is returned.
     """
 
     def root_of_fall(gains: Sequence[float]) -> float:
@@ -251,7 +253,7 @@ def end(
             return value
         share = float(np.clip((ROOT_95 - least) / (most - least), *SHARES))
         value = inner + share * (outer - inner)
-        if value in (inner, outer):  # numbers have no room between them
+        if value in (inner, outer):  # no floating-point number lies between them
             break
         fallen = root_of_fall((yield [value]))
         if fallen > ROOT_95:
@@ -265,9 +267,9 @@ def side_by_side(
     searches: Sequence[Search[Asked, Found]],
     gains_of: Callable[[Sequence[tuple[int, Asked]]], Sequence[float]],
 ) -> list[Found]:
-    """Run searches together, by the gains of what all of them ask for: places and values.
+    """Run searches in step: evaluate the gains of all values that they ask for together.
 
-    A gain that is NaN counts as minus infinity: a value that cannot be used.
+    `gains_of` takes pairs of a search's index and a value. A gain of NaN counts as minus infinity.
     """
     asked = {place: list(next(search)) for place, search in enumerate(searches)}
     results: dict[int, Found] = {}

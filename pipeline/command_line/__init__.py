@@ -1,6 +1,6 @@
-"""Defines the command `fuselog`: its commands and their options, and what they do.
+"""The command `fuselog`: its subcommands, their options, and what they do.
 
-Commands import what they need when they run, so that `--help` answers at once. Begin with `group`.
+Commands import what they need when they run, so that `--help` answers quickly. Begin with `group`.
 """
 
 from fuselog.pipeline.command_line.group import fuselog as fuselog

@@ -1,6 +1,7 @@
-"""Does the commands' work, between the command line and the library.
+"""The work of the commands, between the command line and the library.
 
-Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
+Rerun, matplotlib, pandas and scipy are slow to import: only code that draws, tabulates or aligns does
+so.
 """
 
 import shutil
@@ -55,7 +56,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
 
-MOST_LOGS = 5  # whose findings are printed
+MOST_LOGS = 5  # number of logs whose findings are printed
 
 
 def replay_logs(
@@ -81,9 +82,9 @@ def replay_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> bool:
-    """Replay, write the estimates logs, judge them where there is truth, print the metrics.
+    """Replay logs, write the estimates logs, judge them if there is truth, and print the metrics.
 
-    Returns whether every estimator could follow one of the runs to its end.
+    Returns whether every estimator completed at least one run.
     """
     logs = [log for path in logs for log in logs_in(path)]
     paths = _estimate_paths(logs, out)
@@ -152,7 +153,7 @@ def replay_logs(
 
 
 def say_left_out(path: Path, foxglove: bool) -> None:
-    """Say which streams of a new log have no message for Foxglove, if these were asked for."""
+    """Warn about the streams of a new log that have no Foxglove message, if `foxglove` is set."""
     if foxglove:
         from fuselog.pipeline.logs.foxglove import left_out
 
@@ -161,7 +162,7 @@ def say_left_out(path: Path, foxglove: bool) -> None:
 
 
 def companions_if(foxglove: bool) -> Companions | None:
-    """Make the messages for Foxglove, where they are asked for; it takes long to import."""
+    """Import and return the Foxglove mirror if it is asked for; the import is slow."""
     if not foxglove:
         return None
     from fuselog.pipeline.logs.foxglove import companions
@@ -170,16 +171,16 @@ def companions_if(foxglove: bool) -> Companions | None:
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
-    """Return where the estimates of each log go: beside it, to the one file given, or to a folder.
+    """Name the estimates log of each log: next to it, the one given file, or in a folder.
 
-    Raises BadInput where two would be the same.
+    Raises BadInput if two of them would have the same path.
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
-            raise BadInput(f"--out {out}: {len(logs)} logs give as many estimates logs; give a folder")
+            raise BadInput(f"--out {out}: {len(logs)} logs give one estimates log each; give a folder")
         return [out]
     if out is not None and out.suffix and not out.is_dir():
-        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder that exists")
+        raise BadInput(f"--out {out}: expected a name that ends in .mcap, or an existing folder")
     paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
     places = [path.resolve() for path in paths]
     for path, place in zip(paths, places, strict=True):
@@ -208,7 +209,7 @@ def evaluate_logs(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge estimates logs as `judge_estimates` does, and print the metrics."""
+    """Judge estimates logs with `judge_estimates`, and print the metrics."""
     from fuselog.pipeline.api.estimates import judge_estimates
 
     found = judge_estimates(
@@ -248,15 +249,16 @@ def evaluate_trajectory(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge a trajectory file against another."""
+    """Judge a trajectory file against a true one, and print the errors."""
     from fuselog.pipeline.api.trajectories import evaluate
 
     if len(estimates) > 1:
-        raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
+        raise BadInput(f"{estimates[1]}: only one trajectory can be judged at a time; remove the others")
     if logs or metrics or errors or recover:
         raise BadInput(
-            "--log, --metric, --errors and --recover: are for logs, --truth is for trajectory files; "
-            "leave out one of both"
+            "--log, --metric, --errors and --recover apply to logs, --truth applies to trajectory "
+            "files; "
+            "use one or the other"
         )
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
@@ -275,9 +277,9 @@ def evaluate_trajectory(
         return
     print_pose_errors(done.metrics)
     if done.compared.time_offset_s:
-        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimate")
+        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimates")
     if done.comparison.align == "sim3":
-        say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
+        say(f"the estimates were scaled by {done.alignment['scale']:.6f}")
     for path in written:
         say(str(path))
 
@@ -298,7 +300,7 @@ def _print_outcome(
     for sentence in [*judge.components_without_truth, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
-        warn(f"{len(failures)} failures in all")
+        warn(f"{len(failures)} failures in total")
     if as_json:
         outcome = {
             "metrics": values,
@@ -315,14 +317,14 @@ def _print_outcome(
         print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
-    runs = judge.runs_table if judge.runs > 1 else None  # which takes pandas, slow to import
+    runs = judge.runs_table if judge.runs > 1 else None  # builds on pandas, which is slow to import
     print_metrics(values, judge.bounds, runs)
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
-            "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
-            "show that a filter is consistent, only that it is not far from it; nis_per_component says "
-            "more"
+            "nees: of one run; the interval is that of a single step, so a NEES inside it does not show "
+            "that the filter is consistent, only that it is not grossly inconsistent; see also "
+            "nis_per_component"
         )
     for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
@@ -355,14 +357,15 @@ def view_path(
     gap_limit_s: float,
     recover: bool,
 ) -> None:
-    """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    """Open a path in the viewer, take a screenshot of it, or write or stream its timeline."""
     from fuselog.replay.timeline import viewer
     from fuselog.replay.timeline.moments import read_moments, worst_at
 
     is_shown = save is None and connect is None and not web
     if at is not None and screenshot is None and not is_shown:
         raise BadInput(
-            f"--at {at}: places the cursor of the viewer and of --screenshot; leave it out with --save, "
+            f"--at {at}: sets the time cursor of the viewer and of --screenshot; leave it out with "
+            f"--save, "
             "--connect and --web"
         )
     rrd = path / "timeline.rrd" if path.is_dir() else path
@@ -377,7 +380,7 @@ def view_path(
                 _draw_log(path, rrd, connect, focus, at, span, gap_limit_s, recover=recover)
         elif any(given is not None for given in (start_s, end_s, focus, connect)):
             raise BadInput(
-                f"{rrd}: is a finished timeline; --start, --end, --focus and --connect need a log"
+                f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log"
             )
         elif save is not None:
             _copy_timeline(rrd, save)
@@ -401,7 +404,7 @@ def view_path(
 
 def _copy_timeline(rrd: Path, save: Path) -> None:
     if not rrd.is_file():
-        raise BadInput(f"{rrd}: no such file; give a result that drew a timeline, or a log")
+        raise BadInput(f"{rrd}: no such file; give a result folder with a timeline, or a log")
     with whole_file(save) as new:
         shutil.copyfile(rrd, new)
 
@@ -417,7 +420,7 @@ def _draw_log(
     *,
     recover: bool,
 ) -> None:
-    """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
+    """Draw a span of a log in seconds, or of an estimates log together with its source log."""
     from fuselog.replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
@@ -426,7 +429,7 @@ def _draw_log(
     if is_estimates and log.run is not None and "log" in log.run.notes:
         source = source_of_estimates(log, recover=recover)
     elif not is_estimates:
-        source = alter(source, {})  # of several planes, it is drawn in one
+        source = alter(source, {})  # draws a log with several local tangent planes in one of them
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     worst = at if isinstance(at, str) else None

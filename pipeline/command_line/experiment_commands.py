@@ -1,4 +1,4 @@
-"""Runs experiments, or logs as one, at one point or many: `fuselog run` and `fuselog sweep`."""
+"""The work of `fuselog run` and `fuselog sweep`, for experiments and for logs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,11 +55,14 @@ def run_named(
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims.
 
-    With `tells_parameters` only print the parameters of its estimators.
+    With `tells_parameters`, print only the parameters of its estimators.
     """
     stated, values = _stated_experiment(named, labels, over, settings_file, settings)
     if data is not None and stated.source.endswith(".mcap"):
-        raise BadInput(f"{stated.source}: logs are replayed as they are; leave out --data")
+        raise BadInput(
+            f"{stated.source}: --data does not apply to logs, which are replayed as they are; leave it "
+            f"out"
+        )
     if tells_parameters:
         _tell_parameters(stated.with_settings(values, {}), as_json=as_json)
         return
@@ -93,9 +96,9 @@ def run_named(
         return
     print_worst(result.alarms)
     for cause in result.causes:
-        say(f"likeliest cause of {cause.estimator}: {cause.words} {cause.mended}".rstrip())
+        say(f"likeliest cause for {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
-        from fuselog.pipeline.output.report.kinds import run_sentences  # it takes long to import
+        from fuselog.pipeline.output.report.kinds import run_sentences  # slow to import
 
         say(" ".join(run_sentences(result, done.folder)))
     runs = done.folder / RUNS
@@ -115,7 +118,7 @@ def run_named(
 
 
 def _tell_parameters(experiment: Experiment, *, as_json: bool) -> None:
-    """Print the parameters of an experiment's estimators, defaults included."""
+    """Print the parameters of an experiment's estimators, including defaults."""
     parameters = {
         label: configure(label, values)[1].model_dump(mode="json", exclude_none=True)
         for label, values in experiment.estimators.items()
@@ -124,7 +127,7 @@ def _tell_parameters(experiment: Experiment, *, as_json: bool) -> None:
         print_json({"parameters": parameters})
         return
     print_parameters(parameters)
-    say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
+    say("model parameters that are not listed are read from the log; see fuselog replay --help")
 
 
 def _stated_experiment(
@@ -134,12 +137,17 @@ def _stated_experiment(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> tuple[Stated, dict[str, Any]]:
-    """Return the experiment of a name or TOML file, or of logs, and the settings that go over it."""
+    """Read the experiment (a name, a TOML file, or logs) and the settings that override its own."""
     files = [Path(each) for each in named if each.endswith(".mcap")]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
-        raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        raise BadInput(
+            f"{files[0]}: logs are replayed as they are; give only logs and -e, without --runs and "
+            f"--seed"
+        )
     if not files and (len(named) > 1 or labels):
-        raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+        raise BadInput(
+            f"{named[0]}: give one experiment at a time, without -e; it names its own estimators"
+        )
     stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
     values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]
@@ -161,7 +169,7 @@ def sweep_named(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
+    """Run an experiment, or replay logs as one, at many points, and print its metrics at each."""
     overs = [parse_over(text) for text in swept]
     stated, values = _stated_experiment(named, labels, over, settings_file, settings)
     done = sweep(
@@ -188,5 +196,5 @@ def sweep_named(
         for number, point in enumerate(points)
     ]
     print_table([*points[0], *shown], rows)
-    say(f"{done.folder}: the table of all metrics, figures, result.json")
+    say(f"{done.folder}: a table of all metrics, figures, result.json")
     say_next("report", str(done.folder))

@@ -1,4 +1,4 @@
-"""Has the commands for experiments: run one, run it at many points, report results."""
+"""The commands for experiments: run one, run it at many points, report results."""
 
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,13 @@ from fuselog.pipeline.command_line.options import (
 )
 
 diagnose_option = click.option(
-    "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
+    "--diagnose", is_flag=True, help="Explain why an estimator is inconsistent, from its first run."
 )
 stress_option = click.option(
     "--stress",
     is_flag=True,
-    help="Say of each estimator whether changes that should not matter decide what it gives; verdicts "
-    "below what they do are withheld.",
+    help="Test whether each estimator's result is robust to changes that should not matter; verdicts on "
+    "smaller differences are then withheld.",
 )
 
 
@@ -51,7 +51,9 @@ stress_option = click.option(
 @arrival_option
 @late_option
 @errors_option
-@click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
+@click.option(
+    "--data", type=ANY_PATH, help="The folder or file of real data, for experiments that import."
+)
 @click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT].")
 @workers_option
 @scheduler_option
@@ -72,11 +74,11 @@ def run(
 ) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
 
-    Or replay logs of your own as an experiment, LOG.mcap ... with -e for each estimator.
+    To run your own logs as an experiment, give LOG.mcap ... and -e for each estimator.
 
-    --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 of an estimator,
-    --set gate_probability=1 of all estimators that have it, --set gap_limit_s=1 an entry of the
-    experiment.
+    --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 a parameter of one
+    estimator, --set gate_probability=1 of all estimators that have it, and --set gap_limit_s=1 an entry
+    of the experiment.
     """
     from fuselog.pipeline.command_line.experiment_commands import run_named
 
@@ -98,7 +100,8 @@ def run(
     multiple=True,
     required=True,
     metavar="KEY=LOW:HIGH:N|logN or KEY=A,B,...",
-    help="A parameter and its values, evenly between two ends, or evenly in the logarithm (repeatable).",
+    help="A parameter and its values: a list, or N values from LOW to HIGH, linear or logarithmic "
+    "(repeatable).",
 )
 @click.option(
     "--samples",
@@ -121,10 +124,10 @@ def sweep(
     seed: int | None,
     **options: Any,
 ) -> None:
-    """Run EXPERIMENT, or replay logs, at all points of a grid of parameters, or at samples of it.
+    """Run EXPERIMENT, or replay logs, at all points of a parameter grid, or at samples of it.
 
-    A table has every metric at every point, and within what nine in ten runs lie; figures show them as
-    curves, or as heat maps over two parameters. A key is as --set has it.
+    A table holds every metric at every point, with the range of the middle 90 % of runs; figures show
+    the metrics as curves, or as heat maps over two parameters. Keys are written as for --set.
     """
     from fuselog.pipeline.command_line.experiment_commands import sweep_named
 
@@ -138,7 +141,7 @@ def sweep(
 )
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=PAGE, default=Path("report.html"), show_default=True)
-@click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
+@click.option("--viewer", is_flag=True, help="Add viewer pictures of the first runs; takes 15 s each.")
 @diagnose_option
 def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
@@ -153,5 +156,5 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -
 
         seek = likeliest_causes
     write_report(list(results), out, viewer=viewer, diagnose=seek)
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, a page for any browser")
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB; open it in any browser")
     say_next("view", str(results[0]))

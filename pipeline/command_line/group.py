@@ -1,4 +1,4 @@
-"""Defines the group `fuselog`: which commands there are, by what they are for."""
+"""The group `fuselog`, with all commands in sections by purpose."""
 
 import click
 
@@ -41,10 +41,10 @@ SECTIONS = {
 
 
 class _Sections(click.Group):
-    """Prints its commands in sections."""
+    """A group that lists its commands in sections."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        """Write a line for each command, all in the same columns."""
+        """Write one line per command, with aligned columns."""
         width = max(map(len, self.commands))
         for title, commands in SECTIONS.items():
             with formatter.section(title):
@@ -57,7 +57,7 @@ class _Sections(click.Group):
     cls=_Sections,
     context_settings={"help_option_names": ["-h", "--help"]},
     help=with_examples(
-        "Record, replay, judge and look at estimators for sensor fusion.",
+        "Record, replay, evaluate and visualise estimators for sensor fusion.",
         "fuselog record landmarks --seed 7 -o run.mcap",
         "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
         "fuselog view est.mcap",
@@ -65,7 +65,7 @@ class _Sections(click.Group):
 )
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
-    """Hold all commands; from here on it is told how long one takes."""
+    """Start the timer that reports progress once a minute; all commands are subcommands of this one."""
     from fuselog.pipeline.output.terminal import once_a_minute
 
     once_a_minute.begin()

@@ -1,4 +1,4 @@
-"""Makes a command's help: its docstring, and below it commands to try; each option with an example."""
+"""Help texts of commands: the docstring, then example commands; every option has an example value."""
 
 import inspect
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import click
 
 from fuselog.pipeline.command_line.options import SetOption
 
-# A value of every option that takes one, by its name, or by the command's and its name.
+# An example value of every option that takes one, by option name, or by command and option name.
 EXAMPLES = {
     "--again": "run.mcap",
     "--against": "ekf.golden.xz",
@@ -92,10 +92,10 @@ EXAMPLES = {
 
 
 class _Command(click.Command):
-    """Settles its settings before it begins."""
+    """A command that completes its settings before it runs."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the options."""
+        """Parse the options, then complete the settings."""
         left = super().parse_args(ctx, args)
         for each in self.params:
             if isinstance(each, SetOption) and not ctx.resilient_parsing:
@@ -104,12 +104,12 @@ class _Command(click.Command):
 
 
 def with_examples(text: str, *examples: str) -> str:
-    """Return a help text that ends with commands to try, which click does not wrap."""
+    """Append example commands to a help text, in a block that click does not wrap."""
     return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
 
 
 def example_of(command: str, option: click.Option) -> str | None:
-    """Return an example of an option as one types it; None for flags and options that list choices."""
+    """Return an example of an option as typed; None for flags and options that list choices."""
     if option.is_flag or isinstance(option.type, click.Choice):
         return None
     name = option.opts[-1]
@@ -119,7 +119,7 @@ def example_of(command: str, option: click.Option) -> str | None:
 def command(
     short_help: str, *examples: str, name: str | None = None
 ) -> Callable[[Callable[..., None]], click.Command]:
-    """Make a command, whose help is its docstring, or the short one, and examples of it."""
+    """Make a command. Its help is its docstring, or else the short help, followed by examples."""
 
     def added(function: Callable[..., None]) -> click.Command:
         text = with_examples(function.__doc__ or short_help, *examples)

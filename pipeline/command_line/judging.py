@@ -1,4 +1,4 @@
-"""Has the commands that judge estimates: against the truth, against others, and why they differ."""
+"""The commands that judge estimates, compare them, and explain why they are inconsistent."""
 
 from pathlib import Path
 from typing import Any
@@ -32,26 +32,36 @@ from fuselog.recorders.errors import BadInput
     "fuselog evaluate est.txt --truth gt.txt --align se3",
 )
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
+@click.option(
+    "--log",
+    "logs",
+    multiple=True,
+    type=ANY_PATH,
+    help="The log with the truth, one per run (repeatable).",
+)
 @click.option(
     "--truth",
     type=ANY_PATH,
-    help="The file of the true trajectory, where ESTIMATES is a trajectory file.",
+    help="The true trajectory, if ESTIMATES is a trajectory file.",
 )
 @click.option(
-    "--format", type=FORMAT, help="The format of trajectory files [default: found from their content]."
+    "--format",
+    type=FORMAT,
+    help="The format of trajectory files [default: detected from their content].",
 )
 @click.option(
-    "--truth-format", type=FORMAT, help="The format of the true one [default: found from its content]."
+    "--truth-format",
+    type=FORMAT,
+    help="The format of the true trajectory [default: detected from its content].",
 )
 @click.option(
     "--align",
     type=click.Choice(["none", "yaw", "se2", "se3", "sim3"]),
-    help="Bring estimates nearest to the truth first: yaw turns about the vertical and shifts, se2 too "
-    "but for the height, se3 turns and shifts, sim3 scales as well [default: none].",
+    help="Align estimates with the truth first: yaw rotates about the vertical axis and translates, se2 "
+    "does so without changing the height, se3 rotates and translates, sim3 also scales [default: none].",
 )
 @click.option(
-    "--delta", type=float, help="The distance over which relative pose errors are taken [default: 1]."
+    "--delta", type=float, help="The distance over which relative pose errors are computed [default: 1]."
 )
 @click.option(
     "--delta-unit",
@@ -61,21 +71,21 @@ from fuselog.recorders.errors import BadInput
 @click.option(
     "--association",
     type=click.Choice(["nearest", "interpolated"]),
-    help="Which true pose belongs to an estimated one: the nearest in time, or one between two "
+    help="How an estimated pose is matched with a true one: nearest in time, or interpolated "
     "[default: nearest for files, interpolated for logs].",
 )
 @click.option(
     "--max-difference",
     "max_difference_s",
     type=Seconds(0),
-    help="The largest time in seconds between a pose and its nearest true one [default: 0.01].",
+    help="The largest time difference, in seconds, between matched poses [default: 0.01].",
 )
 @click.option(
     "--time-offset",
     "time_offset_s",
     type=TimeOffset(),
     metavar="SECONDS|estimate",
-    help="Add this to the stamps of the estimated trajectory, or find it [default: 0].",
+    help="Add this to the stamps of the estimated trajectory, or estimate it [default: 0].",
 )
 @click.option(
     "--metric", "metrics", type=METRIC, multiple=True, help="A metric (repeatable) [default: all]."
@@ -99,11 +109,11 @@ def evaluate(
     time_offset_s: float | str | None,
     **options: Any,
 ) -> None:
-    """Judge ESTIMATES logs against the truth of the logs they were replayed from.
+    """Judge ESTIMATES logs against the truth in the logs they were replayed from.
 
-    With --truth, ESTIMATES is a trajectory file (TUM, KITTI or EuRoC) that is judged against another:
-    absolute and relative pose errors, APE and RPE, as evo has them. With --align or --delta, so are
-    estimated positions of logs; all other metrics are then of the aligned estimates.
+    With --truth, judge one trajectory file (TUM, KITTI or EuRoC) against another: absolute and relative
+    pose errors (APE and RPE), computed as in evo. With --align or --delta, also compute them for the
+    estimated positions of logs; all other metrics then refer to the aligned estimates.
     """
     from fuselog.pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
 
@@ -122,7 +132,8 @@ def evaluate(
         return
     if any(formats.values()):
         raise BadInput(
-            "--format and --truth-format: are for trajectory files; give the true one, --truth"
+            "--format and --truth-format apply to trajectory files; give the true trajectory with "
+            "--truth"
         )
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
@@ -134,23 +145,24 @@ def evaluate(
 )
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("labels", "Which estimators (repeatable).", many=True)
-@click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, if SIDES are trajectory files.")
 @click.option(
-    "--case", help="Which truth trajectory files are judged by, such as robot2, where a log has several."
+    "--case",
+    help="The truth that trajectory files are judged against, such as robot2, if a log has several.",
 )
 @click.option(
     "--margin",
     type=click.FloatRange(min=0),
     default=0.02,
     show_default=True,
-    help="The relative difference of a metric that counts as none.",
+    help="The relative difference of a metric that counts as no difference.",
 )
 @click.option("--out", type=RESULT, help="Write a result folder: tables, figures, the timeline.")
-@click.option("--save", type=TIMELINE, help="Write the timeline, side by side, to this .rrd file.")
+@click.option("--save", type=TIMELINE, help="Write the timelines, side by side, to this .rrd file.")
 @click.option(
     "--stress",
     is_flag=True,
-    help="Withhold verdicts on differences below what changes do that should not matter.",
+    help="Withhold verdicts on differences smaller than the effect of changes that should not matter.",
 )
 @click.option(
     "--fail-if-worse",
@@ -161,10 +173,10 @@ def evaluate(
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
-    Or estimators over logs or folders of logs, with -e for each estimator; those of which the logs have
-    estimates already, such as an autopilot's, come first and are not replayed. All others are compared
-    with the first, metric by metric over the runs that both have, with intervals of 95 % by the
-    bootstrap over runs.
+    SIDES can also be logs or folders of logs, with -e for each estimator. Estimates that the logs
+    already contain, such as an autopilot's, come first and are not replayed. All other sides are
+    compared with the first, metric by metric over the runs that both have, with 95 % bootstrap intervals
+    over runs.
     """
     from fuselog.pipeline.comparing.command import compare_candidates
 
@@ -177,17 +189,19 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     "fuselog diagnose run.mcap -e ekf",
 )
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
-@estimator_option("label", "The estimator; by default the only one of estimates.")
+@estimator_option("label", "The estimator [default: the only one of an estimates log].")
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
-@click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
+@click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the findings as events.")
 @model_option
-@click.option("--tried", "tells_tried", is_flag=True, help="List what was tried, with what it gains.")
+@click.option(
+    "--tried", "tells_tried", is_flag=True, help="List every change that was tried, with its gain."
+)
 @replay_options
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
-    """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
+    """Explain what is likely wrong with LOG or with an estimator's settings, and what to try.
 
-    LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
-    cause first: that without which the log-likelihood gains most.
+    LOG is a log, or an estimates log next to its source log. The output has at most five sentences, the
+    likeliest cause first: the one whose correction increases the log-likelihood most.
     """
     from fuselog.pipeline.diagnosing.command import diagnose_log
 
@@ -201,16 +215,24 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("labels", "Which estimators (repeatable).", many=True, required=True)
 @model_option
-@click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
 @click.option(
-    "--save", type=TIMELINE, help="A timeline (.rrd) of the first log to write: copies fan out in it."
+    "--seed",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Seed of the random signs and of the dropped messages.",
+)
+@click.option(
+    "--save",
+    type=TIMELINE,
+    help="A timeline (.rrd) of the first log to write, with the changed replays next to the original.",
 )
 @replay_options
 def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
-    """Replay LOG with stamps, order, inputs, start and parameters changed by next to nothing.
+    """Replay LOG with tiny changes of stamps, order, inputs, start and parameters.
 
-    The verdict comes first: harmless, sensitive (half the change does half as much), or discontinuous
-    or chaotic (it does not). An estimator takes at most twelve replays.
+    The verdict comes first: harmless, sensitive (half the change has half the effect), or discontinuous
+    or chaotic (it does not). Each estimator needs at most twelve replays.
     """
     from fuselog.pipeline.stressing.command import stress_logs
 
@@ -227,23 +249,23 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     "--window",
     "window_s",
     type=Seconds(),
-    help="The length of a window; one follows another [default: the whole run].",
+    help="The length of each of the consecutive windows [default: the whole run].",
 )
 @click.option(
     "--scale",
     "scales",
     multiple=True,
     metavar="COMPONENT=SIGMA",
-    help="The standard deviation that counts as one, instead of the prior's (repeatable).",
+    help="The unit of a component, as a standard deviation, instead of the prior's (repeatable).",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @recover_option
 @json_option
 @set_option("observability")
 def observability(logs: tuple[Path, ...], **options: Any) -> None:
-    """Say how well the measurements of LOGS determine the state, and which direction least.
+    """Show how well the measurements of LOGS determine the state, and in which direction least.
 
-    For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
+    For every run and window, print the rank and the eigenvalues of the local Gramian along the smoothed
     trajectory, in units of the prior's information.
     """
     from fuselog.pipeline.api.observability import show_observability

@@ -1,4 +1,4 @@
-"""Has the commands that list what there is: scenarios, estimators, metrics, models and more."""
+"""The commands that list scenarios, estimators, metrics, models and more."""
 
 import click
 
@@ -41,10 +41,12 @@ experiments = _listing("experiment", "List the shipped experiments, or describe 
     "fuselog models robot --formulas",
 )
 @click.argument("name", required=False, type=MODEL)
-@click.option("--formulas", is_flag=True, help="Print what NAME's functions and their derivatives are.")
+@click.option(
+    "--formulas", is_flag=True, help="Print the formulas of NAME's functions and their derivatives."
+)
 @json_option
 def models(name: str | None, formulas: bool, as_json: bool) -> None:
-    """List the models and which methods can estimate them, or all about NAME: also why one cannot."""
+    """List the models and the methods that can estimate them, or describe NAME in full."""
     if formulas:
         from fuselog.pipeline.api.catalog import show_formulas
 
@@ -60,23 +62,26 @@ def models(name: str | None, formulas: bool, as_json: bool) -> None:
     "fuselog cache --warm robot inertial:smoother:ekf",
 )
 @click.argument("pairs", nargs=-1, metavar="[MODEL[:METHOD]]...")
-@click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
 @click.option(
-    "--warm", is_flag=True, help="Compile what the first replay of models would, on all cores."
+    "--clear", is_flag=True, help="Remove the files that fuselog wrote there, and nothing else."
+)
+@click.option(
+    "--warm",
+    is_flag=True,
+    help="Compile what the first replay of the models would compile, on all cores.",
 )
 @json_option
 def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> None:
-    """Say how large the cache of compiled kernels and samples is; fuselog can make these again.
+    """Show the size of the cache of compiled kernels and samples, which fuselog can make again.
 
-    --warm compiles kernels for these models and methods; ekf, ukf and smoother:ekf where a model stands
-    alone, and of all models where nothing is named. It replays short recordings of the scenarios that
-    fit a model. A log with other sensors compiles its own kernels when it is first replayed, which takes
-    .3 to 2 s.
+    --warm compiles the kernels of the named models and methods: ekf, ukf and smoother:ekf for a model
+    without a method, and all models if nothing is named. It replays short recordings of scenarios that
+    fit a model. A log with other sensors compiles its own kernels on its first replay, in 0.3 to 2 s.
     """
     if pairs and not warm:
-        raise BadInput(f"fuselog cache {pairs[0]}: give --warm to compile it ahead")
+        raise BadInput(f"fuselog cache {pairs[0]}: add --warm to compile it in advance")
     if clear and warm:
-        raise BadInput("fuselog cache --clear --warm: give one of the two, and then the other")
+        raise BadInput("fuselog cache --clear --warm: use one option, then the other")
     if warm:
         from fuselog.pipeline.api.precompiling import show_precompiling
 
@@ -92,7 +97,7 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
     "fuselog header",
 )
 def header() -> None:
-    """Print the folder of the header that a filter of your own in C, C++ or Rust is compiled with.
+    """Print the folder of the header for filters of your own in C, C++ or Rust.
 
     cc -shared -fPIC -I "$(fuselog header)" mine.c -o mine.so
     """

@@ -1,4 +1,4 @@
-"""Has the commands on a log as it is: describe, view, export, cut, merge, rename."""
+"""The commands for one log or several: describe, check, view, export, cut, merge, rename."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 
 
 @command(
-    "Show what a log holds.",
+    "Show what a log contains.",
     "fuselog info run.mcap",
 )
 @click.argument("log", type=ANY_PATH)
-@click.option("--all", "is_all", is_flag=True, help="Also say what it lacks for each model.")
+@click.option("--all", "is_all", is_flag=True, help="Also list what the log lacks for each model.")
 @recover_option
 @json_option
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
-    """Say what LOG holds: the run, its topics, schemas, message counts, the models that fit it.
+    """Show what LOG contains: the run, its topics, schemas, message counts, and the models that fit it.
 
-    LOG may be a log, an estimates log, a bag of ROS, a result folder or a timeline (.rrd).
+    LOG may be a log, an estimates log, a ROS bag, a result folder or a timeline (.rrd).
     """
     from fuselog.pipeline.logs.information import show_log
 
@@ -47,7 +47,7 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 @command(
-    "Find the noise of sensors at rest, with intervals.",
+    "Estimate the noise of sensors at rest, with intervals.",
     "fuselog noise rest.mcap",
     "fuselog noise rest.mcap --topic /imu --out noise",
 )
@@ -63,14 +63,14 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     "--sheet",
     multiple=True,
     metavar="FIELD=VALUE UNIT",
-    help="What a data sheet states, to compare (repeatable); 'one-sided' behind it is of a density.",
+    help="A data sheet's value to compare with (repeatable); append 'one-sided' to a density.",
 )
 @click.option(
     "--tau",
     "taus",
     multiple=True,
     type=click.FloatRange(min=0, min_open=True),
-    help="Also say the Allan deviation at this time in s (repeatable).",
+    help="Also print the Allan deviation at this averaging time in s (repeatable).",
 )
 @click.option(
     "--out",
@@ -81,11 +81,11 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 @recover_option
 @json_option
 def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options: Any) -> None:
-    """Say what noise sensors have by LOG, of a unit at rest: white noise, walk and more.
+    """Estimate sensor noise from LOG, a recording at rest: white noise, random walk and more.
 
-    By maximum likelihood, with intervals; the Allan deviation is measured beside it, and where the model
-    leaves it, that is said. LOG may also be what imu_utils or allan_variance_ros wrote: what its numbers
-    mean is said.
+    Estimates are by maximum likelihood, with intervals. The Allan deviation is computed as well, and
+    fuselog reports where it departs from the model. LOG may also be the output of imu_utils or
+    allan_variance_ros; the meaning of its numbers is then explained.
     """
     from fuselog.pipeline.sensing.command import show_noise
 
@@ -98,21 +98,24 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
     "fuselog ellipsoid positions.mcap --field /imu.specific_force_mps2",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--field", required=True, metavar="TOPIC.FIELD", help="The vector that is calibrated.")
+@click.option("--field", required=True, metavar="TOPIC.FIELD", help="The vector to calibrate.")
 @click.option(
     "--length",
     type=click.FloatRange(min=0, min_open=True),
-    help="The length of the vector, in the field's unit [default: gravity's, else the readings' own].",
+    help="The length of the vector, in the field's unit [default: gravity's, or the mean of the "
+    "readings].",
 )
-@click.option("--out", type=RESULT, help="A result folder to write: the table, and lengths as a figure.")
+@click.option(
+    "--out", type=RESULT, help="A result folder to write: a table, and a figure of the lengths."
+)
 @recover_option
 @json_option
 def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
-    """Find offsets, scales and cross terms of a sensor by LOGS, in which it is turned to all sides.
+    """Estimate offsets, scales and cross terms of a sensor from LOGS in which it is turned to all sides.
 
-    The Earth's magnetic field and gravity have one length, so readings lie on an ellipsoid. An
-    accelerometer is held still in each position. What the turns do not determine is named, and has no
-    value.
+    The Earth's magnetic field and gravity have constant magnitudes, so raw readings lie on an ellipsoid.
+    Hold an accelerometer still in each position. Terms that the rotations do not determine are named and
+    get no value.
     """
     from fuselog.pipeline.calibrating.command import show_ellipsoid
 
@@ -129,10 +132,10 @@ def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
 @json_option
 @set_option("lint")
 def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> None:
-    """Say what is wrong with LOG before any filter: units, stamps, frames, covariances, values, names.
+    """Find errors in LOG before any filter runs: units, stamps, frames, covariances, values, names.
 
-    Each finding says how sure it is, its evidence, and what mends it; --set tries that at once. It exits
-    with 1 where something is found that is more than a hint.
+    Each finding has a confidence, its evidence and a fix, which you can try with --set. The exit code is
+    1 if there is a finding that is more than a hint.
     """
     from fuselog.pipeline.api.linting import show_lint
 
@@ -148,22 +151,24 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     "fuselog view out/landmarks --screenshot picture.png --at 30",
 )
 @click.argument("path", type=ANY_PATH)
-@click.option("--screenshot", type=PICTURE, help="Take the viewer's picture, headless, as PNG.")
+@click.option(
+    "--screenshot", type=PICTURE, help="Save a screenshot of the viewer as PNG, without a window."
+)
 @click.option(
     "--at",
     type=Instant(),
     metavar="SECONDS|worst[:ESTIMATOR]",
-    help="Put the time cursor this many seconds into the run, or at the largest NEES (without NEES the "
+    help="Set the time cursor this many seconds into the run, or at the largest NEES (without NEES the "
     "largest error) of all estimators or of one.",
 )
-@click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
+@click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run.")
 @click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
 @click.option("--save", type=TIMELINE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option(
     "--web", is_flag=True, help="Serve the timeline to a browser on this machine until Ctrl-C."
 )
-@click.option("--focus", help="What to show first, such as robot3.")
+@click.option("--focus", help="What to show first, for example robot3.")
 @recover_option
 @gap_option
 def view(path: Path, **options: Any) -> None:
@@ -175,7 +180,7 @@ def view(path: Path, **options: Any) -> None:
 
 
 def _say_next_of_view(path: Path, *, recover: bool) -> None:
-    """Print what one would type after looking at a result, a log or an estimates log."""
+    """Print the command that one would type after viewing a result, a log or an estimates log."""
     from fuselog.pipeline.output.terminal import say_next
     from fuselog.pipeline.runs.inputs import shipped
     from fuselog.recorders.log import open_log
@@ -215,9 +220,9 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    To tum and kitti go the estimates and truths that state a position, and poses, as trajectories; to
-    mot tracks and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a
-    table; to foxglove one log of the messages that Foxglove and Rerun show.
+    tum and kitti take trajectories: poses, and the estimates and truths that have a position; mot takes
+    tracks and truths frame by frame, as TrackEval reads them; csv and parquet take any stream, as a
+    table; foxglove writes one log of the messages that Foxglove and Rerun show.
     """
     from fuselog.pipeline.logs.exporting import export as export_log
 
@@ -229,7 +234,7 @@ def export(path: Path, to: Any, **options: Any) -> None:
 
 
 @command(
-    "Write a span, some topics or fewer messages of a log.",
+    "Write part of a log: a time span, some topics or fewer messages.",
     "fuselog cut run.mcap --start 10 --end 20 -o part.mcap",
     "fuselog cut run.mcap --decimate '/robot1/odometry=5Hz' -o slow.mcap",
 )
@@ -247,13 +252,13 @@ def export(path: Path, to: Any, **options: Any) -> None:
     "--decimate",
     multiple=True,
     metavar="TOPIC=N|TOPIC=RATEHz",
-    help="Keep every Nth stamp of a topic or pattern, or at most so many a second (repeatable).",
+    help="Keep every Nth stamp of a topic or pattern, or at most RATE per second (repeatable).",
 )
 @recover_option
 def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
-    """Write a part of PATH, a log or an estimates log, as a log of its own.
+    """Write part of PATH, a log or an estimates log, as a new log.
 
-    Maps, priors and what was said at the first stamp of the log stay whole, whatever the span.
+    Maps, priors and the messages at the first stamp of the log are kept whole, whatever the span.
     """
     from fuselog.pipeline.logs.edit import cut as cut_log
 
@@ -261,7 +266,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 
 
 @command(
-    "Write one log of several, whose clocks may differ.",
+    "Merge several logs, whose clocks may differ, into one.",
     "fuselog merge a.mcap b.mcap --offset b.mcap=-0.5 -o both.mcap",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
@@ -275,7 +280,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 )
 @recover_option
 def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
-    """Write one log of LOGS, which have no topic in common: fuselog relabel renames topics."""
+    """Merge LOGS, which must have no topic in common, into one log; fuselog relabel renames topics."""
     from fuselog.pipeline.logs.edit import merge as merge_logs
 
     offsets_s = {}
@@ -283,24 +288,26 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
         try:
             offsets_s[log] = float(text)
         except ValueError:
-            raise BadInput(f"--offset {log}={text}: expected LOG=SECONDS, as {log}=-0.5") from None
+            raise BadInput(
+                f"--offset {log}={text}: expected LOG=SECONDS, for example {log}=-0.5"
+            ) from None
     _say_changed(merge_logs(list(logs), offsets_s=offsets_s, **options))
 
 
 @command(
-    "Add zero-velocity and non-holonomic measurements to a log.",
+    "Add zero-velocity and non-holonomic pseudo-measurements to a log.",
     "fuselog constrain run.mcap -o constrained.mcap --set rolling_hz=10",
 )
 @click.argument("path", type=ANY_PATH)
 @out_log_option
-@click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only unit].")
+@click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only inertial unit].")
 @set_option("constraints")
 @recover_option
 def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
-    """Write PATH with topics that say when its body stands and, with --set rolling_hz=10, that it rolls.
+    """Write PATH with zero-velocity and, with --set rolling_hz=10, non-holonomic pseudo-measurements.
 
-    The model inertial takes them as it takes sensors: a body that stands has no velocity, and one that
-    rolls on wheels moves neither to the side nor up.
+    The model inertial uses them like sensors: a vehicle at rest has no velocity, and one that rolls on
+    wheels moves neither sideways nor up.
     """
     from fuselog.pipeline.logs.edit import constrain as constrain_log
     from fuselog.recorders.parameters import parse_settings
@@ -309,7 +316,7 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
 
 
 @command(
-    "Write a log with other names of topics and components.",
+    "Rename topics and components of a log.",
     "fuselog relabel run.mcap --topic /robot1/=/left/ -o left.mcap",
 )
 @click.argument("path", type=ANY_PATH)
@@ -319,18 +326,18 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     "topics",
     multiple=True,
     metavar="OLD=NEW",
-    help="Rename a topic, or as /robot1/=/robot2/ all that begin so (repeatable).",
+    help="Rename a topic, or a prefix, such as /robot1/=/robot2/ (repeatable).",
 )
 @click.option(
     "--component",
     "components",
     multiple=True,
     metavar="OLD=NEW",
-    help="Rename a component of states, as x_m=east_m, in all topics (repeatable).",
+    help="Rename a component of states in all topics, such as x_m=east_m (repeatable).",
 )
 @recover_option
 def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
-    """Write PATH, a log or an estimates log, with other names; what refers to them follows."""
+    """Write PATH, a log or an estimates log, with renamed topics or components; references follow."""
     from fuselog.pipeline.logs.edit import relabel as relabel_log
 
     done = relabel_log(
@@ -340,12 +347,12 @@ def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **
 
 
 def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Read what an option gives as NAME=VALUE, each name once."""
+    """Split an option's NAME=VALUE texts into a dictionary; every name may occur once."""
     pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.rpartition("=")
         if not (name and equals and value) or name in pairs:
-            raise BadInput(f"{option} {text}: expected NAME=VALUE, with every name once")
+            raise BadInput(f"{option} {text}: expected NAME=VALUE, and each name only once")
         pairs[name] = value
     return pairs
 

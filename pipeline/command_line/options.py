@@ -1,4 +1,4 @@
-"""Defines types of options, and the options that several commands have."""
+"""Types of options, and the options that several commands share."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -12,10 +12,10 @@ from fuselog.replay.foreign.naming import allow_programs_of_files
 
 
 class Output(click.Path):
-    """Declares what a command writes, by which the audit of outputs in tests finds it.
+    """A path that a command writes; the audit of outputs in the tests finds options by this type.
 
     Attributes:
-        suffix: of the file; empty for what is only ever a folder.
+        suffix: of the file; empty for a path that is always a folder.
     """
 
     def __init__(self, suffix: str = "", **options: Any) -> None:
@@ -24,13 +24,13 @@ class Output(click.Path):
 
 
 class OutputFile(Output):
-    """Accepts a file to write: a new one, or a regular one to replace; never a device or a folder."""
+    """A file to write: a new file, or a regular file to replace, but not a device or a folder."""
 
     def __init__(self, suffix: str) -> None:
         super().__init__(suffix, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path."""
+        """Return the path; reject one that exists and is not a regular file."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.exists() and not path.is_file():
             self.fail(f"{path} is not a regular file", param, ctx)
@@ -38,7 +38,7 @@ class OutputFile(Output):
 
 
 class Seconds(click.ParamType):
-    """Reads a time in seconds that fits the stamps of a log."""
+    """A time in seconds, within the range of a log's stamps."""
 
     name = "seconds"
 
@@ -46,7 +46,7 @@ class Seconds(click.ParamType):
         self._minimum = minimum
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number."""
+        """Convert the text to seconds."""
         seconds = float(click.FLOAT.convert(value, param, ctx))
         if not self._minimum <= seconds <= 1e9:
             self.fail(
@@ -56,29 +56,29 @@ class Seconds(click.ParamType):
 
 
 class Instant(Seconds):
-    """Reads a time in seconds, or the words for an estimator's worst moment."""
+    """A time in seconds, or the words for an estimator's worst moment."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number or the words."""
+        """Convert the text to seconds, or return the words as they are."""
         is_worst = isinstance(value, str) and value.partition(":")[0] == "worst"
         return value if is_worst else super().convert(value, param, ctx)
 
 
 class TimeOffset(Seconds):
-    """Reads a time in seconds, or the word that asks to find it."""
+    """A time in seconds, or the word `estimate`."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number or the word."""
+        """Convert the text to seconds, or return the word as it is."""
         return value if value == "estimate" else super().convert(value, param, ctx)
 
 
 class Place(click.ParamType):
-    """Reads a place on the earth: latitude and longitude in deg, and perhaps the height in m."""
+    """A position on the Earth: latitude and longitude in deg, and optionally the height in m."""
 
     name = "place"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the place as a list of numbers."""
+        """Parse the position into a list of numbers."""
         from fuselog.recorders.log.planes import EXAMPLE, origin_of
 
         found = origin_of(str(value).split(","))
@@ -88,7 +88,7 @@ class Place(click.ParamType):
 
 
 class Name(click.types.StringParamType):
-    """Reads a name of what fuselog lists, and completes it in the shell."""
+    """A name from one of fuselog's lists, completed in the shell."""
 
     def __init__(self, kind: str, *, or_file: bool = False) -> None:
         self._kind, self._or_file = kind, or_file
@@ -99,12 +99,12 @@ class Name(click.types.StringParamType):
         param: click.Parameter,  # noqa: ARG002
         incomplete: str,
     ) -> list[CompletionItem]:
-        """Return the names that begin so, each with a line on it."""
+        """Return the names that begin with the typed text, each with a line of description."""
         from fuselog.pipeline.api.lists import listed
 
         names = listed(self._kind).items()
         found = [CompletionItem(name, help=what) for name, what in names if name.startswith(incomplete)]
-        # before the names: bash forgets what came before a file
+        # must precede the names: bash forgets completions that come before a file
         return [CompletionItem(incomplete, type="file"), *found] if self._or_file else found
 
 
@@ -121,7 +121,7 @@ FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
 
 def settings_option(function: Callable[..., None]) -> Callable[..., None]:
-    """Return the option --settings, and that on programs which files such as that one name."""
+    """Add the options --settings and --allow-programs, which permits programs that such files name."""
 
     def allow(context: click.Context, parameter: click.Parameter, value: bool) -> None:  # noqa: ARG001
         allow_programs_of_files(value)
@@ -131,15 +131,15 @@ def settings_option(function: Callable[..., None]) -> Callable[..., None]:
         "settings_file",
         type=ANY_PATH,
         metavar="FILE",
-        help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides "
-        "it.",
+        help="Read parameters of estimators from this TOML file, as written by fuselog tune; --set "
+        "overrides them.",
     )
     programs = click.option(
         "--allow-programs",
         is_flag=True,
         expose_value=False,
         callback=allow,
-        help="Also run programs (lib:, exec:) that a golden, a result or a settings file names.",
+        help="Also run programs (lib:, exec:) that are named by a golden, a result or a settings file.",
     )
     return file(programs(function))
 
@@ -153,20 +153,18 @@ workers_option = click.option(
 scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|local:N",
-    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
+    help="Share the work among the workers of a Dask scheduler, or among N local workers.",
 )
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-model_option = click.option(
-    "--model", type=MODEL, help="The model to estimate, if several fit the logs."
-)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+model_option = click.option("--model", type=MODEL, help="The model to use, if several fit the logs.")
 parameters_option = click.option(
-    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, including defaults."
 )
 parameters_alone_option = click.option(
     "--parameters",
     "tells_parameters",
     is_flag=True,
-    help="Print all parameters of the estimators, defaults included, and run nothing.",
+    help="Print all parameters of the estimators, including defaults, and run nothing.",
 )
 recover_option = click.option(
     "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
@@ -188,26 +186,26 @@ arrival_option = click.option(
 late_option = click.option(
     "--late",
     metavar="drop|wait:SECONDS|rewind:SECONDS",
-    help="With --arrival-order: process measurements in the order of their stamps all the same; drop "
-    "late ones, wait SECONDS for them, or rewind by up to SECONDS to take them in.",
+    help="With --arrival-order: process measurements in the order of their stamps. Drop out-of-sequence "
+    "measurements, wait SECONDS for them, or rewind by up to SECONDS and reprocess.",
 )
 origin_option = click.option(
     "--origin",
     type=PLACE,
     metavar="LATITUDE,LONGITUDE[,HEIGHT]",
-    help="The origin, in deg and m, of the plane of all topics that state none.",
+    help="The origin, in deg and m, of the local tangent plane of all topics that do not state one.",
 )
 foxglove_option = click.option(
     "--foxglove",
     is_flag=True,
-    help="Also write the messages that Foxglove's viewer shows.",
+    help="Also write messages for the Foxglove viewer.",
 )
 
 
 def estimator_option(
     name: str, text: str, *, many: bool = False, required: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add `-e`, which names an estimator, as the argument `name`; `many` takes it several times."""
+    """Add `-e`, which names an estimator, as the argument `name`; with `many` it is repeatable."""
     return click.option(
         "-e", "--estimator", name, type=ESTIMATOR, multiple=many, required=required, help=text
     )
@@ -217,11 +215,12 @@ _REPLAYING = ("estimators", "experiment")
 
 
 class SetOption(click.Option):
-    """Accepts settings, which a command's other options complete once all are parsed: see `settle`.
+    """The option --set, which other options complete once all are parsed; see `settle`.
 
     Attributes:
-        takes: what takes them, a key of `fuselog.pipeline.api.asking.TAKERS`.
-        replays: whether the command replays logs. It has --origin too, a setting of all their topics.
+        takes: what the settings are for, a key of `fuselog.pipeline.api.asking.TAKERS`.
+        replays: whether the command replays logs. Such a command also has --origin, which becomes a
+            setting of all their topics.
     """
 
     def __init__(self, names: Sequence[str], *, takes: str, **options: Any) -> None:
@@ -229,10 +228,10 @@ class SetOption(click.Option):
         self.takes, self.replays = takes, takes in _REPLAYING
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the parameters whose names begin so."""
+        """Return the parameters whose names begin with the typed text."""
         from fuselog.pipeline.api.asking import settings_that_begin
 
-        # click leaves arguments aside while the option lacks its value
+        # click does not assign arguments while the option lacks its value
         [argument, *_] = [each for each in ctx.command.params if isinstance(each, click.Argument)]
         left = tuple(ctx.args) if argument.nargs < 0 else next(iter(ctx.args), None)
         options = ctx.params | ({str(argument.name): left} if left else {})
@@ -240,7 +239,7 @@ class SetOption(click.Option):
         return [CompletionItem(name, help=meaning) for name, meaning in found.items()]
 
     def settle(self, context: click.Context) -> None:
-        """Add the origin to the settings; where these ask, NAME=?, print what it means and exit."""
+        """Add the origin to the settings; for a question (NAME=?), print the meaning and exit."""
         options = context.params
         if self.replays and (place := options.pop("origin")):
             options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
@@ -252,7 +251,7 @@ class SetOption(click.Option):
 
 
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add the option --set of a command, see `SetOption`."""
+    """Add the option --set, see `SetOption`, to a command; if it replays logs, --origin as well."""
 
     def added(function: Callable[..., None]) -> Callable[..., None]:
         option = click.option(
@@ -262,7 +261,7 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
             takes=takes,
             multiple=True,
             metavar="KEY=VALUE",
-            help="Set a parameter (repeatable); KEY=? says what it means.",
+            help="Set a parameter (repeatable); KEY=? explains it.",
         )
         return origin_option(option(function)) if takes in _REPLAYING else option(function)
 
@@ -270,5 +269,5 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
 
 
 def replay_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Add what commands that replay logs share: how these are read, judged and printed, and settings."""
+    """Add the options that commands replaying logs share: reading, judging, printing and settings."""
     return recover_option(gap_option(json_option(settings_option(set_option("estimators")(function)))))

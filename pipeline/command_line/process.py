@@ -1,4 +1,4 @@
-"""Runs the command line as a process: its exit code, what stops it, what it says of errors."""
+"""The command line as a process: exit codes, signals, and messages for errors."""
 
 import atexit
 import gc
@@ -27,16 +27,16 @@ from fuselog.recorders.processes import keep_off_settings_here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
+    """Run the command line and return the exit code: 2, after one sentence, for a user's mistake.
 
-    FUSELOG_TRACEBACK=1 shows where an error comes from, for who writes an estimator.
+    FUSELOG_TRACEBACK=1 shows the traceback of an error, for authors of estimators.
 
     Args:
-        arguments: of the command; by default those that this process was started with, which is then
-            ours: it collects less garbage, and ends here.
+        arguments: of the command; by default those that this process was started with. In that case
+            the process is ours: it collects garbage less often, and ends here.
     """
     if arguments is None:
-        gc.set_threshold(50_000, 20, 100)  # while libraries are imported there is nothing to free
+        gc.set_threshold(50_000, 20, 100)  # there is no garbage to collect while libraries are imported
         try:
             code = _code_of(arguments)
         except Exception:
@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _end(code: int) -> NoReturn:
     """End the process as Python does, but free no objects, which would take a fifth of a short command.
 
-    And leave threads alone: Python up to 3.13 breaks off those that still work, which aborts the process
-    if one is in NumPy's C++ or holds the lock of standard error.
+    Threads are left running: Python up to 3.13 terminates them, which aborts the process if a thread
+    is in NumPy's C++ code or holds the lock of standard error.
     """
     for act in (atexit._run_exitfuncs, sys.stdout.flush):
         with suppress(KeyboardInterrupt, OSError):
@@ -59,12 +59,12 @@ def _end(code: int) -> NoReturn:
 
 
 def _code_of(arguments: Sequence[str] | None) -> int:
-    """Run the command line; returns the exit code, after the sentence that belongs to it."""
+    """Run the command line, print the sentence for an error, and return the exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
+            stream.reconfigure(errors="backslashreplace")  # a file name may not fit the encoding
     logging.basicConfig(format="fuselog: %(message)s")
-    if sys.stderr.isatty():  # somebody waits
+    if sys.stderr.isatty():  # a person is watching
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals(), without_warnings_of_numbers():
@@ -82,7 +82,7 @@ def _code_of(arguments: Sequence[str] | None) -> int:
         return _fail(error.format_message().rstrip(".") + hint)
     except (click.Abort, KeyboardInterrupt) as error:
         click.echo("fuselog: stopped", err=True)
-        cause = error.__cause__ or error  # click wraps it
+        cause = error.__cause__ or error  # click wraps the interrupt
         return 128 + (cause.number if isinstance(cause, Stopped) else signal.SIGINT)
     except BrokenPipeError:
         _drop_output()
@@ -95,12 +95,12 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     return code or 0
 
 
-# Of a sentence; a path has up to 4096 characters.
+# The longest message in characters; a path has up to 4096.
 _LONGEST = 10_000
 
 
 class Stopped(KeyboardInterrupt):
-    """Says that a signal asked the process to end, which is treated as Ctrl-C is."""
+    """A signal asked the process to end; treated like Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -109,9 +109,9 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[None]:
-    """Have signals that end the process unwind it, so that what was begun is cleared away.
+    """Let signals that end the process unwind the stack, so that unfinished files are removed.
 
-    Where one falls into a finalizer, out of which Python lets no exception go, it is sent again.
+    A signal that arrives in a finalizer, which no exception can leave, is sent again.
     """
     last_s = -math.inf
     report = sys.unraisablehook
@@ -119,12 +119,12 @@ def _stopped_by_signals() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal last_s
         while frame is not None:
-            if frame.f_code is again.__code__:  # the machine is so busy that it is still at work
+            if frame.f_code is again.__code__:  # on a busy machine the hook may still be running
                 send_soon(number)
                 return
             frame = frame.f_back
         before_s, last_s = last_s, time.monotonic()
-        if number == signal.SIGINT or last_s - before_s > 1.0:  # `timeout` sends to process and group
+        if number == signal.SIGINT or last_s - before_s > 1.0:  # `timeout` signals process and group
             raise Stopped(number)
 
     def again(lost: "sys.UnraisableHookArgs") -> None:
@@ -159,13 +159,13 @@ def _stopped_by_signals() -> Iterator[None]:
 
 
 def _sentence(error: Exception, place: str) -> str:
-    """Say what went wrong, and where: `place` is for errors that do not say so themselves."""
+    """Describe an error, and where it happened: `place` is for errors that do not name one."""
     if isinstance(error, OSError):
         place = os.fsdecode(error.filename) if error.filename else place
         return f"{place}: {error.strerror or error}"
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
-        return f"not enough memory; ask for fewer runs or less time{why}"
+        return f"not enough memory; use fewer runs or a shorter duration{why}"
     return str(error)
 
 
@@ -178,7 +178,7 @@ def _fail(sentence: str) -> int:
 
 
 def _drop_output() -> bool:
-    """Tell whether standard output takes more; if not, drop it, so that nothing tries again."""
+    """Test whether standard output can be written to; if not, drop it so that nothing tries again."""
     try:
         print(end="", flush=True)
     except OSError:

@@ -1,4 +1,4 @@
-"""Has the commands that make logs: of simulated scenarios, and of real data."""
+"""The commands that make logs: from simulated scenarios, and from real data."""
 
 import shlex
 from collections.abc import Iterator, Mapping
@@ -29,14 +29,14 @@ from fuselog.recorders.errors import BadInput, printable
 @click.argument("scenario", required=False, type=SCENARIO)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
-@click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
-@click.option("--again", type=ANY_PATH, help="Record the run of this log again, by its own metadata.")
+@click.option("--run", type=COUNT, help="Number of the run of that seed [default: 0].")
+@click.option("--again", type=ANY_PATH, help="Record the run of this log again, from its metadata.")
 @click.option(
     "--compression",
     type=click.Choice(["zstd", "lz4", "none"]),
     default="zstd",
     show_default=True,
-    help="Of the log's chunks.",
+    help="Compression of the log's chunks.",
 )
 @foxglove_option
 @set_option("recorder")
@@ -60,11 +60,11 @@ def record(
     from fuselog.recorders.recording import record_run
 
     if (scenario is None) == (again is None):
-        raise BadInput("give either a scenario, one that fuselog scenarios lists, or --again LOG")
+        raise BadInput("give either a scenario (fuselog scenarios lists them) or --again LOG")
     if again is not None:
         source = open_log(again).run
         if source is None or source.seed is None:
-            raise BadInput(f"{again}: the log does not say how it was simulated; name a scenario")
+            raise BadInput(f"{again}: the log has no metadata of a simulation; give a scenario instead")
         name, values, label = source.scenario, source.parameters, f"{again.stem}-again"
         seed = source.seed if seed is None else seed
         run = source.run if run is None else run
@@ -96,24 +96,26 @@ def record(
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
-    help="For ROS: what says when a message was published, its header or the bag [default: header].",
+    help="For ROS: where the publish time of a message comes from, its header or the bag [default: "
+    "header].",
 )
 @click.option(
     "--mapping",
-    help="The mapping of messages or columns: a TOML file, or the name of one that ships; "
-    "without it, import table lists these.",
+    help="The mapping of messages or columns: a TOML file, or the name of a shipped one; "
+    "without it, import table lists the shipped ones.",
 )
 @click.option(
     "--origin",
     type=PLACE,
     metavar="LATITUDE,LONGITUDE[,HEIGHT]",
-    help="For ROS and tables: the origin of the plane that positions are in, in deg and m.",
+    help="For ROS and tables: the origin, in deg and m, of the local tangent plane of positions.",
 )
 @click.option(
     "--guess",
     is_flag=True,
-    help="For tables: write a mapping to start from to -o FILE.toml instead; with -o FILE.mcap import "
-    "by it at once, and write it beside the log.",
+    help="For tables: write a first mapping to -o FILE.toml instead of importing; with -o FILE.mcap, "
+    "import "
+    "with it and write it next to the log.",
 )
 @set_option("recorder")
 def import_(
@@ -126,26 +128,28 @@ def import_(
     guess: bool,
     settings: tuple[str, ...],
 ) -> None:
-    """Import real data of kind SOURCE from PATH, as published, and write their log.
+    """Import real data of format SOURCE from PATH, and write them as a log.
 
-    Tables (SOURCE table) may be several files and folders, which become one log.
+    For tables (SOURCE table), PATH may be several files and folders; they become one log.
     """
     from fuselog.pipeline.output.outputs import check_files, imported
 
     if guess:
         if source != "table":
-            raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
+            raise BadInput(
+                f"--guess works only for tables, not for {source}; use: fuselog import table PATH"
+            )
         if out is None or out.suffix != ".mcap":
             place = out or Path("mapping.toml")
             with _guessed(paths, place):
                 pass
             again = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(place)])
-            click.echo(printable(f"{place}: read it, then: {again}"))
+            click.echo(printable(f"{place}: check this mapping, then run: {again}"))
             return
         check_files([(out, imported(source))], {"data": paths})
         place = out.with_suffix(".toml")
         with _guessed(paths, place) as new:
-            click.echo(printable(f"{place}: what was guessed and is imported by; read it"))
+            click.echo(printable(f"{place}: the guessed mapping that is used for this import; check it"))
             chosen = {"mapping": str(new), "origin": origin}
             _import(source, paths, out, chosen, settings, stated={"mapping": str(place)})
         return
@@ -162,7 +166,7 @@ def _import(
     *,
     stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write their log, which states its parameters with those that are `stated`."""
+    """Import data and write their log; the log states `stated` in place of the parameters used."""
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
@@ -171,7 +175,7 @@ def _import(
     from fuselog.replay.engine.streams.sources import LogSource
 
     if len(paths) > 1 and source != "table":
-        raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
+        raise BadInput(f"{paths[1]}: {source} data are one file or folder; give only one path")
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": paths})
     more = [str(path) for path in paths[1:]]
@@ -188,9 +192,9 @@ def _import(
 
 @contextmanager
 def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
-    """Write a mapping of tables to start from, and say what it assumes.
+    """Write a first mapping of tables, and print what it assumes.
 
-    Yields where it lies until all went well; only then is it in its place.
+    Yields the temporary path of the mapping; it is moved to its final place only if all goes well.
     """
     from fuselog.pipeline.output.outputs import MAPPING, check_files
     from fuselog.recorders.atomic import whole_file
@@ -206,7 +210,7 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
 
 def say_written(path: Path, messages: int) -> None:
-    """Print what was written: the log, its messages and its size; then what to do with it."""
+    """Print what was written (the log, its messages and its size), then a command to run next."""
     from fuselog.pipeline.output.terminal import say, say_next
 
     say(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")

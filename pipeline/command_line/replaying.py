@@ -1,4 +1,4 @@
-"""Has the commands that replay estimators over logs: for estimates, parameters, or a check."""
+"""The commands that replay estimators over logs: for estimates, parameters, or a check."""
 
 from pathlib import Path
 from typing import Any
@@ -36,13 +36,15 @@ validate_option = click.option(
     "held_out",
     multiple=True,
     type=ANY_PATH,
-    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
+    help="A log or folder of logs to validate the values on; they are not used in the search "
+    "(repeatable).",
 )
 folds_option = click.option(
     "--folds",
     type=COUNT,
     default=0,
-    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
+    help="Cross-validate: divide the logs into N parts, and validate on each the values found from the "
+    "others.",
 )
 
 
@@ -58,14 +60,14 @@ folds_option = click.option(
     "-o",
     "--out",
     type=LOG_OR_FOLDER,
-    help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
+    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log].",
 )
 @model_option
 @click.option(
     "--every",
     "every_s",
     type=Seconds(0),
-    help="Give estimates every so many seconds, not only at measurements.",
+    help="Also output estimates at this interval in seconds, not only at measurements.",
 )
 @arrival_option
 @late_option
@@ -75,7 +77,7 @@ folds_option = click.option(
     "origins",
     multiple=True,
     metavar="truth|ESTIMATES",
-    help="What filters start with at --start: the log's truth, or the estimates log of an earlier "
+    help="The initial state of filters at --start: the log's truth, or the estimates log of an earlier "
     "replay (one per log).",
 )
 @click.option(
@@ -99,9 +101,9 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
 
     LOGS are logs or folders of logs. The exit code is 1 if an estimator failed in every run.
-    --set gate_probability=1 sets a parameter of all estimators that have it, --set
-    ekf.gate_probability=1 of one. --set /fix.delay_s=0.3 alters the topic /fix as it is read, here as in
-    run, tune, diagnose and compare; --set /fix=? says what can be set.
+    --set gate_probability=1 sets a parameter of all estimators that have it, and
+    --set ekf.gate_probability=1 a parameter of one. --set /fix.delay_s=0.3 changes the topic /fix as it
+    is read, also in run, tune, diagnose and compare; --set /fix=? lists what can be set.
     """
     from fuselog.pipeline.command_line.commands import replay_logs
 
@@ -117,16 +119,16 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @click.argument("log", type=ANY_PATH)
 @estimator_option("names", "An estimator, or two (repeatable).", many=True, required=True)
 @model_option
-@click.option("--no-browser", is_flag=True, help="Print the page's address, and open nothing.")
+@click.option("--no-browser", is_flag=True, help="Print the page's address and do not open a browser.")
 @recover_option
 @gap_option
 @settings_option
 @set_option("estimators")
 def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
-    """Serve a page on which LOG is replayed while parameters are dragged.
+    """Serve a page that replays LOG while you drag parameters.
 
     The page is served to this machine only, at an address that cannot be guessed. The command ends when
-    the page is closed, or by Ctrl-C.
+    the page is closed, or with Ctrl-C.
     """
     from fuselog.pipeline.exploring.command import explore_log
 
@@ -144,7 +146,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @click.option(
     "--by",
     type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
-    help="What to optimise: the likelihood, NIS or NEES (nearest to their expectation), or RMSE. "
+    help="What to optimise: the likelihood, NIS or NEES (closest to their expectation), or RMSE. "
     "[default: likelihood; rmse for an estimator without innovations]",
 )
 @click.option(
@@ -152,7 +154,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     "bounds",
     multiple=True,
     metavar="NAME=LOW:HIGH",
-    help="The bounds of a parameter (repeatable) [default: 1e-4 to 1e4 times its start].",
+    help="The bounds of a parameter (repeatable) [default: 1e-4 to 1e4 times the start value].",
 )
 @click.option(
     "--grid",
@@ -170,12 +172,12 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @scheduler_option
 @replay_options
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
-    """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
+    """Estimate the parameters of an estimator that explain LOGS best, with 95 % intervals.
 
-    LOGS are logs or folders of logs, and --validate takes either, one at a time: --validate test.
-    The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
-    but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
-    folder is for --settings of fuselog replay and run.
+    LOGS are logs or folders of logs; --validate takes one log or folder each time: --validate test.
+    The search starts from --set NAME=VALUE, or from what the log's channels state. Truth is needed only
+    for --by nees and --by rmse. Ctrl-C ends the search with the best values so far. Use settings.toml
+    from the result folder with --settings of fuselog replay and run.
     """
     from fuselog.pipeline.tuning.command import tune_logs
 
@@ -190,10 +192,13 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("label", "The estimator.", required=True)
 @click.option(
-    "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
+    "--fixed", multiple=True, help="A calibration parameter to leave as it is set (repeatable)."
 )
 @click.option(
-    "--next", "next_motion", is_flag=True, help="Say which manoeuvre of a wheeled robot to record next."
+    "--next",
+    "next_motion",
+    is_flag=True,
+    help="Recommend the next manoeuvre of a wheeled robot to record.",
 )
 @click.option(
     "--bound",
@@ -212,11 +217,11 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @scheduler_option
 @replay_options
 def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
-    """Search the scales, biases, mounting angles, lever arms and delays that explain LOGS best.
+    """Estimate the scales, biases, mounting angles, lever arms and delays that explain LOGS best.
 
-    The model says which parameters these are; --set NAME=VALUE is where one starts. What the motion in
-    the logs does not determine is named, stays where it started, and has no interval. settings.toml in
-    the result folder is for --settings of fuselog replay and run.
+    The model defines these parameters; --set NAME=VALUE sets a start value. A parameter that the motion
+    in the logs does not determine is named, keeps its start value, and has no interval. Use
+    settings.toml from the result folder with --settings of fuselog replay and run.
     """
     from fuselog.pipeline.calibrating.command import calibrate_logs
 
@@ -224,7 +229,7 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
 
 
 @command(
-    "Check that estimates are still those of a golden file.",
+    "Check that estimates still match a golden file.",
     "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
     "fuselog check run.mcap --against ekf.golden.xz",
     "fuselog check run.mcap --against ekf.golden.xz -e lib:./robot_ekf.so",
@@ -234,8 +239,8 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
 @estimator_option(
     "labels",
-    "With --update: an estimator of the golden (repeatable). Without: a program to check in the "
-    "place of the golden's estimator, as lib:./robot_ekf.so.",
+    "With --update: an estimator of the golden (repeatable). Without: a program to check in "
+    "place of the golden's estimator, for example lib:./robot_ekf.so.",
     many=True,
 )
 @arrival_option
@@ -245,28 +250,26 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     "columns",
     multiple=True,
     metavar="PATTERN",
-    help="With --update: keep these of all 'TOPIC COLUMN' (repeatable) [default: all].",
+    help="With --update: keep only columns that match, as 'TOPIC COLUMN' (repeatable) [default: all].",
 )
 @click.option(
     "--tolerance",
     "tolerances",
     multiple=True,
     metavar="PATTERN=RELATIVE",
-    help="With --update: how far apart, relative to its size, such a 'TOPIC COLUMN' may be (repeatable) "
-    "[default: 1e-12, 1e-6 on another CPU].",
+    help="With --update: the largest relative difference of columns that match, as 'TOPIC COLUMN' "
+    "(repeatable) [default: 1e-12, 1e-6 on another CPU].",
 )
-@click.option(
-    "--junit", type=JUNIT, help="Write the results for continuous integration, as JUnit's XML."
-)
+@click.option("--junit", type=JUNIT, help="Write the results as JUnit XML, for continuous integration.")
 @json_option
 @settings_option
 @set_option("estimators")
 def check(path: Path, golden: Path, **options: Any) -> None:
     """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
 
-    It exits with 1 where something is different, and prints the first difference with its stamp. An
-    intended change updates the golden in the same commit. A filter that fuselog deploy wrote is checked
-    with -e lib:PATH, and has to be made of the golden's filter.
+    The exit code is 1 if anything differs; the first difference is printed with its stamp. For an
+    intended change, update the golden in the same commit. To check a filter written by fuselog deploy,
+    use -e lib:PATH; it must be made from the golden's filter.
     """
     from fuselog.pipeline.checking.command import check_path
     from fuselog.pipeline.deploying.deploying import in_place_of_golden
@@ -281,24 +284,24 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     "fuselog deploy run.mcap -e ekf --settings tuned.toml --single -o robot_ekf",
 )
 @click.argument("log", type=ANY_PATH)
-@estimator_option("name", "The filter: ekf, or ukf.", required=True)
+@estimator_option("name", "The filter: ekf or ukf.", required=True)
 @model_option
 @click.option(
     "-o",
     "--out",
     required=True,
     type=RESULT,
-    help="The folder to write, new or empty; its name is the filter's in C.",
+    help="The folder to write, new or empty; its name becomes the filter's name in C.",
 )
-@click.option("--single", is_flag=True, help="In single precision, float.")
+@click.option("--single", is_flag=True, help="Use single precision (float).")
 @json_option
 @settings_option
 @set_option("estimators")
 def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:
-    """Write a filter as C99, with what stands in LOG: its sensors, what its channels state, a test.
+    """Write a filter as C99 from LOG, including its sensors, the values its channels state, and a test.
 
-    The C does what the filter does, operation by operation, so that its estimates are the same to the
-    last bit; README.md in the folder says how to build it, to test it and to replay it.
+    The C code performs the same operations in the same order, so its estimates are identical to the last
+    bit; README.md in the folder explains how to build, test and replay it.
     """
     from fuselog.pipeline.deploying.command import deploy_filter
 

@@ -138,7 +138,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "relabel log.mcap --component x=y -o new.mcap": ("no component 'x'", "x_m"),
     "relabel log.mcap --component x_m=y_m -o new.mcap": ("would have two components y_m",),
     "relabel log.mcap --component x_m=a,b -o new.mcap": ("x_m=a,b", "without a comma"),
-    "relabel log.mcap --component x_m=a --component x_m=b -o new.mcap": ("x_m=b", "every name once"),
+    "relabel log.mcap --component x_m=a --component x_m=b -o new.mcap": ("x_m=b", "each name only once"),
     # parameters of all levels: names, types, bounds
     "record landmarks --set duration_s": ("--set duration_s", "key=value"),
     "record landmarks --set =1": ("--set =1", "key=value"),
@@ -299,7 +299,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "evaluate garbled.toml --truth line.tum": ("garbled.toml", "line 1 is not a pose", "12 numbers"),
     "evaluate line.tum --truth line.tum --truth-format kitti": ("line 1 has 8 columns", "kitti"),
     "evaluate line.tum line.tum --truth line.tum": ("line.tum", "one trajectory", "at a time"),
-    "evaluate line.tum --truth line.tum --log log.mcap": ("--log", "--truth is for trajectory files"),
+    "evaluate line.tum --truth line.tum --log log.mcap": ("--log", "--truth applies to trajectory files"),
     "evaluate line.tum --truth line.tum --align se3": (
         "line.tum",
         "not in one line",

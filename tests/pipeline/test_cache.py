@@ -92,8 +92,8 @@ def test_what_cannot_be_compiled_ahead_is_one_sentence(place: Path, fuselog: Cal
         (["--warm", "robot:ekff"], "no method 'ekff'; did you mean 'ekf'?"),
         (["--warm", "robot:smoother:ekff"], "'ekff' is not a filter"),
         (["--warm", "robot:analytic"], "the model lacks exact moments"),
-        (["robot"], "give --warm"),
-        (["--warm", "--clear"], "give one of the two"),
+        (["robot"], "add --warm"),
+        (["--warm", "--clear"], "use one option, then the other"),
     ):
         told = fuselog("cache", *arguments)
         assert (told.code, said in told.err) == (2, True), told.err

@@ -52,7 +52,7 @@ def imported(car: Car, folder: Path, fuselog: Callable[..., Any]) -> Path:
     dump(car, folder / "drive.csv")
     said = fuselog("import", "table", folder / "drive.csv", "--guess", "-o", log)
     assert said.code == 0, said.err
-    assert f"{folder / 'drive.toml'}: what was guessed" in said.out
+    assert f"{folder / 'drive.toml'}: the guessed mapping" in said.out
     return log
 
 

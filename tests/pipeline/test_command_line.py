@@ -789,7 +789,7 @@ def test_the_run_that_a_result_shows_is_saved(world: Path, fuselog: Fuselog) -> 
     refused = fuselog("view", str(result), "--save", "shown.rrd", "--start", "1")
     assert (refused.code, "--start, --end, --focus and --connect need a log" in refused.err) == (2, True)
     refused = fuselog("view", str(result), "--save", "shown.rrd", "--at", "worst")
-    assert (refused.code, "--at worst: places the cursor of the viewer" in refused.err) == (2, True)
+    assert (refused.code, "--at worst: sets the time cursor of the viewer" in refused.err) == (2, True)
 
 
 @pytest.mark.usefixtures("here")

@@ -476,10 +476,10 @@ def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
     ("arguments", "sentence"),
     [
         (["drive-1.mcap"], "name the estimators to replay it with, such as -e ekf"),
-        (["drive-1.mcap", "landmarks", "-e", "ekf"], "give logs alone"),
-        (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give logs alone"),
+        (["drive-1.mcap", "landmarks", "-e", "ekf"], "give only logs and -e"),
+        (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give only logs and -e"),
         (["drive-9.mcap", "-e", "ekf"], "no log has the name drive-9.mcap"),
-        (["landmarks", "-e", "ekf"], "one experiment runs at a time"),
+        (["landmarks", "-e", "ekf"], "give one experiment at a time"),
         (["drives.toml", "--data", "nowhere"], "no log has the name nowhere"),
         (["drives.toml", "--runs", "3"], "as many runs as there are"),
         (["drive-1.mcap", "-e", "ekf", "--set", "ekf.gate=1"], "no parameter 'gate'"),

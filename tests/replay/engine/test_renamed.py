@@ -15,7 +15,7 @@ def nothing(*_: Any) -> None:
 
 
 def test_a_public_name_is_found_by_its_old_one() -> None:
-    with pytest.warns(FutureWarning, match="fuselog.Told is called fuselog.Diagnostics now"):
+    with pytest.warns(FutureWarning, match="fuselog.Told was renamed to fuselog.Diagnostics"):
         assert fl.Told is fl.Diagnostics
 
 
