@@ -1,4 +1,4 @@
-"""Diagnoses why an estimator is inconsistent, by the faults without which it would not be.
+"""Diagnosis of inconsistent estimators by the faults without which they would be consistent.
 
 Begin with `diagnosis`; `hypotheses` has the faults.
 """

@@ -1,4 +1,4 @@
-"""Describes what to try after a diagnosis: a setting that undoes a fault."""
+"""Advice after a diagnosis: settings that correct a fault."""
 
 import json
 from collections.abc import Mapping
@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 
 class Advice(NamedTuple):
-    """Describes what undoes a fault.
+    """Settings that correct a fault.
 
     Attributes:
-        key: of the setting, a parameter or `/TOPIC.WHAT`.
-        value: of the setting.
-        free: the parameter that may be tuned instead.
-        otherwise: what may be done instead, in words.
-        more: what is set beside it, by its key.
-        is_moved: whether the value is metres along several axes, to which those that are set are added.
+        key: the setting to change, a parameter or `/TOPIC.WHAT`.
+        value: its new value.
+        free: the parameter that can be tuned instead.
+        otherwise: what else can be done, in words.
+        more: further settings that belong to it, with their keys.
+        is_moved: whether the value is metres along several axes, which are added to those already set.
     """
 
     key: str
@@ -28,7 +28,7 @@ class Advice(NamedTuple):
 
     @classmethod
     def of(cls, setting: str) -> "Advice":
-        """Return a setting as `--set` takes it."""
+        """Parse a setting as `--set` takes it."""
         key, _, text = setting.partition("=")
         try:
             return cls(key, float(text))
@@ -37,23 +37,23 @@ class Advice(NamedTuple):
 
     @property
     def settings(self) -> dict[str, float | str]:
-        """Return what is set, by its key."""
+        """Return all settings by key."""
         return {self.key: self.value, **dict(self.more)}
 
     @property
     def setting(self) -> str:
-        """Return the settings as `--set` takes them, one or several."""
+        """Return the settings as `--set` takes them, separated by blanks."""
         return " ".join(f"{key}={value}" for key, value in self.settings.items())
 
 
 @dataclass(frozen=True)
 class Trying:
-    """Describes how advice is followed.
+    """The context in which advice is followed.
 
     Attributes:
-        label: the estimator's; in a command, what names it there.
-        applied: how the log is altered already.
-        is_own: whether no command can name the estimator, as one of a Python program.
+        label: the label of the estimator, or what names it in a command.
+        applied: the alterations that the log already has.
+        is_own: whether no command can name the estimator because a Python program defines it.
         gate: the probability of the gate that is set.
     """
 
@@ -63,11 +63,11 @@ class Trying:
     gate: float = 1.0
 
     def is_set(self, advice: Advice) -> bool:
-        """Tell whether the advice is a gate, and one as narrow is set already."""
+        """Test whether the advice is a gate and a gate at least as narrow is already set."""
         return advice.key == "gate_probability" and self.gate <= float(advice.value)
 
     def over(self, advice: Advice) -> Advice:
-        """Return the advice as the total to set: with what is set already, which it would replace."""
+        """Combine the advice with the value already set, which it would replace."""
         before, now = self.applied.get(advice.key), advice.value
         if advice.is_moved and before is not None:
             both = zip_longest(
@@ -80,7 +80,7 @@ class Trying:
         return advice._replace(value=precise(before * now if is_factor else before + now))
 
     def words(self, advice: Advice) -> str:
-        """Return what to type."""
+        """Return the text to type."""
         if self.is_own:
             line = f"set={json.dumps(advice.settings)}"
             tuning = f'fl.tune(LOG, {{"{self.label}": ...}}, "{advice.free}")'
@@ -94,17 +94,17 @@ class Trying:
 
 
 def rounded(value: float) -> float:
-    """Return a number in three digits, as a setting states it."""
+    """Round a number to three digits, as for parameters."""
     return float(f"{value:.3g}")
 
 
 def precise(value: float) -> float:
-    """Return a number in four digits, as a setting of a topic states it."""
+    """Round a number to four digits, as for settings of topics."""
     return float(f"{value:.4g}")
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Write a number in so many digits, without an exponent where it is read without.
+    """Format a number with `digits` digits, without an exponent if it is readable without one.
 
     >>> number(1912.3), number(-0.25), number(2.4e12)
     ('1,910', '-0.25', '2.4e+12')

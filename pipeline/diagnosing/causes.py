@@ -1,4 +1,4 @@
-"""Finds the likeliest causes of an inconsistent filter: the hypotheses that gain most, in turn."""
+"""Search for the most likely causes of an inconsistent filter: the hypotheses with the largest gains."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -30,30 +30,35 @@ from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.intervals import Interval
 
-FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
-RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
-CLEARLY = 0.5  # more gained: what a log hardly tells apart is named by the likelier, and never in turns
-SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
-GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
-SPREADS = 4.0  # standard deviations of what a control's noise gains, beyond which it explains nothing
-CONTENDS = 0.5  # of what the likeliest gains: with more faults undone it may be likelier
-HIDDEN = 0.3  # of the least gain: what gains as much may gain enough if other causes are fitted again
-LEADING = 10  # of the likeliest faults: each is tried beside all that gain less
+FALSE_ALARMS = 0.01  # share of logs without a fault in which a cause may be found nevertheless
+# difference in gain to the most likely cause below which a rival is also named: odds of 20 to 1
+RIVAL = 3.0
+# difference in gain from which a likelier name replaces a nearly equal one; avoids endless swaps
+CLEARLY = 0.5
+# relative differences of a delay and its gain between "early" and "late" names of one fault
+SAME_SIZE, SAME_GAIN = 0.1, 0.8
+GROSS = float(np.log(20.0))  # a noise stated this many times too small indicates another fault
+SPREADS = 4.0  # standard deviations of the gain by control noise that a cause has to exceed
+# share of the largest gain from which a fault stays a contender while other faults are corrected
+CONTENDS = 0.5
+# share of the least gain from which a fault is tried together with a new fit of the other causes
+HIDDEN = 0.3
+LEADING = 10  # number of the most likely faults that are tried with all faults of smaller gain
 
 Named = tuple[Peak, Hypothesis]
-Names = list[Named]  # of one cause: what a log does not tell from it
+Names = list[Named]  # the names of one cause, which the log does not distinguish
 
 
 class Cause(NamedTuple):
-    """Holds a hypothesis with the number that gains most.
+    """A hypothesis with the number that gains most.
 
     Attributes:
-        hypothesis: what may be wrong.
-        value: by how much.
-        ends: of the 95 % interval of that.
-        gain: in log-likelihood, after all causes before it.
-        others: causes that explain the log as well, or nearly: it does not tell which of them it is.
-        of_halves: what either half of the measurements gains, where all other causes are undone.
+        hypothesis: the assumed fault.
+        value: its size.
+        ends: the ends of the 95 % interval of that size.
+        gain: the gain in log-likelihood after all causes before it.
+        others: causes that explain the log equally well, or nearly so, and are not distinguished.
+        of_halves: the gain over each half of the measurements, with all other causes corrected.
     """
 
     hypothesis: Hypothesis
@@ -65,12 +70,12 @@ class Cause(NamedTuple):
 
     @property
     def has_ends(self) -> bool:
-        """Tell whether the log bounds the number on both sides, as far as a fit says."""
+        """Test whether the interval of the number is bounded on both sides, as far as a fit shows."""
         return not np.isinf(self.ends).any()
 
     @property
     def statement(self) -> str:
-        """Return what is wrong, and by how much; without an interval if the fit did not converge."""
+        """Return the fault and its size; without an interval if the fit did not converge."""
         words = self.hypothesis.words(self.value, *self.ends)
         if not np.isnan(self.ends).any():
             return words
@@ -79,7 +84,7 @@ class Cause(NamedTuple):
 
     @property
     def numbers(self) -> list[Interval]:
-        """Return the numbers as they are reported, by component: factors, not their logarithms."""
+        """Return the numbers as reported, by component; factors rather than their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Interval(self.value, low, high, name=of.part).rising(of.reported)]
@@ -89,7 +94,7 @@ class Cause(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return what is wrong, by how much, and what that is known by."""
+        """Return the fault, its size, the alternatives and the gain."""
         or_else = "".join(
             f"; this log does not determine it: as likely, {each.statement}"
             if each.hypothesis is self.hypothesis
@@ -104,42 +109,42 @@ class Cause(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """Holds a hypothesis that was tried on the log as it is, and the greatest gain that was found."""
+    """A hypothesis that was tried on the unaltered log, and its largest gain."""
 
     hypothesis: Hypothesis
     at: Peak
 
     @property
     def row(self) -> tuple[str, str, str, str, float]:
-        """Return its kind, topic and part, the number or numbers that gain most, and that gain."""
+        """Return its kind, topic, part, the number or numbers with the largest gain, and that gain."""
         of, at = self.hypothesis, self.at.value
         values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
 
 
 def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
-    """Return a row per hypothesis, the one that gains most first, less what its numbers cost."""
+    """Tabulate hypotheses in descending order of gain minus the cost of their numbers."""
     ranked = sorted(tried, key=lambda each: -each.at.score(each.hypothesis))
     names = ("kind", "topic", "part", "value", "gain")
     return pd.DataFrame([each.row for each in ranked], columns=names)
 
 
 def least_gain(count: int, size: int = 1) -> float:
-    """Return what the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
+    """Compute the gain that the best of `count` hypotheses exceeds by chance in FALSE_ALARMS of logs.
 
-    Twice the gain is chi-square with as many degrees of freedom as there are numbers (Wilks), shared
-    among them (Bonferroni).
+    Twice the gain is chi-square distributed with one degree of freedom per number (Wilks); the
+    probability is divided by `count` (Bonferroni).
     """
     return float(chi2.isf(FALSE_ALARMS / max(count, 1), size)) / 2.0
 
 
 class Found(NamedTuple):
-    """Holds a cause that is being fitted.
+    """A cause during the search.
 
     Attributes:
-        names: what the log does not tell apart, each with its number; the first is undone.
-        over: the trial over which the names gain what they do, while the cause is the only one.
-        contenders: what gained nearly as much, while other causes were not undone yet.
+        names: faults that the log does not distinguish, with their numbers; the first one is corrected.
+        over: the trial from which the gains of the names count, while the cause is the only one.
+        contenders: faults that gained nearly as much before other causes were corrected.
     """
 
     names: Names
@@ -148,18 +153,18 @@ class Found(NamedTuple):
 
     @property
     def supposed(self) -> Supposed:
-        """Return the likeliest name."""
+        """Return the most likely name."""
         at, of = self.names[0]
         return Supposed(of, at.value)
 
 
 class Look(NamedTuple):
-    """Holds what the faults that are tried gain beside the causes that are found.
+    """The gains of the faults that are tried in addition to the causes found.
 
     Attributes:
         found: the causes.
-        now: the log without them.
-        ranked: every fault that may follow, with its greatest gain.
+        now: the log with these causes corrected.
+        ranked: every fault that may follow, with its largest gain.
     """
 
     found: Sequence[Found]
@@ -175,12 +180,12 @@ class Look(NamedTuple):
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
-    """Find at most `most` causes, the likeliest first; what each hypothesis gains; and one in doubt.
+    """Find at most `most` causes, the gain of each hypothesis, and a cause in doubt.
 
-    Each cause gains most after all before it are undone: most in log-likelihood less what its numbers
-    cost. Several are fitted together. What the hypotheses gain is of the log as it is. In doubt is what
-    gains most after all causes, or more than the last, where the parts of the log disagree about its
-    number.
+    Each cause has the largest gain after all causes before it are corrected, where gain is
+    log-likelihood minus the cost of the numbers. Several causes are fitted together. The gains of
+    hypotheses are those on the unaltered log. A cause is in doubt if it gains most after all causes, or
+    more than the last one, but the parts of the log disagree about its number.
     """
     search = _Search(likelihood, base, most, len(tried))
     peaks = search.peaks(base, tried)
@@ -193,13 +198,13 @@ def find_causes(
 
 @dataclass(frozen=True)
 class _Search:
-    """Looks for causes one after the other, and fits those that are found together.
+    """A search that finds causes one after the other and fits them together.
 
     Attributes:
-        likelihood: of trials.
-        base: the log as it is, and the settings.
-        most: how many causes at most.
-        count: how many hypotheses there are.
+        likelihood: computes the log-likelihoods of trials.
+        base: the unaltered log, and the settings.
+        most: the largest number of causes.
+        count: the number of hypotheses.
     """
 
     likelihood: Likelihood
@@ -208,11 +213,11 @@ class _Search:
     count: int
 
     def peaks(self, now: Trial, candidates: Sequence[Hypothesis], least: float = 0.0) -> list[Peak]:
-        """Find the greatest gain of each over a trial, less well if all gain less than `least`."""
+        """Find the largest gain of each candidate, roughly if all gain less than `least`."""
         return _peaks(gains_over(self.likelihood, now), candidates, self.count, least)
 
     def without(self, found: Sequence[Found]) -> Trial:
-        """Return the log without causes."""
+        """Correct the causes in the log."""
         return undone(self.base, [each.supposed for each in found])
 
     def more(
@@ -223,14 +228,14 @@ class _Search:
         *,
         target: float = -np.inf,
     ) -> tuple[list[Found], list[Named]]:
-        """Add causes to those that are found until none is sure; and say what is in doubt after them.
+        """Add causes to those found until none is certain, and return what is in doubt after them.
 
-        `peaks` are what the hypotheses gain over those that are found. With a `target`, the search ends
-        if as many causes as may be named would not come to that log-likelihood. Without one it also
-        looks for causes that gain enough only together with a new fit of the others.
+        `peaks` are the gains of the hypotheses over the causes found. With a `target`, the search ends
+        if the allowed number of causes cannot reach that log-likelihood. Without one, it also searches
+        for causes that gain enough only after a new fit of the others.
         """
         found, doubtful, tried = list(found), list[Named](), list(tried)
-        for _ in range(2 * self.most):  # a cause may go again
+        for _ in range(2 * self.most):  # a cause may be removed again
             look = self._look(tried, peaks, found, target)
             if look is None:
                 break
@@ -258,7 +263,7 @@ class _Search:
         found: Sequence[Found],
         target: float,
     ) -> Look | None:
-        """Find what hypotheses gain beside those that are found; None if no cause can follow."""
+        """Compute the gains of hypotheses over the causes found; None if no cause can follow."""
         named = {id(of) for each in found for _, of in each.names}
         candidates = [each for each in tried if id(each) not in named]
         if not candidates or len(found) >= self.most:
@@ -270,22 +275,22 @@ class _Search:
         return look if self._reaches(look, lacking) else None
 
     def _reaches(self, look: Look, gain: float) -> bool:
-        """Tell whether as many causes as may be named in all would gain so much, each by itself.
+        """Test whether the allowed number of causes could gain this much, judging by single gains.
 
-        Those that are found are among them: they gain more if they are fitted again beside others.
+        The causes found count among them: they gain more if they are fitted again with others.
         """
         best = max((at.score(of) for at, of in look.physical), default=0.0)
         return best * self.most >= gain
 
     def _is_gross(self, look: Look, noises: Sequence[Named]) -> bool:
-        """Tell whether two gross faults may look like a noise or outliers, so that pairs are tried."""
+        """Test whether two gross faults may look like noise or outliers: pairs are tried then."""
         if any(of.kind in NOISES and at.value > GROSS for at, of in noises):
             return True
         outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
         return self._reaches(look, outliers)
 
     def _beside_gross(self, look: Look, alike: Names, noises: Names) -> tuple[Look, Names, Names]:
-        """Undo one of two gross faults, if they gain more than a noise; the other is likeliest then."""
+        """Correct one of two gross faults that gain more than a noise, and find the other."""
         gross = _companion(self.likelihood, look.now, look.ranked)
         if gross is None:
             return look, alike, noises
@@ -294,9 +299,10 @@ class _Search:
         return beside, _likeliest(self.likelihood, now, beside.ranked, self.count)[0] or alike, []
 
     def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
-        """Leave out a noise if the others, exchanged for faults of their kinds, explain as much.
+        """Remove a noise if the other causes, replaced by faults of their kinds, explain as much.
 
-        Positions that are too large, which look as precise as they are large, may be speeds too small.
+        For example, positions that are too large and look equally imprecise may be speeds that are too
+        small.
         """
         for noise in found:
             rest = [self._widened(each, tried) for each in found if each is not noise]
@@ -308,18 +314,18 @@ class _Search:
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
-        """Let all faults of a cause's kind contend with it as well."""
+        """Add all faults of a cause's kind to its contenders."""
         kind = found.supposed.of.kind
         alike = [of for of in tried if of.kind == kind and _is_physical(of)]
         return found._replace(contenders=[*found.contenders, *alike])
 
     def _score(self, found: Sequence[Found]) -> float:
-        """Compute the log-likelihood of the log without causes, less what their numbers cost."""
+        """Compute the log-likelihood of the corrected log minus the cost of the numbers."""
         [explained] = self.likelihood([self.without(found)])
         return explained - NUMBER_COST * sum(len(each.supposed.numbers) for each in found)
 
     def _with(self, look: Look, alike: Names) -> list[Found]:
-        """Add the likeliest cause, and fit it together with the others."""
+        """Add the most likely cause and fit it together with the others."""
         (at, of), *_ = alike
         contenders = [
             other
@@ -330,9 +336,9 @@ class _Search:
         return self._together([*look.found, Found([*rivals, *alike[1:]], look.now, contenders)])
 
     def _without_noise(self, look: Look, noises: Sequence[Named]) -> list[Found]:
-        """Find causes that explain as much as a noise or outliers do; none if there are none.
+        """Find causes that explain as much as a noise or outliers; an empty list if there are none.
 
-        What is left out of a model looks like noise that is stated too small, and large parts of it like
+        What a model leaves out looks like noise stated too small, and large parts of it look like
         outliers.
         """
         if not noises:
@@ -343,13 +349,14 @@ class _Search:
         instead, _ = self.more(faults, peaks, look.found, target=before + noise)
         if self._score(instead) < self._score(look.found) + noise:
             return []
-        # with the others undone, a noise or a fault of the same kind may explain more than a cause does
+        # with the others corrected, a noise or a fault of the same kind may explain more than a cause
+        # does
         own = [of for _, of in noises]
         wide = [self._widened(each, faults) for each in instead]
         return self._together([each._replace(contenders=[*each.contenders, *own]) for each in wide])
 
     def _hidden(self, look: Look) -> list[Found]:
-        """Add a cause that gains enough only if those that are found are fitted again beside it."""
+        """Add a cause that gains enough only if the causes found are fitted again together with it."""
         if not look.found:
             return []
         known = [each.names[0] for each in look.found]
@@ -373,7 +380,7 @@ class _Search:
         return []
 
     def _together(self, found: Sequence[Found]) -> list[Found]:
-        """Fit causes together: what the others make superfluous goes, what explains more is taken."""
+        """Fit causes together, remove superfluous ones, and adopt contenders that explain more."""
         if len(found) < 2:
             return list(found)
         fitted = fit(self.likelihood, self.base, [each.supposed for each in found])
@@ -390,7 +397,7 @@ class _Search:
         return found
 
     def _needed(self, found: list[Found], fitted: Fit) -> list[Found]:
-        """Leave out a cause that the others make superfluous, or whose number is no estimate."""
+        """Remove a cause that the others make superfluous, or whose number is not an estimate."""
         if False in fitted.are_estimates:
             place = fitted.are_estimates.index(False)
             return [*found[:place], *found[place + 1 :]]
@@ -403,9 +410,9 @@ class _Search:
         return rest if fitted.log_likelihood - of_rest.log_likelihood < enough else found
 
     def _likelier(self, found: Sequence[Found], place: int, log_likelihood: float) -> Found:
-        """Exchange a cause for a contender if that explains more when all are fitted again.
+        """Replace a cause by a contender that explains more when all causes are fitted again.
 
-        `log_likelihood` is that of the log without those that are found.
+        `log_likelihood` is that of the log with all causes corrected.
         """
         each, before, after = found[place], found[:place], found[place + 1 :]
         others = [*before, *after]
@@ -439,18 +446,17 @@ class _Search:
         return each._replace(names=[near[0], *rivals, *different])
 
     def _nearest(self, now: Trial, faults: Sequence[Hypothesis]) -> Names:
-        """Return the fault that gains most over a trial, and what the log does not tell from it."""
         ranked = zip(self.peaks(now, faults), faults, strict=True)
         return _alike(sorted(ranked, key=lambda pair: -pair[0].score(pair[1])))
 
     def _alone(self, found: Found) -> Found:
-        """Return a cause with what it gains if it is the only one."""
+        """Fit a cause as the only one."""
         known = [(Peak(0.0, 0.0), of) for of in found.contenders]
         faults = _faults([*found.names, *known])
         return Found(self._nearest(self.base, faults), self.base, faults)
 
     def causes(self, found: Sequence[Found]) -> list[Cause]:
-        """Return the causes with gains and intervals; what has no end of its interval is not named."""
+        """Compute gains and intervals of the causes; a cause without a bounded interval is not named."""
         causes = self._estimated(found)
         ended = [each for each, cause in zip(found, causes, strict=True) if cause.has_ends]
         if len(ended) < len(found):
@@ -461,7 +467,7 @@ class _Search:
         ]
 
     def _estimated(self, found: Sequence[Found]) -> list[Cause]:
-        """Compute gains and intervals of causes: of several by fits of all of them."""
+        """Compute gains and intervals of the causes, from joint fits if there are several."""
         if len(found) < 2:
             alone = [_causes(gains_over(self.likelihood, each.over), each.names) for each in found]
             return [first._replace(others=tuple(others)) for first, *others in alone]
@@ -482,14 +488,14 @@ class _Search:
 
 
 def _faults(names: Names) -> list[Hypothesis]:
-    """Return the faults that names are of, each once."""
+    """List the faults among names, each once."""
     return list({id(of): of for _, of in names}.values())
 
 
 def _alike(ranked: Sequence[Named]) -> Names:
-    """Return the likeliest, and those that a log does not tell from it; the usual names first.
+    """Select the most likely name and those that the log does not distinguish; usual names come first.
 
-    Before all others is a delay that is set and too large.
+    A delay that is set too large comes before all others.
     """
     least = ranked[0][0].score(ranked[0][1]) - RIVAL
     near = [
@@ -499,18 +505,18 @@ def _alike(ranked: Sequence[Named]) -> Names:
 
 
 def _is_physical(of: Hypothesis) -> bool:
-    """Tell whether it is a fault of what is measured, and no noise."""
+    """Test whether it is a fault of a measured quantity, not noise or outliers."""
     return of.kind not in NOISES and of.kind != "outliers"
 
 
 def _likeliest(
     likelihood: Likelihood, now: Trial, pairs: Names, count: int
 ) -> tuple[Names, list[Named]]:
-    """Find the hypothesis that gains most, not by chance, and those the log does not tell from it.
+    """Find the hypothesis with the largest gain beyond chance, its alternatives, and those in doubt.
 
-    And those in doubt. How much the parts of a log disagree is the log's: what they disagree about in
-    what gains more holds of what gains less as well. Burnham and Anderson, Model Selection and
-    Multimodel Inference, 2nd ed. 2002, section 2.5, divide all by one factor too.
+    The disagreement between parts of the log is a property of the log: if parts disagree about a larger
+    gain, the smaller gains are reduced as well. Burnham and Anderson, Model Selection and Multimodel
+    Inference, 2nd ed. 2002, section 2.5, also divide all by one factor.
     """
     gains_of, inflation_of = gains_over(likelihood, now), inflation_over(likelihood, now)
     noise_gain_of = noise_gain_over(likelihood, now)
@@ -544,15 +550,15 @@ def _likeliest(
 
 
 def _takes_all(at: Peak, of: Hypothesis) -> bool:
-    """Tell whether it explains part of any fault: a noise that is stated too small, or outliers."""
+    """Test whether it explains a part of any fault: a noise stated too small, or outliers."""
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
 def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | None:
-    """Find one of two gross faults which gain more together than any noise does; None without.
+    """Find one of two gross faults that together gain more than any noise; None if there are none.
 
-    Of two gross faults none may gain by itself what it is worth. So the likeliest are tried with all
-    others, and special numbers, such as the factors of units, with one another.
+    One of two gross faults may gain less alone than it is worth. The most likely faults are therefore
+    tried with all others, and special numbers, such as factors of units, with each other.
     """
     supposed, most = list[Supposed](), 0.0
     for at, of in ranked:
@@ -578,9 +584,9 @@ def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | 
 
 
 def _is_other_name(pair: Named, first: Named) -> bool:
-    """Tell whether a topic is late by as much as the likeliest cause has another early, or reversely.
+    """Test whether a delay is as large as the opposite delay of another topic in the likeliest cause.
 
-    These are one fault but for what is at the ends of the log.
+    Except at the ends of the log, both are the same fault.
     """
     (at, of), (best, early) = pair, first
     if of.kind != early.kind or of.topic == early.topic or not (_is_early(first) or _takes_back(pair)):
@@ -589,20 +595,20 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 
 
 def _is_early(pair: Named) -> bool:
-    """Tell whether it is the less usual name of a fault: one topic is late, or all others are early."""
+    """Test for the less usual name of a fault: all others are early in place of one topic late."""
     at, of = pair
     is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
     return is_of_stamps and of.already + at.value < 0.0
 
 
 def _takes_back(pair: Named) -> bool:
-    """Tell whether it takes back part of a delay that is set: the setting is too large."""
+    """Test whether it reduces a delay that is set: the setting is too large."""
     at, of = pair
     return of.already > 0.0 > at.value and not _is_early(pair)
 
 
 def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int, least: float) -> list[Peak]:
-    """Find the greatest gain of each; all are searched side by side."""
+    """Find the largest gain of each candidate; all are searched in parallel."""
     greatest = 0.0
 
     def noting(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
@@ -619,13 +625,13 @@ def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int, leas
 
 
 def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
-    """Tell whether chance does not explain the gain, and the number is a fault's."""
+    """Test whether the gain exceeds chance and the number is large enough for a fault."""
     is_small = isinstance(at.value, float) and abs(at.value) <= of.floor
     return at.gain > least_gain(count, of.size) and at.score(of) > 0.0 and not is_small
 
 
 def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
-    """Tell whether the number may as well be the last that is searched: its 95 % go on beyond."""
+    """Test whether the 95 % interval of the number extends beyond the range that is searched."""
     if not of.has_end or at.is_special:
         return False
     [last] = gains_of([(of, float(np.copysign(of.limit, at.value)))])
@@ -633,9 +639,9 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
 
 
 def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
-    """Put beside the number of a delay or angle another one, where chance explains the difference.
+    """Return the number of a delay or angle, with a rival number if chance explains the difference.
 
-    The likelier first; it alone, where chance does not.
+    The likelier number comes first.
     """
     at, of = pair
     may_come_again = of.limit == np.pi or of.kind == "delay"
@@ -649,8 +655,8 @@ def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
 
 
 def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
-    """Return the causes with the intervals of their numbers."""
-    asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others are, or are not
+    """Make causes with the intervals of their numbers."""
+    asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others have no number
     searches = []
     for at, _ in asking:
         # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
@@ -671,7 +677,7 @@ def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
 
 
 def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
-    """Compute the 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
+    """Compute the 95 % intervals of several numbers from the curvature of the gain at its maximum."""
     values, steps = np.array(at.value), np.array(of.tried[0])
 
     def cost(points: Floats) -> Floats:
@@ -684,7 +690,7 @@ def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Num
 
 
 def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -> list[Cause]:
-    """Return the causes with what either half of the log gains: a fault is in both."""
+    """Add to the causes their gains over each half of the log: a real fault is in both."""
     trials = [base] * (len(causes) + 1)
     for place, cause in enumerate(causes):
         trials = [
@@ -697,13 +703,13 @@ def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -
 
 
 class Sought(NamedTuple):
-    """Holds what the search for causes found.
+    """The result of the search for causes.
 
     Attributes:
-        causes: the likeliest first.
-        tried: every hypothesis, with what it gains of the log as it is.
-        in_doubt: what would be likeliest, but that the parts of the log disagree about its number.
-        log_likelihood: of the log as it is; NaN where its innovations have none, and nothing is tried.
+        causes: the causes, the most likely first.
+        tried: every hypothesis, with its gain on the unaltered log.
+        in_doubt: a cause that would be most likely, except that the parts of the log disagree about it.
+        log_likelihood: of the unaltered log; NaN if its innovations have none, and nothing is tried.
     """
 
     causes: Sequence[Cause] = ()
@@ -713,15 +719,15 @@ class Sought(NamedTuple):
 
 
 def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: int) -> Sought:
-    """Find the likeliest causes.
+    """Find the most likely causes.
 
     Args:
         source: the log.
-        label: the estimator's.
-        settings: its parameters with its `kind`; the gate is open.
-        most: how many causes at most.
+        label: the estimator's label.
+        settings: the estimator's parameters with its `kind`; the gate is open.
+        most: the largest number of causes.
 
-    Raises BadInput where the estimator cannot be replayed.
+    Raises BadInput if the estimator cannot be replayed.
     """
     likelihood, base = Likelihood(label), Trial(source, settings)
     seen = likelihood.begin(base)

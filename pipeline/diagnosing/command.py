@@ -1,4 +1,4 @@
-"""The command `fuselog diagnose`: it prints what is likely wrong, and what to try."""
+"""The command `fuselog diagnose`: it prints what is probably wrong, and what to try."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,7 +32,7 @@ def diagnose_log(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Diagnose, write what is asked for, and print sentences, components and metrics."""
+    """Diagnose, write the requested files, and print sentences, components and metrics."""
     log, *others = logs
     if others:
         raise BadInput(

@@ -1,4 +1,4 @@
-"""Tests whether NIS and NEES are those of a consistent filter, whatever the cause."""
+"""Tests of whether NIS and NEES are those of a consistent filter, whatever the cause."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -17,14 +17,16 @@ from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 from fuselog.replay.judging.metrics.measuring import metric_key
 
-SAME = 0.9  # of the messages: a truth that equals as many of what the filter used is the same
-SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
+# share of messages in which truth equals what the filter used, from which both are the same data
+SAME = 0.9
+SEEN = 1.5  # NIS per component up to which innovations show no error
 CHART_BINS = 60
-BIASED = 0.7  # of the root mean square of innovations, which their mean is where half is a bias
+# ratio of mean to root mean square of innovations, above which half of their power is a bias
+BIASED = 0.7
 
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
-    """Find errors that innovations do not see, which causes that were found may explain or not."""
+    """Yield errors that innovations do not show; causes that were found may explain them or not."""
     mend = "let a bias be estimated, or see fuselog observability LOG"
     if has_causes:
         mend = "mend what is said above, and look whether it is still so"
@@ -75,11 +77,10 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
 def unnamed(
     done: Replay, innovations: Mapping[str, Stream], tried: int, no_judges: Collection[str]
 ) -> Iterator[Finding]:
-    """Find NIS and NEES outside of where a consistent filter has them in CONSISTENT of all logs.
+    """Yield NIS and NEES outside the range that a consistent filter has in CONSISTENT of all logs.
 
-    NIS is of all innovations, those that a gate keeps out too; truths that are `no_judges` do not count.
-    Errors hang together over a run, so that
-    the mean of NEES has the interval of a single step.
+    NIS covers all innovations, including those that a gate rejects; truths in `no_judges` do not count.
+    Errors are correlated over a run, so that the mean of NEES has the interval of a single step.
     """
     faults = f"none of {tried} faults that were tried explains it" if tried else "no fault was tried"
     for topic, stream in innovations.items():
@@ -110,7 +111,7 @@ def unnamed(
 
 
 class _Seen(NamedTuple):
-    """A component whose innovations are not as large as their variances say, and what may mend it."""
+    """A component whose innovations do not have their stated variances, and what may correct it."""
 
     name: str
     nis: float
@@ -120,22 +121,22 @@ class _Seen(NamedTuple):
 
     @property
     def times(self) -> float:
-        """Return how many times larger, or smaller, they are."""
+        """Return by what factor they are larger, or smaller."""
         deviation = float(np.sqrt(self.nis))
         return 1.0 / deviation if self.is_small else deviation
 
     @property
     def is_small(self) -> bool:
-        """Tell whether they are smaller."""
+        """Test whether they are smaller."""
         return self.nis < self.low
 
 
 def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find what each sensor's innovations say of an estimator that cannot be replayed.
+    """Yield what each sensor's innovations show about an estimator that cannot be replayed.
 
-    Those that hang together in time are the motion's, or a delay's; others the sensor's own noise. Where
-    a channel states which of its estimator's parameters is that noise, it is named. Components of which
-    the same is true are one sentence.
+    Autocorrelated innovations point to the motion or a delay, others to the sensor's own noise. If a
+    channel states which parameter of its estimator is that noise, the parameter is named. Components
+    with the same finding share one sentence.
     """
     for topic, stream in innovations.items():
         case, alike = split_topic(topic)[1], dict[tuple[bool, str], list[_Seen]]()
@@ -160,7 +161,7 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _inconsistent(stream: Stream) -> Iterator[_Seen]:
-    """Yield the components whose mean square no consistent filter has."""
+    """Yield the components whose mean square is inconsistent."""
     stated = stream.metadata.get("noise", "")
     noise = f"its noise ({stated})" if stated else "its noise"
     for name, column in zip(stream.components, whitened(stream).T, strict=True):
@@ -204,9 +205,10 @@ def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> 
 
 
 def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dict[str, MetricValue]:
-    """Return metrics, with that of all measurements in place of likelihoods of those that a gate let in.
+    """Replace likelihoods of the measurements that a gate accepted by that of all measurements.
 
-    What a gate keeps out costs nothing, so that the likelihood of the rest is larger the more that is.
+    Measurements that a gate rejects cost nothing, so the likelihood of the others grows with their
+    number.
     """
     found = dict(metrics)
     for key in metrics:

@@ -1,6 +1,6 @@
-"""Diagnoses why an estimator is inconsistent: innovations, errors where there is truth, causes.
+"""Diagnosis of an inconsistent estimator: innovations, errors if there is truth, and causes.
 
-A fault is named by what the log-likelihood gains without it, not by how large it looks: a bearing whose
+A fault is named by the gain in log-likelihood without it, not by its apparent size: a bearing whose
 noise is stated too small makes the range's innovations too large as well.
 """
 
@@ -75,18 +75,18 @@ OPEN = {"gate_probability": 1.0}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
-    """Holds what a diagnosis found.
+    """The result of a diagnosis.
 
     Attributes:
-        label: the estimator's.
-        replay: the log replayed with it, as it is set.
-        sentences: what is wrong, at most five: faults of stamps, then causes, the likeliest first.
+        label: the estimator's label.
+        replay: the replay of the log with the estimator's settings.
+        sentences: at most five findings: faults of stamps, then causes, the most likely first.
         components: a row per measured component; see `component_table`.
-        tried: a row per fault that was tried on the log as it is, the one that gains most first: kind,
+        tried: a row per fault that was tried on the unaltered log, in descending order of gain: kind,
             topic, part, value, gain.
-        least_gain: what the least gains of those that are named.
-        notes: what one has to know of the diagnosis.
-        log_likelihood: of all measurements that causes were sought by, with an open gate; or NaN.
+        least_gain: the gain that a fault needs to be named.
+        notes: what one should know about the diagnosis.
+        log_likelihood: of all measurements used in the search for causes, with an open gate; or NaN.
     """
 
     label: str
@@ -103,12 +103,12 @@ class Diagnosis:
 
     @property
     def hypotheses(self) -> int:
-        """Count how many faults were tried."""
+        """Return the number of faults that were tried."""
         return len(self.tried)
 
     @property
     def told(self) -> list[str]:
-        """Return the sentences, numbered; or that nothing was found."""
+        """Return the numbered sentences, or a sentence that nothing was found."""
         if not self.sentences:
             why = (
                 f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
@@ -118,9 +118,9 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """Return a row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
+        """Return a row per sentence or number in it: kind, topic, part, interval, gain, setting.
 
-        What the log does not tell from a cause has the same number in the column `sentence_number`.
+        Alternatives that the log does not distinguish from a cause have its `sentence_number`.
         """
         rows = []
         for order, each in enumerate(self.sentences, start=1):
@@ -152,20 +152,20 @@ class Diagnosis:
 
     @cached_property
     def profiles(self) -> dict[str, Chart]:
-        """Draw NIS per component over time, by case."""
+        """Return charts of NIS per component over time, by case."""
         innovations = Outputs(self.replay, schemas.INNOVATION)
         return nis_charts(self.label, innovations, self.replay.logs[0].epoch_ns)
 
     @property
     def marks(self) -> dict[str, Stream]:
-        """Return the sentences as messages by topic, for the timeline: stamped where each one began."""
+        """Return the sentences as messages by topic for the timeline, at the stamps where they begin."""
         first_ns = self.replay.logs[0].extent("publish_time")[0]
         return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
     def view(self, save: str | Path) -> None:
-        """Write the timeline of the replay, the sentences among its events, to the .rrd file `save`.
+        """Write the replay's timeline, with the sentences among its events, to the .rrd file `save`.
 
-        Raises BadInput where the file cannot be written.
+        Raises BadInput if the file cannot be written.
         """
         check_files([(Path(save), TIMELINE)], {"log": self.replay.paths})
         self._draw(Path(save))
@@ -181,7 +181,7 @@ class Diagnosis:
     def save(self, folder: str | Path) -> ResultFolder:
         """Write sentences, tables, figures, metrics and a timeline to the result folder `folder`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder exists and is not a fuselog result.
         """
         place = Path(folder)
         check_folder(place, {"input": self.replay.paths})
@@ -204,7 +204,7 @@ class Diagnosis:
 
 
 def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outcome:
-    """Return the outcome with these tables and summary instead of its own; empty ones are left out."""
+    """Replace the tables of an outcome by these and a new summary, without empty ones."""
     found = {**tables, "summary": summary_table(outcome.metrics)}
     return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
 
@@ -217,24 +217,24 @@ def diagnose(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
 ) -> Diagnosis:
-    """Say why an estimator is inconsistent, or that nothing is wrong.
+    """Find out why an estimator is inconsistent, or that nothing is wrong.
 
-    Faults of the log and of the settings are undone one after the other, each by the number that gains
-    most in log-likelihood; of causes what gains most is named first,
-    see `sentences.ranked` for what stands before. A gate is open meanwhile.
+    Each possible fault of the log and of the settings is corrected in turn, with the number that gains
+    most in log-likelihood; the cause with the largest gain is named first (`sentences.ranked` has what
+    comes before causes). The gate is open meanwhile.
 
     Args:
-        log: a path, a log that was opened, or a recording; or an estimates log beside the log that it
-            is of.
-        estimator: a registered name, or a label of your own with what it stands for, see `replay`; of
+        log: a path, an opened log, or a recording; or an estimates log next to the log on which the
+            estimates were made.
+        estimator: a registered name, or a label of your own with what it stands for, see `replay`; for
             an estimates log one of its labels, by default its only one.
-        set: parameters of the estimator, and how topics are altered; see `replay`.
+        set: parameters of the estimator, and alterations of topics; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
     Returns:
         At most five sentences on what is wrong, and tables of the evidence.
 
-    Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
+    Raises BadInput if there are several logs, or if the estimator does not fit the log, fails, or gives
     no innovations.
 
     >>> from fuselog.pipeline.api.api import record
@@ -288,7 +288,7 @@ def diagnose(
             if each.where not in no_judges
         ),
     ]
-    if not sentences and all(each.kind == "gate" for each in findings):  # which names no cause
+    if not sentences and all(each.kind == "gate" for each in findings):  # a gate names no cause
         findings += unnamed(done, innovations, len(sought.tried), no_judges)
     sentences += findings
     return Diagnosis(
@@ -309,7 +309,7 @@ def diagnose(
 
 
 def _without_likelihood(label: str, settings: Mapping[str, Any], innovations: Outputs) -> str:
-    """Say why no fault is tried."""
+    """Explain why no fault is tried."""
     if innovations.state("log_likelihood") and any(
         np.isneginf(each["log_likelihood"]).any() for each in innovations.values()
     ):
@@ -327,9 +327,9 @@ def _of_recorded(
     settings: Mapping[str, Any],
     gap_limit_s: float,
 ) -> Diagnosis:
-    """Diagnose a filter that cannot be replayed, by an autopilot's innovations.
+    """Diagnose a filter that cannot be replayed from the innovations that it recorded.
 
-    Raises BadInput where there are several filters, settings of one, or no innovations.
+    Raises BadInput if there are several filters, settings for one, or no innovations.
     """
     label, *others = labels
     if others:
@@ -364,7 +364,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """Holds a log that an estimator can follow, how it did, what was mended first, and a note on it."""
+    """A log that an estimator can follow, its replay, the corrections made first, and notes on them."""
 
     source: LogSource | MemorySource
     done: Replay
@@ -375,9 +375,9 @@ class _Followed(NamedTuple):
 def _followed(
     source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], gap_limit_s: float
 ) -> _Followed:
-    """Replay a log; one that cannot be followed without what it says itself is wrong with it.
+    """Replay a log, after corrections that the log itself suggests if it cannot be followed otherwise.
 
-    Raises BadInput where it cannot be followed even so, with why it cannot as it is.
+    Raises BadInput if it cannot be followed even then, with the reason for the uncorrected log.
     """
 
     def replayed(source: LogSource | MemorySource) -> _Followed:
@@ -407,7 +407,7 @@ def _followed(
 def _asked(
     source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
-    """Return the log and the one estimator asked for; of estimates the log that they are of."""
+    """Return the log and the requested estimator; for an estimates log, the log it belongs to."""
     has_estimates = labels_of(source) and not recorded_estimators(source)
     if has_estimates and isinstance(source, LogSource):
         stated = stated_estimators(source.log)

@@ -1,6 +1,7 @@
-"""Finds what is unusual in innovations and estimates, and what the log says of itself.
+"""Unusual innovations and estimates, and findings in the log itself.
 
-Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
+Thresholds, listed here with their meaning, are far from what chance does to a log that follows its
+model.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -21,16 +22,16 @@ from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
-FIRST = ("lost messages", "gap", "stamps")  # what comes before causes: it is seen without any filter
+FIRST = ("lost messages", "gap", "stamps")  # findings that precede causes: they need no filter
 TAIL = 3.0  # standard deviations
-LOCKED_OUT = 20  # measurements in a row that a gate keeps out
-KEPT_OUT = 0.05  # of measurements that a gate keeps out, though they are no outliers
+LOCKED_OUT = 20  # measurements in a row that a gate rejects
+KEPT_OUT = 0.05  # share of measurements that a gate rejects although they are no outliers
 FEWEST = 20
-FLOOR = 0.1  # of the estimates whose variance is the least
-FLOOR_STEP = 1e-4  # relative, from the least variance to the next
+FLOOR = 0.1  # share of estimates with the smallest variance
+FLOOR_STEP = 1e-4  # relative step from the smallest variance to the next
 
 
-# What a parameter that is a factor of a topic corrects.
+# Findings that a factor of a topic corrects.
 FACTORS: tuple[Kind, ...] = ("unit", "scale", "sign", "gravity")
 
 
@@ -39,7 +40,7 @@ def of_log(
     streamed: Collection[str],
     corrected: Collection[tuple[Kind, str]] = (),
 ) -> list[Finding]:
-    """Find what the log says of an estimator's topics, except what its parameters have corrected."""
+    """List the log's findings on an estimator's topics, except those that its parameters correct."""
     return [
         each
         for each in lint_source(source)
@@ -48,12 +49,12 @@ def of_log(
 
 
 def is_told(found: Finding) -> bool:
-    """Tell whether what the log says is a sentence of a diagnosis; other hints are notes."""
+    """Test whether a finding is a sentence of a diagnosis; other hints are notes."""
     return found.severity != "hint" or found.kind in FIRST
 
 
 def corrected_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
-    """List what the estimator's parameters correct already: the delay or the factor of a topic."""
+    """List what the estimator's parameters already correct: the delay or the factor of a topic."""
     found = list[tuple[Kind, str]]()
     for each in bound:
         if not isinstance(each, Recursive) or each.reading is None or each.parameters is None:
@@ -73,11 +74,11 @@ def corrected_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
-    """Return a row per measured component.
+    """Compute a row per measured component.
 
-    Of the normalised innovations: how many there are, their mean with its 95 % interval, mean square,
-    the share beyond 3 standard deviations (0.27 % of a Gaussian), the excess kurtosis, the correlation
-    with the next, and how probable a larger Ljung-Box Q is if they are white.
+    The columns describe the normalised innovations: their number, mean with its 95 % interval, mean
+    square, the share beyond 3 standard deviations (0.27 % of a Gaussian), excess kurtosis, correlation
+    with the next one, and the probability of a larger Ljung-Box Q if they are white.
     """
     rows = []
     for topic, stream in innovations.items():
@@ -106,7 +107,7 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
 
 
 def _kurtosis(values: Floats) -> float:
-    """Compute that beyond a normal distribution's, of values that are not all one (n,)."""
+    """Compute the excess kurtosis of values (n,) that are not all equal."""
     deviations = values - values.mean()
     return float(np.mean(deviations**4) / np.mean(deviations**2) ** 2) - 3.0
 
@@ -119,9 +120,10 @@ def of_innovations(
     has_outliers: bool,
     in_stretches: bool = False,
 ) -> Iterator[Finding]:
-    """Yield what the gate (its probability, if it is ours) keeps out, and where a filter diverges.
+    """Yield findings on rejected measurements and on divergence of the filter.
 
-    Outliers that come in stretches are kept out for long, as they should be.
+    `gate` is its probability if the gate is fuselog's own. Outliers in stretches are rightly rejected
+    for long.
     """
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
@@ -161,7 +163,7 @@ def of_innovations(
 
 
 def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterator[Finding]:
-    """Yield where a filter diverges, and after what."""
+    """Yield the stamp at which a filter diverges, and the measurement before it."""
     found = find_divergence(stream)
     if found is None:
         return
@@ -182,13 +184,13 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
 
 
 def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
-    """Find where flags are set so many times in a row, and more: from and to."""
+    """Find runs of at least `least` set flags, as from and to."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 
 
 def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find variances that stop at a floor."""
+    """Yield variances that stop at a floor."""
     for topic, stream in estimates.items():
         if len(stream) < FEWEST or not stream.components:
             continue

@@ -1,7 +1,7 @@
-"""Fits the numbers of several faults together, by the search that `tune` and `calibrate` use.
+"""A joint fit of the numbers of several faults, with the search that `tune` and `calibrate` use.
 
-Each fault hides part of the others: numbers that are found one after the other, and their intervals, are
-those of a log in which the rest is still wrong.
+Each fault hides a part of the others: numbers found one after the other, and their intervals, are those
+of a log in which the other faults are still present.
 """
 
 from collections.abc import Sequence
@@ -28,57 +28,58 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
-TINY, OFF = 1e-6, 2e-3  # of a number: how far a jump is seen from, and how far a search begins from it
-NEAR = 1e-3  # of a number or its limit: how far off nothing may depend on it, or it may be at its limit
-TOLERANCE = 1e-7  # of the log-likelihood: a thousandth of what tells anything
+# relative to a number: offsets to detect a jump, and to begin a search away from it
+TINY, OFF = 1e-6, 2e-3
+NEAR = 1e-3  # relative to a number or its limit: offset for tests of no effect and of limits
+TOLERANCE = 1e-7  # of the log-likelihood: far less than anything significant
 
 
 class Supposed(NamedTuple):
-    """Holds a fault with its number."""
+    """A fault with its number."""
 
     of: Hypothesis
     value: Number
 
     def without(self, trial: Trial) -> Trial:
-        """Return the trial without the fault."""
+        """Correct the fault in a trial."""
         return self.of.without(trial, self.value)
 
     @property
     def is_special(self) -> bool:
-        """Tell whether the number is one that is tried as it is."""
+        """Test whether the number is one that is tried exactly."""
         return self.value in self.of.specials
 
     @property
     def numbers(self) -> list[float]:
-        """Return the numbers that are searched for; a fault that is so or is not has none."""
+        """Return the numbers to search for; a fault without a number has none."""
         if not self.of.tried:
             return []
         return list(self.value) if self.of.size > 1 else [self.value]
 
     def number(self, numbers: Sequence[float]) -> Number:
-        """Return numbers as the fault takes them; the value it has if none are searched for."""
+        """Convert numbers to the fault's form; returns its value if it has no numbers to search for."""
         if not self.of.tried:
             return self.value
         return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
 
 
 def undone(base: Trial, faults: Sequence[Supposed]) -> Trial:
-    """Return the trial without any of the faults."""
+    """Correct all faults in a trial."""
     return reduce(lambda trial, each: each.without(trial), faults, base)
 
 
 class Fit(NamedTuple):
-    """Holds the numbers with which faults together explain a log best.
+    """The numbers with which faults together explain a log best.
 
     Attributes:
-        faults: with these numbers.
+        faults: the faults with these numbers.
         log_likelihood: of the log without the faults.
-        losses: by fault, what the log-likelihood loses without it, all others refitted, as the curvature
-            has it; infinite if the fault has no number.
-        are_estimates: whether the numbers of a fault are estimates: not if the search ended at their
-            limit, or if nothing depends on them.
-        ends: by fault, the ends of the 95 % profile-likelihood intervals of its numbers. If the search
-            did not converge they are NaN.
+        losses: loss of log-likelihood without each fault, with all others refitted, by the curvature;
+            infinite for a fault without a number.
+        are_estimates: whether the numbers of a fault are estimates; they are not if the search ended at
+            their limit, or if they have no effect.
+        ends: ends of the 95 % profile-likelihood intervals of each fault's numbers; NaN if the search
+            did not converge.
     """
 
     faults: Sequence[Supposed]
@@ -91,12 +92,12 @@ class Fit(NamedTuple):
 def fit(
     likelihood: Likelihood, base: Trial, faults: Sequence[Supposed], *, has_ends: bool = False
 ) -> Fit:
-    """Search for the numbers of faults together, from those that they have.
+    """Search for the numbers of faults together, starting from those that they have.
 
     Args:
-        likelihood: of trials.
-        base: the log as it is, and the settings.
-        faults: with numbers near those that are searched for.
+        likelihood: computes the log-likelihoods of trials.
+        base: the unaltered log, and the settings.
+        faults: faults with numbers to begin from.
         has_ends: whether the ends of intervals are computed.
     """
     together = _Together(likelihood, base, faults)
@@ -108,7 +109,7 @@ def fit(
         point, has_converged = least(
             together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
         )
-    except BadInput:  # nothing depends on one of the numbers
+    except BadInput:  # one of the numbers has no effect
         [found] = likelihood([undone(base, faults)])
         is_free = ~(together.is_flat(start) | together.at_limits(start))
         are_estimates = [bool(is_free[own].all()) for own in together.places]
@@ -133,10 +134,10 @@ def fit(
 
 
 def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
-    """Compute what the last of several faults gains if all are fitted again, by the curvature.
+    """Estimate, from the curvature, the gain of the last of several faults if all are fitted again.
 
-    That is its gain beside the others as they are, and WIDE times that of one step of a search from
-    there: more is not hoped for. It is infinite if the log-likelihood does not bend downwards.
+    It is the fault's gain over the others as they are, plus WIDE times the gain of one step of a search
+    from there, a generous bound. It is infinite if the log-likelihood does not bend downwards.
     """
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
@@ -151,14 +152,14 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
 
 
 def _errors(at: Peak, of: Hypothesis) -> Floats:
-    """Return about the standard errors of the numbers (m,) of a fault that gains most."""
+    """Approximate the standard errors of the numbers (m,) of a fault at its largest gain."""
     if not of.tried or of.size > 1:
         return np.array(of.tried[0] if of.tried else (), float)
     return np.array([abs(at.value) / (2.0 * max(at.gain, 1.0)) ** 0.5])
 
 
 class _Together:
-    """Has the numbers of all faults in one vector (k,)."""
+    """The numbers of all faults as one vector (k,)."""
 
     def __init__(self, likelihood: Likelihood, base: Trial, faults: Sequence[Supposed]) -> None:
         self.likelihood, self.base, self.faults = likelihood, base, faults
@@ -188,20 +189,21 @@ class _Together:
         return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
 
     def is_flat(self, point: Floats) -> NDArray[np.bool_]:
-        """Tell of which numbers (k,) nothing depends near a point (k,)."""
+        """Test which numbers (k,) have no effect near a point (k,)."""
         apart = np.diag(np.maximum(np.abs(point), 1.0) * NEAR)
         here, *costs = self.cost(np.concatenate([point[None], point + apart, point - apart]))
         return np.all(np.reshape(costs, (2, -1)) == here, axis=0)
 
     def at_limits(self, point: Floats) -> NDArray[np.bool_]:
-        """Tell which numbers (k,) of a point (k,) are at the limit of what is searched."""
+        """Test which numbers (k,) of a point (k,) are at the limit of the search."""
         limits = np.array([each.high for each in self.free])
         return np.abs(point) >= (1.0 - NEAR) * limits
 
     def beside_jumps(self) -> Floats:
-        """Return the start (k,), a little off where the log-likelihood jumps.
+        """Return the start (k,), moved slightly if the log-likelihood jumps there.
 
-        A delay moves the first message or the last out of the log; slopes across a jump say nothing.
+        A delay moves the first or the last message out of the log; slopes across such a jump have no
+        meaning.
         """
         start = self.start.copy()
         apart = np.diag(TINY * start)
@@ -214,7 +216,7 @@ class _Together:
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
-    """Compute what is lost without numbers (m,) of a covariance (m, m); infinite without a number."""
+    """Compute the loss without numbers (m,) with a covariance (m, m); infinite without a number."""
     return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
 
 
@@ -225,7 +227,7 @@ def _at_specials(
     covariance: Floats,
     ends: tuple[Floats, Floats],
 ) -> Floats:
-    """Take special values, such as the factor of a unit, if they are within the intervals."""
+    """Adopt special values, such as the factor of a unit, that are within the intervals."""
     specials = dict[int, float]()
     for own, each in zip(together.places, together.faults, strict=True):
         for place in own[: each.of.size == 1]:

@@ -1,4 +1,4 @@
-"""Names the likeliest cause of each inconsistent estimator of a result, and what its mend does."""
+"""The most likely cause of each inconsistent estimator of a result, and the effect of correcting it."""
 
 import math
 from collections.abc import Mapping
@@ -18,14 +18,14 @@ from fuselog.replay.judging.verdicts import Consistency
 
 MENDED = "mended"
 STILL_WRONG = (
-    1.5  # times the aim of NEES or NIS: what is left of a fault when its likeliest cause is undone
+    1.5  # times the expected NEES or NIS: above this, the most likely cause is not the only one
 )
 
 
 def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
-    """Diagnose each estimator of a result that is inconsistent, over its first run.
+    """Diagnose each inconsistent estimator of a result over its first run.
 
-    Nothing of what has no log, no innovations or no cause that is found.
+    Estimators without a log, without innovations or without a cause are left out.
     """
     logs = _logs(folder, result)
     tables = {"runs": read_table(folder / RUNS)} if (folder / RUNS).is_file() else {}
@@ -40,7 +40,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
         gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))
         try:
             sentences = diagnose(logs[0], {label: own}, gap_limit_s=gap_limit_s).sentences
-        except BadInput:  # of an estimator without innovations nothing is known
+        except BadInput:  # nothing is known about an estimator without innovations
             continue
         if sentences:
             mended = _mended(logs, label, own, sentences[0], found.main)
@@ -66,7 +66,7 @@ def _cause(label: str, found: Finding, mended: str) -> Cause:
 
 
 def _mended(logs: list[Path], label: str, own: dict[str, Any], first: Finding, main: str) -> str:
-    """Say what the same runs give with the mend; nothing where it is no parameter."""
+    """Describe the metrics of the same runs with the correction; "" if it is not a parameter."""
     if not first.setting or first.setting.startswith("/"):
         return ""
     mend = merge(own, parse_settings([first.setting]))

@@ -1,14 +1,14 @@
-"""Computes what other settings, or a log without a fault, gain: the log-likelihood of replays.
+"""The log-likelihood of replays, to find the gain of other settings or of a log without a fault.
 
-All trials have the same measurements, and begin by the same rule. What a trial does not score, such
-as a fix that a delay moves out of the odometry's span, has the likelihood of a broad model: the next
-message is as far from the last as messages of its topic usually are.
+All trials have the same measurements, and begin by the same rule. Measurements that a trial does not
+score, such as a fix that a delay moves beyond the odometry's span, have the likelihood of a broad model:
+the distance between successive messages is what is usual for their topic.
 
-A measurement that the gate keeps out is an outlier: it may be anywhere in the volume that the
-innovations span, and is one with the share that they have. Without a gate there are none, and the
-log-likelihood is that of the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to
-Tracking and Navigation, 2001, section 5.4; Durbin and Koopman, Time Series Analysis by State Space
-Methods, 2nd ed. 2012, chapter 7.
+A measurement that the gate rejects is an outlier: it is uniform in the volume that the innovations span,
+and occurs with the observed share. Without a gate there are no outliers, and the log-likelihood is that
+of the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
+2001, section 5.4; Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012, chapter
+7.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -38,17 +38,17 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
-MOST_MESSAGES = 300_000  # of the runs that are replayed together
+MOST_MESSAGES = 300_000  # messages of the runs that are replayed together
 EVER_NS = 2**62
-ROOM_NS = 86_400 * 10**9  # before the first stamp
-LEAST_SCORED = 0.5  # of the measurements: a trial that scores fewer is of another log
+ROOM_NS = 86_400 * 10**9  # room for earlier stamps
+LEAST_SCORED = 0.5  # share of the measurements: a trial that scores fewer is not comparable
 
 
 class Trial(NamedTuple):
-    """Holds a run as it may be, and the estimator's settings as they may be.
+    """A possible run with possible settings of the estimator.
 
-    `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
-    measurement lies, compared with the log's: a density of numbers in other units is another one.
+    `stretched` is, by topic, the logarithm of the volume of measurements relative to the log's: other
+    units change the density of the numbers.
     """
 
     source: MemorySource
@@ -57,14 +57,14 @@ class Trial(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """Holds the part of a trial that a filter can score.
+    """The part of a trial that a filter can score.
 
     Attributes:
         source: its messages.
-        begin_ns: where the filter begins if no prior says so.
-        left: by estimate, what the broad model says of the others.
-        beyond: by estimate, how many these are.
-        stretch: by estimate, what is added since measurements are in other units than the log's.
+        begin_ns: the stamp at which the filter begins if there is no prior.
+        left: by estimate, the log-likelihood of all other messages under the broad model.
+        beyond: by estimate, the number of these messages.
+        stretch: by estimate, the correction for units that differ from the log's.
     """
 
     source: MemorySource
@@ -75,34 +75,33 @@ class Scored(NamedTuple):
 
 
 class _Known:
-    """Keeps what is found of streams, which trials that alter others have in common."""
+    """A cache of results on streams that several trials share."""
 
     def __init__(self) -> None:
         self._found: dict[Hashable, tuple[object, object]] = {}
 
     def once(self, streams: Sequence[Stream], key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return what `find` finds of these very streams, under a key."""
+        """Return the result of `find` for these very streams, cached under a key."""
         entry = (*map(id, streams), key)
         if entry not in self._found:
-            self._found[entry] = find(), streams  # which are kept, so that their ids stay theirs
+            self._found[entry] = find(), streams  # keeps the streams alive, so that their ids stay valid
         return cast(Found, self._found[entry][0])
 
 
 @dataclass
 class Likelihood:
-    """Computes the log-likelihood of trials that have the measurements of one run.
+    """The log-likelihood of trials that have the measurements of one run.
 
     Trials whose estimators differ only in numbers are replayed together, as the runs of an ensemble.
 
     Attributes:
-        label: the estimator's.
-        volumes: by topic, the extents (m,) of the innovations' components, of which outliers may lie
-            anywhere.
-        count: by estimate, how many innovations there are with those that the broad model has.
-        starts: where all trials begin, where neither the log states it nor broad starts are found.
-        readings: by estimate, what is read; those that are known.
-        broad: by topic, the mean log-likelihood of a message by the broad model.
-        later_ns: by how much all stamps are later, so that what is moved is never before 1970.
+        label: the estimator's label.
+        volumes: by topic, the ranges (m,) of innovations by component, in which outliers are uniform.
+        count: by estimate, the number of innovations, including those of the broad model.
+        starts: the common start of all trials, if neither the log nor broad starts give one.
+        readings: by estimate, what is read, if known.
+        broad: by topic, the mean log-likelihood of a message under the broad model.
+        later_ns: shift of all stamps, so that no alteration moves them to before 1970.
     """
 
     label: str
@@ -115,10 +114,10 @@ class Likelihood:
     _bound: dict[Hashable, list[Bound]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
-        """Take a trial for the one that others are compared with; its innovations by topic.
+        """Set the trial with which others are compared, and return its innovations by topic.
 
-        From the likeliest part of broad starts, where the log does not state one. Raises BadInput where
-        the estimator cannot begin.
+        They are those of the most likely part of broad starts if the log states no start. Raises
+        BadInput if the estimator cannot begin.
         """
         bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
@@ -149,19 +148,19 @@ class Likelihood:
         return found
 
     def __call__(self, trials: Sequence[Trial]) -> list[float]:
-        """Compute the log-likelihoods; minus infinity where a replay fails or loses measurements."""
+        """Compute the log-likelihoods; minus infinity if a replay fails or loses measurements."""
         return [float(each) for [each] in self.over_parts(trials, 1)]
 
     def over_parts(self, trials: Sequence[Trial], count: int) -> Floats:
         """Compute log-likelihoods (trials, count) of equal shares of the measurements, in order.
 
-        Minus infinity where the estimator fails or loses measurements.
+        They are minus infinity if the estimator fails or loses measurements.
         """
         together: dict[Hashable, list[int]] = {}
         bound: dict[int, list[Bound]] = {}
         for place, trial in enumerate(trials):
             stated, key = _stated_by(trial), _key(trial)
-            with suppress(BadInput):  # no run can be followed with these
+            with suppress(BadInput):  # these settings fit no run
                 bound[place] = self._bound_to(trial, (key, stated))
                 together.setdefault((_alike(bound[place]) or key, stated), []).append(place)
         found = np.full((len(trials), count), -np.inf)
@@ -175,11 +174,11 @@ class Likelihood:
         return found
 
     def disturbed(self, trial: Trial) -> list[MemorySource]:
-        """Return copies of a trial's log with noise added to what drives."""
+        """Copy a trial's log with noise added to the controls."""
         return disturbed(trial.source, self._bound_to(trial))
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
-        """Divide trials into portions that memory holds."""
+        """Divide trials into portions that fit in memory."""
         messages = sum(map(len, trials[places[0]].source.streams.values())) * part_count(self.starts)
         size = max(1, MOST_MESSAGES // max(messages, 1))
         return (places[first : first + size] for first in range(0, len(places), size))
@@ -191,9 +190,9 @@ class Likelihood:
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
-        """Choose what of a trial can be scored: in the span of what drives it, after its prior.
+        """Select the scored messages of a trial: within the span of its controls, after its prior.
 
-        `known` keeps what is found of streams that trials have in common.
+        `known` caches results on streams that several trials share.
         """
         given, streams = trial.source.streams, dict(trial.source.streams)
         left, count, stretch = dict[str, float](), dict[str, int](), dict[str, float]()
@@ -218,14 +217,14 @@ class Likelihood:
             topic: known.once([stream], self.later_ns, partial(_later, stream, self.later_ns))
             for topic, stream in streams.items()
         }
-        # raw: a trial that leaves out what is impossible after an alteration would gain by that
+        # raw: otherwise, a trial would gain by leaving out values that its alteration makes impossible
         source = replace(trial.source, streams=later, is_raw=True)
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
         self, bounds: Sequence[Sequence[Bound]], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
-        """Return the innovations of trials of alike estimators, by part and topic; none if it fails."""
+        """Replay trials of similar estimators: innovations by part and topic; none on failure."""
         count = part_count(self.starts)
         bound = [_together(each, count) for each in zip(*bounds, strict=True)]
         sources = [each.source for each in scored for _ in range(count)]
@@ -233,7 +232,7 @@ class Likelihood:
         try:
             begun = [begun_broadly(begun_at(each, self.starts), begins_ns, count) for each in bound]
             outputs = collect(replay(Ensemble(sources), begun, is_part=True))
-        except BadInput:  # no run can be followed with these
+        except BadInput:  # these settings fit no run
             outputs = {}
         if not outputs and any(each is not bounds[0] for each in bounds):
             alone = zip(bounds, scored, strict=True)
@@ -250,7 +249,7 @@ class Likelihood:
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
-        """Compute log-likelihoods of equal shares of the measurements, each given those before it."""
+        """Compute log-likelihoods of equal shares of the measurements, each given those before."""
         until = []
         for share in np.arange(1, count + 1) / count:
             found = [self._of_start(scored, part, share) for part in parts]
@@ -263,7 +262,7 @@ class Likelihood:
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float
     ) -> dict[str, float]:
-        """Compute the log-likelihood of a share of what is seen of each; nothing if much lacks."""
+        """Compute each estimate's log-likelihood of a share; {} if too few messages are scored."""
         found = {}
         for name, all_ in self.count.items():
             topic = _topic(name)
@@ -299,15 +298,16 @@ def _topic(name: str) -> str:
 
 
 def _name(topic: str) -> str:
-    """Return whose innovations a topic has; of a program these may be of several that it estimates."""
+    """Return what the innovations of a topic belong to; those of a program may belong to several."""
     return topic.removeprefix("/estimates/").removesuffix("/innovation")
 
 
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
-    """Find from where to where a filter can score measurements, and the step of what drives it.
+    """Find the span in which a filter can score measurements, and the step of its controls.
 
-    What is before by a step at most is scored at the begin, and what is after while the last control
-    holds, and once more as long: what a small delay moves over an end stays comparable.
+    Measurements up to a step before it are scored at its begin, and those after it while the last
+    control holds and for the same time again: messages that a small delay moves across an end stay
+    comparable.
     """
     begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
     for topic in controls:
@@ -324,7 +324,7 @@ def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) 
 
 
 def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
-    """Compute the mean log-likelihood of messages (n, m) as far from the last as is usual."""
+    """Compute the mean log-likelihood of messages (n, m) whose steps have their usual size."""
     steps = np.diff(numbers, axis=0)
     is_angle = np.array(kinds) == "angle"
     steps[:, is_angle] = np.remainder(steps[:, is_angle] + np.pi, 2.0 * np.pi) - np.pi
@@ -336,10 +336,10 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 
 
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
-    """Limit topics that a filter foresees better than it states to what it says of them itself.
+    """Limit the broad likelihood of topics that a filter predicts better than it states.
 
-    Of a body at rest the broad model knows more than a cautious filter; without this a delay would gain
-    by moving messages to where nothing is scored.
+    For a body at rest, the broad model is more precise than a conservative filter; without the limit, a
+    delay would gain by moving messages out of the scored span.
     """
     found = {}
     is_known = np.isfinite(innovations["innovation"])
@@ -353,9 +353,9 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Tell whether rows are of the first share of their sensor's, told by what is measured.
+    """Test whether rows are in the first share of their sensor's rows, by what they measure.
 
-    Of all rows it would be other measurements where a delay changes their order.
+    A share of all rows would have other measurements if a delay changes their order.
     """
     known = np.isfinite(innovations["innovation"])
     sensor = known @ 2.0 ** np.arange(known.shape[1])
@@ -367,7 +367,7 @@ def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
 
 
 def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
-    """Return the messages that can be scored in a span, see `_span`, none of them before it."""
+    """Return the messages that can be scored in a span, see `_span`, with none before its begin."""
     (begin_ns, end_ns, step_ns), stamps_ns = span_ns, stream.publish_time_ns
     is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
     if is_in.all() and stamps_ns.min() >= begin_ns:
@@ -381,12 +381,12 @@ def _later(stream: Stream, by_ns: int) -> Stream:
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:
-    """Compute the log-likelihood of a part, as its innovations state it."""
+    """Sum the log-likelihoods that the innovations of a part state."""
     return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
 def _stated_by(trial: Trial) -> Hashable:
-    """Return what channels state, which has to be equal of trials that are replayed together."""
+    """Return what channels state, which has to be equal for trials that are replayed together."""
     return tuple((topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items())
 
 
@@ -395,13 +395,13 @@ def _key(trial: Trial) -> str:
 
 
 def _alike(bound: Sequence[Bound]) -> Hashable:
-    """Return what has to be equal of estimators that are replayed together; None if nothing suffices."""
+    """Return what has to be equal for estimators to be replayed together; None if nothing suffices."""
     keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
     return tuple(keys) if len(keys) == len(bound) else None
 
 
 def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator of runs that stand there `count` times each, and each have their own."""
+    """Make one estimator for runs that repeat `count` times and each have their own numbers."""
     first = bounds[0]
     alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
     if all(each is first for each in bounds):
@@ -410,10 +410,10 @@ def _together(bounds: Sequence[Bound], count: int) -> Bound:
 
 
 def _extents(stream: Stream) -> Floats:
-    """Return how far the innovations (m,) of each component range; an angle may have any value."""
+    """Compute the ranges (m,) of innovations by component; that of an angle is a full turn."""
     kinds = stream.metadata["kinds"].split(",")
     known = np.where(np.isfinite(stream["innovation"]), stream["innovation"], np.nan)
-    highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # that of no number
+    highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # result for a component without numbers
     extents = highest - np.fmin.reduce(known, axis=0, initial=np.inf)
     extents = np.where(np.array(kinds) == "angle", 2.0 * np.pi, extents)
     return np.where(extents > 0.0, extents, 1.0)

@@ -1,4 +1,4 @@
-"""Chooses what is diagnosed: of a long log its first part, of an autopilot what it recorded itself."""
+"""The data that is diagnosed: the first part of a long log, or what an autopilot recorded."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,13 +20,13 @@ from fuselog.replay.engine.streams.blocks import Findings
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.metrics.measuring import find_metrics
 
-MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
+MOST_MESSAGES = 40_000  # messages of a log, from its first, in which causes are searched for
 
 
 class Outputs(Mapping[str, Stream]):
-    """Maps topics to the outputs of a replay that have a schema.
+    """A mapping from topics to the outputs of a replay that have a given schema.
 
-    Only the last topic is kept, since outputs of a long log take much memory.
+    Only the last topic is cached, because outputs of a long log take much memory.
     """
 
     def __init__(self, done: Replay, schema: Schema) -> None:
@@ -45,13 +45,13 @@ class Outputs(Mapping[str, Stream]):
         return len(self._topics)
 
     def state(self, column: str) -> bool:
-        """Tell whether all of them have a column."""
+        """Test whether all outputs have a column."""
         firsts = (next(iter(self._estimates.blocks([topic], "publish_time", 1))) for topic in self)
         return all(column in stream.columns for first in firsts for stream in first.values())
 
 
 def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str, Any]) -> BadInput:
-    """Return the sentence on an estimator that gives no innovations of a log of this name."""
+    """Return the error for an estimator that gives no innovations on a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
     mend = for_likelihood(settings) or "give a filter of the same model, such as -e ekf"
@@ -61,14 +61,14 @@ def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str,
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
-    """Return the estimates that a recording has of an estimator, as if a replay had made them."""
+    """Return an estimator's recorded estimates as if a replay had made them."""
     estimates = Renamed(source, label, label)
     judge = judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)
     return Replay([source], [estimates], {label: {}}, Pass(judge, {label: {}}), gap_limit_s)
 
 
 class Portion(NamedTuple):
-    """Holds what the estimator reads of a log, in memory, until `end_ns`; None stands for all of it."""
+    """What the estimator reads from a log, in memory, until `end_ns`; None stands for the whole log."""
 
     source: MemorySource
     end_ns: int | None
@@ -78,7 +78,7 @@ class Portion(NamedTuple):
 def first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> Portion:
-    """Return what the estimator reads of a log; of a long one its first MOST_MESSAGES."""
+    """Read what the estimator needs from a log; only the first MOST_MESSAGES of a long one."""
     whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
@@ -91,7 +91,7 @@ def first_part(
             break
     for topic, found in parts.items():
         streams[topic] = concatenate(found) if found else source.empty(topic)
-    for each in bound:  # by its name, which a setting may have; its errors are not looked at here
+    for each in bound:  # a setting may name the truth; its errors are not needed here
         if each.truth in source.topics:
             streams.setdefault(each.truth, source.empty(each.truth))
     end_ns, note = None, ""
@@ -116,14 +116,14 @@ def on_the_rest(
     advised: Mapping[str, Any],
     end_ns: int,
 ) -> str:
-    """Return what following an advice gains after a part of the log, as a sentence goes on.
+    """Compute the gain of following advice after a part of the log, as the end of a sentence.
 
     Args:
         source: the whole log.
-        label: the estimator's.
-        settings: its parameters, with an open gate.
-        advised: settings of topics and parameters.
-        end_ns: where the part ends in which the cause was found.
+        label: the estimator's label.
+        settings: the estimator's parameters, with an open gate.
+        advised: the advised settings of topics and parameters.
+        end_ns: the end of the part in which the cause was found.
     """
     of_topics, own = split_settings(advised)
     before, after = (

@@ -1,7 +1,7 @@
-"""Searches for the numbers by which faults gain most: all faults in turn, each by a few values a round.
+"""Search for the numbers at which faults gain most, over all faults in parallel.
 
-A search is a generator: it yields values, is sent what they gain, and returns its `Peak`. So one replay
-has the next values of all faults.
+A search is a generator: it yields values, receives their gains, and returns its `Peak`. One replay can
+thus compute the next values of all faults.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,19 +13,20 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.optimise import Search
 
 Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
-ROUNDS = 14  # of a refinement at most
-NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
-CLEAR = 0.05  # of the same, where a peak is of several numbers
-FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
-GRID = 49  # numbers, over all that are searched, among which another greatest gain is looked for
-WIDE = 4.0  # times what a parabola promises: more is not hoped for
-NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
+ROUNDS = 14  # of a refinement, at most
+NEAR = 1e-5  # accuracy of a peak in log-likelihood
+CLEAR = 0.05  # the same for a peak of several numbers
+# accuracy relative to the distance from the largest peak: a distant peak can be less accurate
+FAR = 0.02
+GRID = 49  # numbers over the whole range, among which another maximum is searched for
+WIDE = 4.0  # factor on the gain that a parabola predicts, a generous bound
+NUMBER_COST = 3.0  # cost in log-likelihood of each number that is found
 
 
 class Peak(NamedTuple):
-    """Holds the value at which the gain of a fault is greatest, and that gain.
+    """The value at which the gain of a fault is largest, and that gain.
 
-    `is_special` says that the value was not searched: it is one of the fault's special ones.
+    `is_special` tells that the value is one of the fault's special ones, which are not searched.
     """
 
     value: Number
@@ -33,7 +34,7 @@ class Peak(NamedTuple):
     is_special: bool = False
 
     def score(self, of: Hypothesis) -> float:
-        """Return the gain less what each number costs that is found."""
+        """Compute the gain minus the cost of each number that is found."""
         is_free = of.tried and not self.is_special
         return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
 
@@ -41,13 +42,13 @@ class Peak(NamedTuple):
 def peak(
     of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0.0
 ) -> Search[Number, Peak]:
-    """Search for the greatest gain of a fault.
+    """Search for the largest gain of a fault.
 
     Args:
-        of: the fault; it gains zero where its number is zero.
-        floor: a gain that is less than this is not worth a search.
-        greatest: the greatest gain that is known of any fault. Where none gains anything nearby, or by a
-            special value, nothing is looked for far away.
+        of: the fault; its gain is zero at the number zero.
+        floor: a gain below this is not worth a search.
+        greatest: returns the largest known gain of any fault. If there is none yet, and no gain nearby
+            or at a special value, distant values are not searched.
     """
     if of.size > 1:
         return (yield from _of_several(of, floor, greatest))
@@ -64,7 +65,7 @@ def peak(
         return Peak(0.0, 0.0)
     known.update(zip(far, (yield far), strict=True))
     if max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor:
-        return Peak(0.0, 0.0)  # a smooth function that is about greatest here
+        return Peak(0.0, 0.0)  # a smooth function with its maximum about here
     before = -np.inf
     for _ in range(ROUNDS):
         now = max(known.values())
@@ -80,7 +81,7 @@ def peak(
 
 
 def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
-    """Return the value of the greatest gain with its neighbours; None where it lacks one."""
+    """Return the value with the largest gain and its neighbours; None if one is missing."""
     values = sorted(known)
     place = max(range(len(values)), key=lambda place: known[values[place]])
     if place in (0, len(values) - 1):
@@ -89,7 +90,7 @@ def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
 
 
 def _vertex(known: Mapping[float, float], low: float, best: float, high: float) -> float | None:
-    """Find where the parabola through three values is greatest; None where a gain is infinite."""
+    """Find the maximum of the parabola through three values; None if a gain is infinite."""
     left, right = known[best] - known[low], known[best] - known[high]
     if not np.isfinite(left + right) or left + right <= 0.0:
         return None
@@ -99,7 +100,7 @@ def _vertex(known: Mapping[float, float], low: float, best: float, high: float) 
 
 
 def _promised(known: Mapping[float, float]) -> float:
-    """Compute by how much a parabola about the greatest gain is above it."""
+    """Compute how far the maximum of a parabola exceeds the largest gain."""
     around = _around(known)
     if around is None:
         return np.inf
@@ -108,14 +109,14 @@ def _promised(known: Mapping[float, float]) -> float:
     if at is None:
         return np.inf
     side = low if at < best else high
-    # the parabola with this vertex, through the best and the neighbour on the vertex's side
+    # the parabola with this vertex, through the best value and its neighbour on the vertex's side
     share = (at - best) / (side - best)
     drop = known[best] - known[side]
     return float(drop * share**2 / (1.0 - 2.0 * share)) if 2.0 * share < 1.0 else np.inf
 
 
 def _next(known: Mapping[float, float], limit: float) -> list[float]:
-    """Choose what values to look at next: about the greatest gain, or beyond where it is the last."""
+    """Choose the next values: around the largest gain, or beyond it if it is at the end."""
     around = _around(known)
     if around is None:
         best = max(known, key=lambda value: known[value])
@@ -135,17 +136,17 @@ def _next(known: Mapping[float, float], limit: float) -> list[float]:
 
 
 def _is_lopsided(low: float, best: float, high: float) -> bool:
-    """Tell whether a bracket is so uneven that a parabola says little."""
+    """Test whether a bracket is too uneven for a parabola."""
     return max(best - low, high - best) > 8.0 * min(best - low, high - best)
 
 
 def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
-    """Compute the greatest gain of the parabola through zero and both sides of it, or infinity."""
+    """Compute the maximum of the parabola through zero and the values on both sides, or infinity."""
     if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
         return np.inf
     low, high = sorted(sides)
     gains = np.array([known[low], known[high]])
-    if not gains.any():  # nothing depends on the number
+    if not gains.any():  # the number has no effect
         return 0.0
     if not np.isfinite(gains).all():
         return np.inf
@@ -154,10 +155,10 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
 
 
 def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search[Number, Peak]:
-    """Search for several numbers: by the paraboloid about the best, again and again.
+    """Search for several numbers with repeated paraboloids around the best values.
 
-    Where a filter diverges the gain is rough, and has no paraboloid: the best of the points that it is
-    told by is taken then, and smaller steps about that.
+    The gain of a diverging filter is rough and has no paraboloid: then the best evaluated point is
+    taken, and the steps around it get smaller.
     """
     size, steps = of.size, np.array(of.tried[0])
     at, gain = np.zeros(size), 0.0
@@ -182,7 +183,7 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
         best = int(np.argmax(gains))
         if found < gain + gains[best]:
             found, move, is_rough = gain + gains[best], np.subtract(asked[best], at), True
-        if found <= gain and is_rough:  # no parabola as wide as this
+        if found <= gain and is_rough:  # no parabola of this width
             steps, is_rough = 0.2 * steps, False
             continue
         if found <= gain:
@@ -199,9 +200,9 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
 
 
 def rival(of: Hypothesis, at: Peak, least: float) -> Search[Number, Peak | None]:
-    """Search for another number of a fault that gains at least so much; None where there is none.
+    """Search for another number of a fault that gains at least `least`; None if there is none.
 
-    It is another greatest gain, with a valley to the first: as of a delay on laps of equal length.
+    It is another local maximum, such as that of a delay on laps of equal length.
     """
     values = np.linspace(-of.limit, of.limit, GRID).tolist()
     known = dict(zip(values, (yield values), strict=True)) | {at.value: at.gain}

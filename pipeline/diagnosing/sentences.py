@@ -1,4 +1,4 @@
-"""Writes the sentences of a diagnosis in their order: causes, and what stands in the log by itself."""
+"""The sentences of a diagnosis in their order: causes, and findings in the log itself."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,24 +17,24 @@ from fuselog.recorders.log.impossible import Rejections
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.judging.errors.evaluation import split_topic
 
-# What explains the numbers themselves, and no noise or bias that would have to be large.
+# Kinds that explain the numbers themselves, in contrast to noise or biases that would have to be large.
 OF_FORM = (
     *("factor or sign", "exchanged axes", "convention", "parameter", "delay", "clock drift"),
     *("outliers", "exchanged numbers", "start"),
 )
-CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
+CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of faulty stamps
 
 MOST_SENTENCES = 5
-Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over the rest of a long log
+Rest = Callable[[Mapping[str, Any]], str]  # the gain of settings over the rest of a long log
 
 
-# Kinds of what the log says, that a cause says as well.
+# Kinds of log findings that a cause of another kind covers.
 ALIKE: Mapping[Kind, Kind] = {"mounting": "bias or turned frame", "covariance": "measurement noise"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CauseFinding(Finding):
-    """Represents a finding by likelihood: it is of the topic or parameter of its `cause`."""
+    """A finding by likelihood: it concerns the topic or parameter of its `cause`."""
 
     cause: Cause
 
@@ -45,12 +45,12 @@ class CauseFinding(Finding):
 
 
 def cause_of(found: Finding) -> Cause | None:
-    """Return the cause that a finding is by its likelihood, if it is one."""
+    """Return the cause of a finding by likelihood; None for other findings."""
     return found.cause if isinstance(found, CauseFinding) else None
 
 
 def names_of(found: Finding) -> list[tuple[Kind, str]]:
-    """Return what a finding names: a kind and a topic, and those that the log does not tell from it."""
+    """Return the kind and topic of a finding and of its alternatives."""
     cause = cause_of(found)
     others = [each.hypothesis for each in cause.others] if cause else []
     return [(found.kind, found.where), *((each.kind, each.topic) for each in others)]
@@ -59,10 +59,10 @@ def names_of(found: Finding) -> list[tuple[Kind, str]]:
 def ranked(
     causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
 ) -> list[Finding]:
-    """Order findings: stamps, causes, and what else is seen without any filter.
+    """Order findings: stamps, causes, and what else is found without a filter.
 
-    What has a setting that corrects it comes before causes that are only its consequence, such as noise.
-    What a cause names or advises is not said twice.
+    A finding with a setting that corrects it comes before causes that are only its consequence, such as
+    noise. Findings that a cause names or advises are not repeated.
     """
     mends = [cause.hypothesis.mend(cause.value) for cause in causes]
     advised = {key for mend in mends if mend is not None for key in mend.settings}
@@ -88,7 +88,7 @@ def ranked(
 
 
 def _is_advised(setting: str, advised: Collection[str]) -> bool:
-    """Tell whether a setting, or that of the whole vector that it is an entry of, is advised."""
+    """Test whether a setting, or that of the whole vector to which it belongs, is advised."""
     stem = setting.partition("=")[0].removesuffix("_scale")
     return any(stem.startswith(each.removesuffix("_scale")) for each in advised)
 
@@ -96,7 +96,7 @@ def _is_advised(setting: str, advised: Collection[str]) -> bool:
 def marks_of(
     sentences: Sequence[Finding], label: str, outputs: Sequence[str], first_ns: int
 ) -> dict[str, Stream]:
-    """Write sentences as messages by topic, for a timeline: at the stamp where each one began.
+    """Write sentences as messages by topic for a timeline, at the stamps where they begin.
 
     `outputs` are the topics of what was estimated, `first_ns` is the first stamp of the log.
     """
@@ -116,7 +116,7 @@ def marks_of(
 
 
 def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
-    """Return what a log says and no sentence does: hints, and what a cause names in other words."""
+    """List findings in the log that no sentence has: hints, and those that a cause names differently."""
     return [
         f"hint: {each.sentence}" if each.severity == "hint" else f"the log alone says: {each.evidence}"
         for each in of_log
@@ -125,7 +125,7 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 
 
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
-    """Say what has to be known of a diagnosis: what is in doubt, not judged, or not said."""
+    """List what one should know about a diagnosis: what is in doubt, not judged, or left out."""
     notes = [
         "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
         f"than chance: {each.words}"
@@ -151,9 +151,9 @@ def _finding(
     before: Sequence[Finding],
     rest: Rest | None,
 ) -> CauseFinding:
-    """Say a cause, what to try against it, and whether that is good for the rest of a long log.
+    """Describe a cause, what to try against it, and its effect on the rest of a long log.
 
-    `before` is what was found in the stamps, of which a cause may be a consequence.
+    `before` are findings on stamps, of which a cause may be a consequence.
     """
     of, words = cause.hypothesis, cause.words
     mend = of.mend(cause.value)

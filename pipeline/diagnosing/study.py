@@ -1,9 +1,9 @@
-"""Studies diagnosing: faults put into logs and settings, and how often a diagnosis names them.
+"""A study of diagnosing: faults are planted in logs and settings; it counts how often they are named.
 
-Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame; and it is
-only between two frames, or two clocks, that a turn or a drift is seen, so that either may be named. What
-removing a fault gains in log-likelihood says whether it can be seen at all: of ten faults in three
-scenarios some cannot, as a delay of the only sensor of a vehicle that nothing else moves.
+Faults that cannot be distinguished count as one kind: a bearing's bias and its sensor's rotated frame. A
+rotation or a drift is only visible between two frames or clocks, so that either may be named. The gain
+in log-likelihood from removing a fault shows whether it is visible at all: some of ten faults in three
+scenarios are not, such as a delay of the only sensor of a vehicle without controls.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -28,9 +28,9 @@ from fuselog.recorders.parameters import Parameters, merge
 from fuselog.recorders.recording import record_run
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
-WORTH = 10.0  # of log-likelihood: a fault whose removal gains less is not counted
-FIRST = 0.8  # of the faults that are counted, the least share to be named first
-SIZED = ("R", "Q", "delay")  # faults whose size has to lie in its interval
+WORTH = 10.0  # gain in log-likelihood: a fault that gains less when removed is not counted
+FIRST = 0.8  # share of the counted faults that should be named first
+SIZED = ("R", "Q", "delay")  # faults whose size has to be in its interval
 DEGREE = np.pi / 180.0
 QUANTITIES = (
     "worth",
@@ -47,13 +47,13 @@ CLEAN_RUN = "none"
 
 
 class Options(Parameters):
-    """States what is diagnosed beside the scenarios.
+    """Options of the study: the faults to plant, and the benchmark.
 
     Attributes:
         faults: the names of the faults to plant, such as `landmarks-bias`; `landmarks-none` is a log
-            without a fault. Without names all are planted.
-        battery_seed: the first seed of the battery, see `fuselog.pipeline.diagnosing.battery.battery`.
-        battery_runs: of each of its cells, and at most as many as of each fault; none unless given.
+            without a fault. By default all are planted.
+        battery_seed: first seed of the benchmark, see `fuselog.pipeline.diagnosing.battery.battery`.
+        battery_runs: runs of each of its cells, at most as many as of each fault; 0 by default.
     """
 
     faults: tuple[str, ...] = ()
@@ -62,15 +62,15 @@ class Options(Parameters):
 
 
 class Fault(NamedTuple):
-    """Describes a fault, and what a diagnosis should say.
+    """A fault, and what a diagnosis should report.
 
     Attributes:
-        kind, topic: what is named; any topic where that is empty.
-        value: of its number, which its 95 % interval should hold; None where there is none.
-        record: the recorder's parameters that make it.
-        settings: those of the estimator.
-        alteration: of `altered`, which is `topic` where that is not said, by `by`, or else by `value`.
-        exchanged: two topics whose messages stand for each other.
+        kind, topic: what is named; any topic if `topic` is empty.
+        value: its number, which the 95 % interval should cover; None for a fault without a number.
+        record: parameters of the recorder that cause it.
+        settings: settings of the estimator that cause it.
+        alteration: an alteration of `altered` (by default `topic`) by `by` (by default `value`).
+        exchanged: two topics whose messages are swapped.
     """
 
     kind: Kind | None = None
@@ -85,7 +85,7 @@ class Fault(NamedTuple):
 
 
 class Scenario(NamedTuple):
-    """States what is recorded, the estimator, and the faults by name."""
+    """A recorder with its parameters, the estimator, and the faults by name."""
 
     recorder: str
     parameters: Mapping[str, Any]
@@ -234,7 +234,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
-    """Return the scenario and the fault of each name, or all of them without names."""
+    """Return the scenario and the fault of each name; all of them without names."""
     known = {
         f"{name}-{fault}": (name, fault)
         for name, scenario in SCENARIOS.items()
@@ -248,14 +248,14 @@ def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
 
 
 def battery_seeds(options: Options, runs: int) -> range:
-    """Return the seeds of each cell of the battery, of which there are no more than of each fault."""
+    """Return the seeds of each cell of the benchmark, at most as many as runs of each fault."""
     return range(options.battery_seed, options.battery_seed + min(options.battery_runs, runs))
 
 
 def _recorded(
     scenario: Scenario, fault: Fault, seed: int, run: int
 ) -> tuple[MemorySource, MemorySource]:
-    """Record a run without a fault, and the same with it."""
+    """Record a run without a fault, and the same run with it."""
     parameters = merge(scenario.parameters, fault.record)
     source = memory_source(*record_run(scenario.recorder, scenario.parameters, seed, run))
     faulty = memory_source(*record_run(scenario.recorder, parameters, seed, run))
@@ -268,7 +268,7 @@ def _recorded(
 
 
 def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: MemorySource) -> float:
-    """Compute the log-likelihood that removing the fault gains; nothing with fewer measurements."""
+    """Compute the gain in log-likelihood from removing the fault; 0 if measurements are lost."""
     likelihood = Likelihood(scenario.estimator)
     settings = {"kind": scenario.estimator, **OPEN}
     likelihood.begin(Trial(faulty, merge(settings, fault.settings)))
@@ -277,7 +277,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
 
 
 def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
-    """Say what the diagnosis said, and whether it is right."""
+    """Summarise what the diagnosis reported, and whether it is right."""
     is_right = [
         any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in names_of(each))
         for each in found.sentences
@@ -300,7 +300,7 @@ def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Count over the runs those that are worth it, and how often the fault is named and covered."""
+    """Count the runs in which the fault matters, and how often it is named and its value covered."""
     counted = rows[rows["worth"] >= WORTH]
     return pd.Series(
         {
@@ -318,7 +318,7 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 
 def _overall(runs: pd.DataFrame) -> dict[str, float]:
-    """Count over all scenarios what a diagnosis has to do."""
+    """Compute the overall shares over all scenarios."""
     counted = runs[runs["worth"] >= WORTH]
     sized = counted[counted["fault"].isin(SIZED)].dropna(subset=["covers"])
     return {
@@ -331,7 +331,7 @@ def _overall(runs: pd.DataFrame) -> dict[str, float]:
 
 
 def _chart(faults: pd.DataFrame) -> Chart:
-    """Draw how often each fault that can be seen is named first."""
+    """Draw how often each visible fault is named first."""
     names = list(dict.fromkeys(faults["fault"]))
     panel = Panel(
         x=Axis(label="fault: " + ", ".join(f"{place} {name}" for place, name in enumerate(names))),

@@ -1,4 +1,4 @@
-"""Finds which parameters of an estimator explain logs best, and how well the logs tell them.
+"""Estimation of the parameters with which an estimator explains logs best, and of their accuracy.
 
 Begin with `tuning`.
 """

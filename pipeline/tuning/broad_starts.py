@@ -1,8 +1,8 @@
-"""Replays from broad starts, for likelihoods with other parameters, or of an altered log, to compare.
+"""Replays from broad starts, to compare likelihoods with other parameters or of altered logs.
 
-A log without a prior begins where its first messages say, and by how much they are trusted. So that all
-trials score the same measurements from the same start, they begin at the log's first stamp, in equally
-likely parts; the likelihood is the mean of those of the parts.
+Without a prior, a filter begins where the log's first messages put it, with a covariance that depends on
+the parameters. So that all trials score the same measurements from the same start, they begin at the
+log's first stamp, in equally likely parts; the likelihood is the mean of those of the parts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,11 +19,12 @@ from fuselog.replay.engine.streams.blocks import Ragged, gather, side_by_side
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource
 
-Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated; parts of one number
+# by the name of what is estimated; all have the same number of parts
+Starts = Mapping[str, Sequence[Initialized]]
 
 
 def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
-    """Find the equally likely starts of a run whose log does not state them; BadInput as `replay`."""
+    """Find equally likely starts for a log that does not state one; raises BadInput as `replay`."""
     stamps = [source.streams[topic].publish_time_ns[:1] for each in bound for topic in each.streams]
     first_ns = int(np.min(np.concatenate(stamps), initial=np.iinfo(np.int64).max))
     found: dict[str, list[Initialized]] = {}
@@ -47,12 +48,12 @@ def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
 
 
 def part_count(starts: Starts) -> int:
-    """Count the replays that a trial is."""
+    """Count the parts of a start, each of which is replayed."""
     return max(map(len, starts.values()), default=1)
 
 
 def begun_at(bound: Bound, starts: Starts) -> Bound:
-    """Make an estimator of runs that stand there once for each part, one part after another."""
+    """Make an estimator for runs that repeat the log for each part, one part after another."""
     parts = starts.get(bound.name)
     return bound if parts is None else with_find(bound, partial(_part_of_runs, parts))
 
@@ -67,10 +68,10 @@ def _part_of_runs(parts: Sequence[Initialized], first: Mapping[str, Ragged], *_:
 
 
 def begun_broadly(bound: Bound, begins_ns: Sequence[int], count: int) -> Bound:
-    """Make an estimator of trials that stand there `count` times each, once for each of their parts.
+    """Make an estimator for trials that are repeated `count` times each, once for each of their parts.
 
-    Each trial has starts of its own, by its own first messages: what is measured may be altered. The
-    stamps of the starts are `begins_ns`. An estimator that finds no broad starts stays as it is.
+    Each trial finds its own starts from its own first messages, because measurements may be altered. The
+    starts have the stamps `begins_ns`. An estimator that finds no broad starts stays as it is.
     """
     initialization = initialization_of(bound)
     if initialization is None or initialization.find_broad is None:
@@ -97,7 +98,7 @@ def _own_parts(
 
 
 def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
+    """Compute the log of the mean likelihood by estimated object; failed parts have likelihood zero."""
     found = {}
     for name in dict.fromkeys(name for part in parts for name in part):
         known = [part[name] for part in parts if not np.isnan(part.get(name, np.nan))]
@@ -106,12 +107,12 @@ def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def initialization_of(bound: Bound) -> Initialization | None:
-    """Return how an estimator finds its beginning, if it has to find one."""
+    """Return an estimator's search for its start, or None if it needs none."""
     return bound.initialization if isinstance(bound, Recursive) else None
 
 
 def with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
-    """Make an estimator that finds its beginning in another way, if it has to find one."""
+    """Replace how an estimator finds its start, if it has to find one."""
     if isinstance(bound, Recursive) and bound.initialization is not None:
         return replace(bound, initialization=replace(bound.initialization, find=find))
     return bound

@@ -1,4 +1,4 @@
-"""Prints and writes what `fuselog tune` finds, and what `calibrate` shares with it."""
+"""Output of `fuselog tune`, and functions that `calibrate` shares with it."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -40,9 +40,10 @@ def tune_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Say what is tuned on and what is held out, tune, write the result folder, print what was found.
+    """Tune on logs, write the result folder, and print which logs were used and what was found.
 
-    A `search` of one's own knows what is free and what is best, in place of `free`, `by` and `grid`.
+    A given `search` determines the free parameters and the criterion, in place of `free`, `by` and
+    `grid`.
     """
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
@@ -96,9 +97,9 @@ def tune_logs(
 
 
 def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Refuse or warn of logs that were likely meant to be held out, and would be tuned on.
+    """Refuse or warn about logs that were probably meant to be held out, but would be tuned on.
 
-    Of `--validate test/*.mcap` the shell makes many words, and the option takes only the first.
+    The shell expands `--validate test/*.mcap` to several words, and the option takes only the first.
     """
     folders = {path.resolve().parent for path in held_out}
     beside = [path for path in logs if path.resolve().parent in folders]
@@ -116,7 +117,7 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
 
 
 def progress_of(best: Best) -> str:
-    """Say how far a search is: its best values, if the estimator could be replayed with any."""
+    """Describe the progress of a search: the number of evaluations and the best values so far."""
     named = zip(best.names, best.point, strict=True)
     values = ", ".join(f"{name} {value:.4g}" for name, value in named)
     found = (
@@ -126,14 +127,14 @@ def progress_of(best: Best) -> str:
 
 
 def _in_words(logs: Sequence[Path]) -> str:
-    """Say how many logs, the first and the last."""
+    """Describe logs by their number, the first and the last."""
     if len(logs) > 1:
         return f"{len(logs)} logs, {logs[0]} to {logs[-1]}"
     return f"1 log, {logs[0]}" if logs else "none"
 
 
 def _bound(text: str) -> tuple[str, tuple[float, float]]:
-    """Read a parameter and its bounds, from NAME=LOW:HIGH."""
+    """Parse a parameter's bounds from NAME=LOW:HIGH."""
     name, _, ends = text.rpartition("=")
     low, _, high = ends.partition(":")
     try:

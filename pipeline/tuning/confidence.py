@@ -1,6 +1,7 @@
-"""Measures how well logs tell parameters: intervals, correlations, profiles, and what they cannot tell.
+"""Confidence in tuned parameters: intervals, correlations, profiles, and undetermined directions.
 
-All by the curvature of minus the log-likelihood at its least: its inverse is the parameters' covariance.
+All follow from the curvature of minus the log-likelihood at its minimum; its inverse is the parameters'
+covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,21 +15,21 @@ from fuselog.pipeline.tuning.search import UNIT, Coordinates
 from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
-LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
-INVOLVED = 0.3  # of a direction of length one
+LEAST_CURVATURE = 4.0  # a standard error of one half: known only within a factor of about 2.7
+INVOLVED = 0.3  # component of a unit direction from which a parameter counts as involved
 PROFILE_POINTS = 9
 PROFILE_ERRORS = 3.0  # standard errors to either side
-MEANINGLESS = 100.0  # a factor that leaves nothing known
-WIDEST = 3.0  # in coordinates: times or divided by 20
+MEANINGLESS = 100.0  # a factor so large that the value is unknown
+WIDEST = 3.0  # in coordinates: a factor of 20
 
 
 class Confidence(NamedTuple):
-    """Holds what the curvature tells of m of k parameters, those that lie at no bound.
+    """The confidence in m of k parameters, those that are not at a bound.
 
     Attributes:
-        places: (m,) which of them.
-        curvature: (m, m) the second derivatives of the cost, by coordinates.
-        covariance: (m, m) its inverse; infinite variances of what the cost does not rise along.
+        places: (m,) the indices of these parameters.
+        curvature: (m, m) the second derivatives of the cost in coordinates.
+        covariance: (m, m) its inverse; variances are infinite where the cost does not rise.
     """
 
     places: Sequence[int]
@@ -48,20 +49,20 @@ class Confidence(NamedTuple):
 
 
 class SearchOutcome(NamedTuple):
-    """States where a search ended.
+    """The end of a search.
 
     Attributes:
-        coordinates: what was searched for.
-        optimum: (k,) the values of that at which the cost is least.
-        confidence: how well the logs tell them; None where the search was no maximum likelihood, was
-            stopped, or ended at bounds alone.
-        evaluations: how many values were tried.
-        has_converged, was_stopped: how it ended.
-        is_spike: whether a search from a second start does not find this least cost.
-        at_edge: parameters beside whose values a run fails, or uses fewer measurements.
-        begins_alike: whether filters begin with the optimum where they began in the search.
-        held: parameters of a calibration that the motion does not determine; they stay at their start.
-        lacks: the sentences that say so, and of which other parameters the values depend on these.
+        coordinates: the coordinates that were searched.
+        optimum: (k,) the parameter values with the least cost.
+        confidence: the confidence in these values; None if the search was not by maximum likelihood, was
+            stopped, or ended with all parameters at bounds.
+        evaluations: the number of points tried.
+        has_converged, was_stopped: how the search ended.
+        is_spike: whether a search from a second start does not find this minimum.
+        at_edge: parameters close to whose values a run fails or uses fewer measurements.
+        begins_alike: whether filters begin at the optimum where they began in the search.
+        held: calibration parameters that the motion does not determine; they stay at their start.
+        lacks: sentences that report these, and which other values depend on them.
     """
 
     coordinates: Coordinates
@@ -78,14 +79,14 @@ class SearchOutcome(NamedTuple):
 
 
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
-    """Compute what a curvature tells of the parameters.
+    """Compute the covariance of parameters from the curvature of the cost.
 
     Args:
-        places: (m,), the places of these parameters among all k.
-        curvature: (m, m), the second derivatives of the cost, by coordinates.
+        places: (m,), the indices of these parameters among all k.
+        curvature: (m, m), the second derivatives of the cost in coordinates.
 
     Returns:
-        The covariance, with infinite variances of what the cost does not rise along.
+        The confidence; variances are infinite in directions in which the cost does not rise.
     """
     values, vectors = np.linalg.eigh(curvature)
     rises = values > 0.0
@@ -96,19 +97,19 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
 
 
 def with_noise(curvature: Floats, noise: Floats) -> Floats:
-    """Reduce a curvature to that with which its inverse is the covariance of parameters.
+    """Reduce a curvature so that its inverse is the covariance of the parameters.
 
-    If slopes vary more than the curvature says, the estimates' covariance is that of the slopes between
-    two inverse curvatures: White, Maximum likelihood estimation of misspecified models, Econometrica 50,
-    1982. The curvature counts the noise that slopes are linear in already, so that in each direction
-    the larger of the two is used.
+    If slopes vary more than the curvature implies, the covariance of the estimates is that of the slopes
+    multiplied by the inverse curvature from both sides: White, Maximum likelihood estimation of
+    misspecified models, Econometrica 50, 1982. The curvature already contains the noise that slopes are
+    linear in, so the larger of the two is used in each direction.
 
     Args:
         curvature: (m, m), the second derivatives of the cost.
-        noise: (m, m), the covariance of its first derivatives by the noise of what drives the motion.
+        noise: (m, m), the covariance of its first derivatives caused by the noise of the controls.
 
     Returns:
-        The curvature (m, m), smaller along directions in which the noise is larger than it.
+        The curvature (m, m), reduced in directions in which the noise exceeds it.
 
     >>> with_noise(np.diag([4.0, 4.0]), np.diag([1.0, 16.0])).round(6).tolist()
     [[4.0, 0.0], [0.0, 1.0]]
@@ -124,14 +125,14 @@ def with_noise(curvature: Floats, noise: Floats) -> Floats:
 
 
 def doubts(confidence: Confidence, coordinates: Coordinates) -> Iterator[str]:
-    """Yield a sentence for every direction of the parameters (k,) of which the logs tell little."""
+    """Yield a sentence for every direction of the parameters (k,) that the logs determine poorly."""
     own = [coordinates.free[place] for place in confidence.places]
     for direction, value in _weak(confidence, coordinates):
         yield _in_words(direction, value, own)
 
 
 def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
-    """Return the parameters (k,), by their places, of which the logs tell nothing by the curvature."""
+    """Return the indices of parameters (k,) that the curvature leaves undetermined."""
     found = []
     for direction, value in _weak(confidence, coordinates):
         first, *others = _involved(direction)
@@ -145,10 +146,10 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 
 
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
-    """Yield the unit directions (m,) along which the cost hardly rises, and its curvature there.
+    """Yield unit directions (m,) in which the cost rises too little, with the curvature there.
 
-    By the eigenvalues of the curvature in useful units: two standard errors that are useful, a factor of
-    2.7, or `UNIT` standard errors that a parameter without a useful one has alone.
+    They are eigenvectors of the curvature in useful units: two useful standard errors, a factor of 2.7,
+    or `UNIT` standard errors that a parameter without a useful error has if all others are fixed.
     """
     places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]
@@ -164,18 +165,18 @@ def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Fl
 
 
 def _involved(direction: Floats) -> list[int]:
-    """Return the places of a direction (m,) that count, the first most."""
+    """Return the indices of the relevant components of a direction (m,), the largest first."""
     order = np.argsort(-np.abs(direction)).tolist()
     return [place for place in order if abs(direction[place]) > INVOLVED]
 
 
 def _factor(value: float) -> float:
-    """Compute within what factor a positive parameter is known that alone has this curvature."""
+    """Compute the factor within which a positive parameter with this curvature is known."""
     return float(np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0)))
 
 
 def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str:
-    """Say what it means that the cost has only this curvature along a unit direction (m,)."""
+    """Describe the effect of a small curvature along a unit direction (m,)."""
     names = [each.name for each in free]
     first, *others = _involved(direction)
     if not others and free[first].useful:
@@ -198,13 +199,13 @@ def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str
 
 
 class Profile(NamedTuple):
-    """Holds the cost along one parameter, all others at their best to second order.
+    """The cost along one parameter, with all others optimised to second order.
 
     Attributes:
-        name: of the parameter.
+        name: the name of the parameter.
         along: (n,) its values.
-        rise: (n,) how much more that costs than the least; infinity where it cannot be used.
-        parabola: (n,) the same by the curvature alone.
+        rise: (n,) the cost relative to the minimum; infinite if it cannot be computed.
+        parabola: (n,) the same from the curvature only.
     """
 
     name: str
@@ -219,10 +220,10 @@ def profiles(
     """Compute the profiles of all parameters that have a standard error.
 
     Args:
-        cost: minus the log-likelihood, by values (n, k).
-        coordinates: what was searched over.
+        cost: computes minus the log-likelihood of values (n, k).
+        coordinates: the coordinates that were searched.
         point: (k,), the coordinates of the least cost.
-        confidence: by the curvature there.
+        confidence: the confidence at that point.
 
     Returns:
         A profile for each such parameter, over `PROFILE_POINTS` values.

@@ -1,17 +1,18 @@
-"""Adds noise to what drives a motion, to find what that noise gains by itself.
+"""Noise added to the controls of a motion, to find what noise itself gains in likelihood.
 
-A control that is measured has noise (errors in variables). Stamps that are shifted by a part of a step
-average it over two messages, and a factor below one attenuates it: both gain log-likelihood in a log
-with nothing wrong. Noise of the same size that is added costs as much as the noise that is there
-already, and less where it is averaged or attenuated. So the corrected log-likelihood is L(u) - c, where
-c is the mean of L(u + n) and L(u - n) less L(u): the noise then enters all alternatives alike. Nakamura,
+A measured control has noise (errors in variables). Stamps shifted by a part of a step average the noise
+over two messages, and a factor below one attenuates it: both increase the log-likelihood of a log
+without any fault. Added noise of the same size costs as much as the noise that is already there, and
+less if it is averaged or attenuated. The corrected log-likelihood is therefore L(u) - c, where c is the
+mean of L(u + n) and L(u - n) minus L(u); the noise then affects all alternatives equally. Nakamura,
 Corrected score function for errors-in-variables models, Biometrika 77, 1990; Cook and Stefanski,
 Simulation-extrapolation estimation, JASA 89, 1994.
 
-An error of the mean over few copies moves the estimates of all logs of one length in the same way. So
-the signs of the noise are those of a Hadamard matrix: over all copies the products of nearby messages
-cancel, and only messages that are further apart than there are pairs leave an error. Bekas, Kokiopoulou
-and Saad, An estimator for the diagonal of a matrix, Applied Numerical Mathematics 57, 2007.
+An error of the mean over a few copies shifts the estimates of all logs of the same length in the same
+way. The signs of the noise are therefore those of a Hadamard matrix: over all copies the products of
+nearby messages cancel, and only messages that are further apart than the number of pairs contribute an
+error. Bekas, Kokiopoulou and Saad, An estimator for the diagonal of a matrix, Applied Numerical
+Mathematics 57, 2007.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,14 +29,14 @@ from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
-PAIRS = 8  # of copies with opposite noise; a power of two
+PAIRS = 8  # pairs of copies with opposite noise; a power of two
 SEED = 62
-FEWEST = 20  # messages that tell noise
-MAD = 1.4826  # of a normal distribution: its standard deviation by its median absolute value
+FEWEST = 20  # fewest messages from which noise is estimated
+MAD = 1.4826  # standard deviation of a normal distribution divided by its median absolute deviation
 
 
 class _Noise(NamedTuple):
-    """Describes the noise of one number of a control."""
+    """The noise of one number of a control."""
 
     topic: str
     field: str
@@ -46,11 +47,11 @@ class _Noise(NamedTuple):
 def disturbed(
     source: MemorySource, bound: Sequence[Bound], log: int = 0, pairs: int = PAIRS
 ) -> list[MemorySource]:
-    """Return copies of a log with noise added to its controls: each with its opposite after it.
+    """Copy a log with noise added to its controls; each copy is followed by one with the opposite noise.
 
-    The noise is as large as the model states, but no larger than what is seen in the control. There are
-    no copies if a model states none, or none is seen. Of several logs each has noise of its own, by its
-    number `log`. `pairs` is a power of two.
+    The noise is as large as the model states, but at most as large as the noise seen in the control.
+    There are no copies if the model states no noise or none is seen. Each of several logs gets its own
+    noise, selected by the number `log`. `pairs` is a power of two.
     """
     noises = [noise for each in bound for noise in _noises(source, each)]
     rng = np.random.default_rng([SEED, log])
@@ -67,7 +68,7 @@ def disturbed(
 
 
 def _noises(source: MemorySource, bound: Bound) -> Iterator[_Noise]:
-    """Yield the noise of the numbers that drive an estimator."""
+    """Yield the noises of an estimator's controls."""
     if not isinstance(bound, Recursive) or bound.reading is None:
         return
     reading = bound.reading()
@@ -86,6 +87,6 @@ def _noises(source: MemorySource, bound: Bound) -> Iterator[_Noise]:
 
 
 def _seen(values: Floats) -> float:
-    """Compute the standard deviation of noise in values (n,), by their second differences."""
+    """Estimate the standard deviation of noise in values (n,) from their second differences."""
     bends = np.abs(np.diff(values, 2))
     return MAD * float(np.nanmedian(bends)) / 6.0**0.5 if np.isfinite(bends).any() else 0.0

@@ -1,7 +1,7 @@
-"""Studies tuning where the truth of the noise is unknown: other vehicles judge the values.
+"""A study of tuning without known noise: the values are judged on other vehicles.
 
-The log's vehicles are parted: some tune the experiment's one estimator by likelihood, from its settings
-or what the log states; others, held out, are replayed with either values.
+Some of the log's vehicles tune the experiment's one estimator by likelihood, from its settings or from
+what the log states; held-out vehicles are replayed with the start and the tuned values.
 """
 
 from collections.abc import Collection
@@ -20,12 +20,12 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
-    """States what is searched for, and which vehicles tune and judge it.
+    """Options of the study: the free parameters, and the vehicles that tune and that judge.
 
     Attributes:
         free: names of the parameters that are searched for.
-        tuned_by: vehicles that tune, by the first word of their topics.
-        held_out: vehicles that judge, by the first word of their topics.
+        tuned_by: vehicles to tune on, by the first word of their topics.
+        held_out: vehicles to judge the values on, by the first word of their topics.
     """
 
     free: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
-    """Leave some vehicles' topics out of a log; raises BadInput where it has none of one of them."""
+    """Copy a log without some vehicles' topics; raises BadInput for a vehicle that has no topics."""
     found = {topic.split("/")[1] for topic in source.streams}
     for vehicle in vehicles:
         if vehicle not in found:

@@ -1,9 +1,9 @@
-"""Measures what the motion in logs tells of a calibration before any search, and what it lacks.
+"""Information that the motion in logs holds on a calibration, computed before any search.
 
-With v the innovations and S their covariances, I = sum dv' S^-1 dv over all measurements, where dv are
-the derivatives by the parameters. In units that are useful for each, a direction whose eigenvalue is
-below one is not determined: no pseudo-inverse, which would give it a small standard error. Such
-directions by motion: Yang et al., arXiv 2201.09170; wheels: Censi et al., IEEE T-RO 2013.
+With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
+the derivatives by the parameters. In useful units, a direction with an eigenvalue below one is not
+determined. A pseudo-inverse is not used: it would give such a direction a small standard error. Such
+directions by kind of motion: Yang et al., arXiv 2201.09170; for wheels: Censi et al., IEEE T-RO 2013.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,20 +21,20 @@ from fuselog.recorders.parameters import Parameter
 from fuselog.replay.judging.consistency.whiteness import whitened
 
 Floats = NDArray[np.float64]
-STEP = 0.01  # of the differences, in useful units
-LEAST = 1.0  # an eigenvalue: a standard error as large as is useful
-INVOLVED = 0.3  # of a parameter's axis in what is not determined
-FURTHEST = float(MOVES[-1])  # useful units that what is held may be wrong by
-NAMED = 0.1  # of a direction, beside its largest part
+STEP = 0.01  # step of differences, in useful units
+LEAST = 1.0  # an eigenvalue: the standard error equals the useful error
+INVOLVED = 0.3  # component of an undetermined direction from which a parameter is involved
+FURTHEST = float(MOVES[-1])  # error of a fixed parameter that is allowed for, in useful units
+NAMED = 0.1  # component of a direction, relative to its largest, from which a parameter is named
 
 
 class Undetermined(NamedTuple):
-    """Holds what the motion does not determine of m parameters.
+    """Directions of m parameters that the motion does not determine.
 
     Attributes:
-        eigenvalues: (m,) of the information in useful units, the least first.
-        directions: (d, m) that are not determined, in useful units, each of few parameters.
-        places: of the parameters that take part in these.
+        eigenvalues: (m,) of the information in useful units, in ascending order.
+        directions: (d, m) undetermined directions in useful units, each with few parameters.
+        places: indices of the parameters involved in them.
     """
 
     eigenvalues: Floats
@@ -45,19 +45,19 @@ class Undetermined(NamedTuple):
 def information(objective: Objective, values: Floats, useful: Floats, places: Sequence[int]) -> Floats:
     """Compute the information that all logs hold on some of the parameters.
 
-    Measurements that one side of a difference lacks tell nothing.
+    A measurement that is missing on one side of a difference contributes nothing.
 
     Args:
         objective: replays the logs.
-        values: (k,), where the derivatives are taken.
+        values: (k,), the point at which derivatives are taken.
         useful: (k,), each parameter's useful unit.
-        places: which m of the k parameters.
+        places: the indices of m of the k parameters.
 
     Returns:
-        (m, m), in useful units.
+        The information (m, m) in useful units.
     """
     found = np.zeros((len(places), len(places)))
-    values = values + 2.0 * STEP * useful  # beside a delay of zero, at which stamps are equal
+    values = values + 2.0 * STEP * useful  # away from a delay of zero, at which stamps are equal
     for run in objective.runs:
         here = _innovations(objective, values, run)
         columns = []
@@ -77,9 +77,10 @@ def information(objective: Objective, values: Floats, useful: Floats, places: Se
 
 
 def undetermined(scaled: Floats) -> Undetermined:
-    """Return what an information (m, m) in useful units leaves open.
+    """Find the directions that an information matrix (m, m) in useful units leaves undetermined.
 
-    At a constant speed of 8 m/s a sensor 0.2 m ahead is one that is 0.025 s late:
+    At a constant speed of 8 m/s, a sensor that is 0.2 m further ahead looks like one that is 0.025 s
+    late:
 
     >>> known = np.array([[1.0, -0.5, 0.0], [-0.5, 0.25, 0.0], [0.0, 0.0, 1.0]]) * 100.0
     >>> open_ = undetermined(known)
@@ -95,7 +96,7 @@ def undetermined(scaled: Floats) -> Undetermined:
 def in_words(
     names: Sequence[str], lacking: Undetermined, free: Sequence[Parameter], held: Sequence[str]
 ) -> str:
-    """Name what the motion does not determine: parameters (m,), combinations of them; what stays."""
+    """Describe undetermined parameters (m,), combinations of them, and the fixed values."""
     alone: list[str] = []
     together: list[str] = []
     for direction in lacking.directions:
@@ -113,15 +114,15 @@ def in_words(
 def conditions(
     scaled: Floats, places: Sequence[int], free: Sequence[Parameter], held: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a sentence for each parameter whose interval is right only if one that is held is right.
+    """Yield a sentence for each parameter whose interval is valid only if a fixed parameter is right.
 
-    What is held may be wrong by as much as the logs leave open, at most by `FURTHEST` useful units.
+    Fixed parameters may be wrong by as much as the logs allow, at most by `FURTHEST` useful units.
 
     Args:
         scaled: (m, m), the information in useful units.
-        places: of these m parameters among the free ones.
+        places: the indices of these m parameters among the free ones.
         free: all parameters.
-        held: the names of those that stay where they started.
+        held: the names of those that are fixed at their start.
     """
     names, useful = np.array([(free[place].name, free[place].useful) for place in places], object).T
     stays = np.isin(names, held)
@@ -150,9 +151,9 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """Compute a difference of innovations by message, by the covariances of those between (n m,).
+    """Compute differences of innovations (n m,), whitened with the covariances in between.
 
-    A delay changes the order among topics, never within one.
+    A delay changes the order of messages between topics, but never within one.
     """
     shape = here["innovation"].shape
     if (
@@ -167,7 +168,7 @@ def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | No
 
 
 def _sparse(directions: Floats) -> Floats:
-    """Span the same (d, m) by directions of as few parameters each as elimination leaves."""
+    """Rewrite directions (d, m) by elimination, with the same span and few parameters each."""
     rows = directions.copy()
     for number in range(len(rows)):
         rest = np.abs(rows[number:])

@@ -1,4 +1,4 @@
-"""Takes the part of a log over which something is measured, for diagnoses and tuning."""
+"""The part of a log over which measurements exist, for diagnoses and tuning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,15 +6,16 @@ from dataclasses import replace
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
-BEYOND_NS = 1_000_000_000  # that what drives goes on, so that the last measurement is between two of it
+# time of controls to keep, so that the last measurement is between two controls
+BEYOND_NS = 1_000_000_000
 
 
 def until_last_measured(
     source: LogSource | MemorySource, bound: Sequence[Bound]
 ) -> LogSource | MemorySource:
-    """Cut a log a second after its last measurement: what drives the motion may go on for longer.
+    """Cut a log a second after its last measurement if the controls continue for longer.
 
-    There are no estimates that anything could be compared with then, and that is no failure.
+    After that there are no estimates to compare with, which is not a failure.
     """
     readings = [
         (each, each.reading())

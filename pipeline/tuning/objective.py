@@ -1,7 +1,8 @@
-"""Computes what a tuning minimises: logs replayed with other parameters, and their replays' cost.
+"""The cost that tuning minimises: replays of logs with other parameters, and their evaluation.
 
-Every log is replayed by itself; a point costs what the sums over all logs do, in their order. Logs and
-points are shared among threads, whose kernels run side by side, or among the workers of a pool.
+Every log is replayed separately; the cost of a point follows from the sums over all logs, in their
+order. Logs and points are shared among threads, whose kernels run in parallel, or among the workers of a
+pool.
 """
 
 import pickle
@@ -41,20 +42,20 @@ from fuselog.replay.judging.metrics.measuring import Sums, plus
 
 Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]
-NOISE = "noise"  # what a log's controls cost by their noise, beside the topics of what is estimated
+NOISE = "noise"  # key of the cost of a log's control noise, next to the topics of what is estimated
 INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
 class Run(NamedTuple):
-    """Holds a log in memory as it is replayed again and again.
+    """A log in memory that is replayed repeatedly.
 
     Attributes:
-        ensemble: it alone.
-        name: what it is called.
-        begun: how what is estimated begins, by its name, where the log does not say so; see `begin`.
-        starts: from where likelihoods are compared, in place of `begun`.
-        parts: the log once for each part of `starts`.
-        disturbed: copies with noise added to what drives, if the cost is corrected for that noise.
+        ensemble: the log, as an ensemble of one.
+        name: the log's name.
+        begun: the begin of each estimated object by name, if the log does not state it; see `begin`.
+        starts: the starts between which likelihoods are compared, in place of `begun`.
+        parts: the log, repeated for each part of `starts`.
+        disturbed: copies with noise added to the controls, if the cost is corrected for that noise.
     """
 
     ensemble: Ensemble[MemorySource]
@@ -66,7 +67,7 @@ class Run(NamedTuple):
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
-    """Read what estimators read of a log, and its truths, into memory."""
+    """Read into memory the topics that estimators read, and the log's truths."""
     topics = {topic for each in bound for topic in (*each.static, *each.streams)}
     truths = topics_of(source.topics, schemas.TRUTH_STATE)
     topics |= {name for name in truths if not name.startswith("/estimates/")}
@@ -80,7 +81,7 @@ def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
 
 
 def for_likelihood(settings: Mapping[str, Any]) -> str:
-    """Say how an estimator of a user's own gives innovations with a likelihood; "" for another."""
+    """Describe how a user's own estimator can give innovations with a likelihood; "" for others."""
     kind = settings.get("kind")
     if isinstance(kind, Estimator):
         return (
@@ -96,12 +97,12 @@ def for_likelihood(settings: Mapping[str, Any]) -> str:
 
 
 def is_innovation(rows: Ragged) -> bool:
-    """Tell whether an output is a stream of innovations."""
+    """Test whether an output is a stream of innovations."""
     return rows.stream.schema.full_name == INNOVATION
 
 
 def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]]:
-    """Yield the innovation streams of one log's outputs, by topic."""
+    """Yield the innovation streams among one log's outputs, with their topics."""
     for topic, rows in outputs.items():
         if is_innovation(rows) and len(rows):
             yield topic, rows.stream
@@ -112,7 +113,7 @@ def _likelihood(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> 
 
 
 def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
-    """Sum the squares of whitened innovations by measured component; count them."""
+    """Sum and count the squares of whitened innovations by measured component."""
     found: Sums = {}
     for topic, stream in innovations_in(outputs):
         for name, column in zip(stream.components, whitened(stream).T, strict=True):
@@ -122,7 +123,7 @@ def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  
 
 
 def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
-    """Sum NEES by case; count how many components they are of."""
+    """Sum NEES by case, and count its components."""
     found: Sums = {}
     for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         known = errors.nees[np.isfinite(errors.nees)]
@@ -131,7 +132,7 @@ def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
 
 
 def _rmse(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
-    """Sum squared errors of the position, else of what is judged first; count them."""
+    """Sum and count squared errors of the position, or of the first quantity that is judged."""
     found: Sums = {}
     for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         squared = errors.error[:, errors.main.columns] ** 2
@@ -144,7 +145,7 @@ def _cost_of_likelihood(sums: Sums) -> float:
 
 
 def _cost_of_ratios(sums: Sums) -> float:
-    """Compute how far mean squares are from one, by their deviations, 1/2 sum n/2 log(s/n)^2."""
+    """Compute the deviance of mean squares s/n from one: the sum of n/4 log(s/n)^2."""
     squares = np.array(list(sums.values()))
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(squares[:, 0] / squares[:, 1])
@@ -152,20 +153,21 @@ def _cost_of_ratios(sums: Sums) -> float:
 
 
 def _cost_of_squares(sums: Sums) -> float:
-    """Sum the logarithms of the RMSEs, of which logs with other truths have more than one."""
+    """Sum the logarithms of the RMSEs; logs with different kinds of truth have more than one."""
     squares = np.array(list(sums.values()))
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(0.5 * np.sum(np.log(squares[:, 0] / squares[:, 1])))
 
 
 class Criterion(NamedTuple):
-    """Holds what a tuning goes by.
+    """A criterion that tuning optimises.
 
     Attributes:
-        sums: what is summed over logs, of one log's outputs.
-        cost: what the sums cost; nothing of a run that told nothing.
-        is_smooth: whether it is of innovations; then no gate may leave any out, else that may change.
-        lacks: what a log lacks that has no such sums.
+        sums: computes the quantities that are summed over logs, from one log's outputs.
+        cost: computes the cost of the sums; a run without values contributes nothing.
+        is_smooth: whether it uses innovations. The gate is then open, because it could change which
+            innovations are used.
+        lacks: what is missing in a log without such sums.
     """
 
     sums: Callable[[Run, Mapping[str, Ragged], float], Sums]
@@ -183,7 +185,7 @@ CRITERIA: dict[By, Criterion] = {
 
 
 class Best(NamedTuple):
-    """Holds the best point (k,) of a search so far, its cost, and how many points were tried."""
+    """The best point (k,) of a search so far, its cost, and the number of points tried."""
 
     evaluations: int
     point: Floats
@@ -192,25 +194,25 @@ class Best(NamedTuple):
 
 
 def silent(_: Best) -> None:
-    """Tell nobody of the search."""
+    """Ignore the progress of a search."""
 
 
 @dataclass
 class Objective:
-    """Computes the cost of parameter values over logs.
+    """The cost of parameter values over logs.
 
     Attributes:
-        label, settings: the estimator, and its parameters but for those that are searched for.
-        names: of these.
+        label, settings: the estimator, and its parameters except those that are searched for.
+        names: the names of the parameters that are searched for.
         runs: the logs.
-        by: what it goes by.
+        by: the criterion.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        on_best: is told of the best point after every batch.
-        pool: who replays; without one threads of this process.
-        best: of all points until now.
-        held: by the places of noises among the names, the values (k,) that these keep where the cost is
-            corrected; see `correct`.
-        left_out: by topic, how many messages `begin_after` left out.
+        on_best: called with the best point after every batch.
+        pool: the workers that replay; None stands for threads of this process.
+        best: the best of all points so far.
+        held: values of noise parameters, by their indices among the names (k,), that stay fixed in the
+            correction of the cost; see `correct`.
+        left_out: number of messages that `begin_after` left out, by topic.
     """
 
     label: str
@@ -227,9 +229,9 @@ class Objective:
     _counts: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
-        """Compute what points (n, k) cost (n,); infinity where a run fails or uses fewer measurements.
+        """Compute the costs (n,) of points (n, k); infinity if a run fails or uses fewer measurements.
 
-        Raises BadInput where a worker dies.
+        Raises BadInput if a worker dies.
         """
         sums = self._shared(points)
         costs = np.array(
@@ -244,7 +246,7 @@ class Objective:
         return costs
 
     def _shared(self, points: Floats) -> list[list[Sums | None]]:
-        """Return what every run tells at each point; all workers share the points."""
+        """Compute the sums of every run at each point; all workers share the points."""
         with threads() if self.pool is None else nullcontext(self.pool) as pool:
             parts = np.array_split(points, min(pool.workers, len(points)))
             alone = self._without_runs()
@@ -264,14 +266,15 @@ class Objective:
                 ) from error
 
     def _without_runs(self) -> "Objective":
-        """Return what workers need besides a run."""
+        """Copy the objective without its runs, to send it to workers."""
         return replace(self, runs=(), on_best=silent, pool=None)
 
     def begin(self, start: Floats) -> None:
-        """Note what every log tells at the start (k,), and where filters begin there: so it stays.
+        """Record the number of messages of every log at the start (k,), and where filters begin there.
 
-        Else likelihoods of different measurements would be compared. Raises BadInput where a run fails,
-        a log lacks what is minimised, or the estimator cannot go to other processes.
+        Both stay fixed, because likelihoods of different measurements cannot be compared. Raises
+        BadInput if a run fails, if a log lacks the quantity that is minimised, or if the estimator
+        cannot be sent to other processes.
         """
         if self.pool is not None:
             try:
@@ -309,9 +312,9 @@ class Objective:
         self.best = Best(self.best.evaluations, start, np.inf, self.names)
 
     def begin_after(self, start: Floats, reaches_s: Mapping[str, float]) -> None:
-        """Begin without the messages that delays of up to `reaches_s`, by name, put before the start.
+        """Begin without the messages that delays of up to `reaches_s` move to before the start.
 
-        With such delays they give no innovation, so that likelihoods could not be compared.
+        With such delays these messages give no innovation, so that likelihoods could not be compared.
         """
         runs = []
         for run in self.runs:
@@ -335,8 +338,8 @@ class Objective:
     def correct(self, values: Floats) -> None:
         """Correct the cost for the noise of the controls, see `fuselog.pipeline.tuning.control_noise`.
 
-        Of noises that are searched for, the correction keeps the values (k,): else it would take that
-        noise out of the likelihood that they are found by.
+        If these noises are themselves searched for, the correction uses their values in `values` (k,).
+        Otherwise it would remove them from the likelihood by which they are found.
         """
         noises: set[str] = set()
         for run in self.runs:
@@ -349,7 +352,7 @@ class Objective:
         }
 
     def with_pairs(self, values: Floats, pairs: int) -> "Objective":
-        """Return the same, corrected by this number of pairs of copies of each log, see `correct`."""
+        """Return a copy corrected by this number of pairs of copies per log, see `correct`."""
         runs = [
             run._replace(disturbed=disturbed(run.ensemble[0], self._bound(values, run), number, pairs))
             for number, run in enumerate(self.runs)
@@ -357,7 +360,7 @@ class Objective:
         return replace(self, runs=runs)
 
     def leave_noise(self) -> None:
-        """Take the correction back."""
+        """Remove the correction for the noise of the controls."""
         self.runs, self.held = [run._replace(disturbed=()) for run in self.runs], {}
 
     def nis(self, values: Floats) -> float:
@@ -369,11 +372,11 @@ class Objective:
 
     @property
     def is_corrected(self) -> bool:
-        """Tell whether the cost is corrected for the noise of the controls."""
+        """Test whether the cost is corrected for the noise of the controls."""
         return any(run.disturbed for run in self.runs)
 
     def lost_by_noise(self, points: Floats) -> Floats:
-        """Compute what pairs of opposite noises cost the logs at points (n, k): (n, pairs, 2)."""
+        """Compute the costs (n, pairs, 2) of pairs of opposite noises at points (n, k)."""
         return np.array([
             np.sum([self._lost(point, run, count) for run, count in self._corrected_runs], axis=0)
             for point in points
@@ -384,7 +387,7 @@ class Objective:
         return [pair for pair in zip(self.runs, self._counts, strict=True) if pair[0].disturbed]
 
     def _lost(self, values: Floats, run: Run, count: int) -> Floats:
-        """Compute what pairs of opposite noises cost a log (pairs, 2); NaN where a replay fails."""
+        """Compute the costs (pairs, 2) of pairs of opposite noises on one log; NaN if a replay fails."""
         values = values.copy()
         values[list(self.held)] = list(self.held.values())
         size = part_count(run.starts)
@@ -398,13 +401,13 @@ class Objective:
         return without - np.reshape(having, (-1, 2))
 
     def begins_alike(self, values: Floats) -> bool:
-        """Tell whether filters would begin at the same stamps with these values (k,)."""
+        """Test whether filters would begin at the same stamps with these values (k,)."""
         return self.by == "likelihood" or all(
             _stamps(run) == _stamps(self.begun(values, run)) for run in self.runs
         )
 
     def begun(self, values: Floats, run: Run) -> Run:
-        """Return the log, with how the estimator begins with these values (k,); BadInput as `replay`."""
+        """Return the log with the estimator's begin at values (k,); raises BadInput as `replay`."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):
@@ -421,7 +424,7 @@ class Objective:
         return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
-        """Replay a log with these values (k,): outputs by topic; BadInput as `replay`."""
+        """Replay a log with values (k,): outputs by topic; raises BadInput as `replay`."""
         bound = [
             with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
@@ -429,13 +432,13 @@ class Objective:
         return collect(replay(run.ensemble, bound))
 
     def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
-        """Sum what a log tells at each point (n, k); None where it gave another number of messages."""
+        """Compute a log's sums at points (n, k); None if a point gives another number of messages."""
         return [self._sums(point, run, count) for point in points]
 
     def _sums(self, values: Floats, run: Run, count: int) -> Sums | None:
         try:
             parts = self._parts(values, run)
-        except BadInput:  # as of a batch that does not converge
+        except BadInput:  # for example, a batch that does not converge
             return None
         total = self._total(parts, run, count)
         if total is None or not run.disturbed:
@@ -443,7 +446,7 @@ class Objective:
         return {**total, NOISE: float(np.mean(self._lost(values, run, count)))}
 
     def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
-        """Return the outputs that are compared: of each part of broad starts, where the log has none."""
+        """Return the outputs to compare, one set for each part of broad starts."""
         if not run.starts:
             return [self.outputs(values, run)]
         return self._outputs_of_parts(values, run, run.parts)
@@ -451,7 +454,7 @@ class Objective:
     def _outputs_of_parts(
         self, values: Floats, run: Run, parts: Ensemble[MemorySource]
     ) -> list[dict[str, Ragged]]:
-        """Return the outputs of logs which stand there once for each part of the log's starts."""
+        """Return the outputs of an ensemble that repeats the log for each part of its starts."""
         bound = [begun_at(each, run.starts) for each in self._bound(values, run)]
         outputs = collect(replay(parts, bound)).items()
         return [
@@ -459,7 +462,7 @@ class Objective:
         ]
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
-        """Sum what all parts tell; None where all fail or gave another number of messages."""
+        """Sum over all parts; None if all fail or give another number of messages."""
         is_used = [not _failures(outputs) and self._count(outputs) == count for outputs in parts]
         if not any(is_used):
             return None
@@ -470,7 +473,7 @@ class Objective:
         return found[0] if len(parts) == 1 else dict(mean_likelihood(found))
 
     def _count(self, outputs: Mapping[str, Ragged]) -> int:
-        """Count the messages compared: innovations alone, if there are; a delay adds estimates."""
+        """Count the innovations, or the output rows without innovations; delays add estimates."""
         innovations = sum(len(stream) for _, stream in innovations_in(outputs))
         return innovations or sum(len(rows) for rows in outputs.values())
 
@@ -487,7 +490,7 @@ class Objective:
 
 
 def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
-    """Return when a log's filters begin, by what is estimated and by topic."""
+    """Return the stamps at which a log's filters begin, by estimated object and topic."""
     return {
         (name, topic): rows.stream.publish_time_ns.tolist()
         for name, opened in run.begun.items()
@@ -507,12 +510,12 @@ def _as_noted(opened: Initialized, *_: Any) -> Initialized:
 
 
 def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:
-    """Return settings in which parameters have other values.
+    """Copy settings with other parameter values.
 
     Args:
-        settings: they stay as they are.
-        names: the parameters, by their full names.
-        values: (k,), what these become.
+        settings: the settings; they are not modified.
+        names: the full names of the parameters.
+        values: (k,), their new values.
     """
     pairs = zip(names, values.tolist(), strict=True)
     return reduce(merge, (nested(name, value) for name, value in pairs), dict(settings))

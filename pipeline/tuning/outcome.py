@@ -1,4 +1,4 @@
-"""Presents what a tuning found: tables, figures, sentences, settings to replay with, a result folder."""
+"""Presentation of a tuning's result: tables, figures, notes, settings to replay with, result folder."""
 
 import json
 import math
@@ -32,28 +32,28 @@ from fuselog.replay.judging.tables import joined
 
 Floats = NDArray[np.float64]
 Source = LogSource | MemorySource
-START, TUNED = "start", "tuned"  # what the estimator is called with either values
+START, TUNED = "start", "tuned"  # labels of the estimator with its start and its tuned values
 SETTINGS = "settings.toml"
-IMPROBABLE = 1e-3  # of white innovations: they are none
+IMPROBABLE = 1e-3  # probability below which innovations are not taken for white
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tuning:
-    """Holds what a tuning found.
+    """The result of a tuning.
 
     Attributes:
-        label: the estimator's.
-        logs, held_out_logs: what the search went by, and other logs to judge it by.
-        settings: of the estimator with the values it started from, and with those that were found.
-        objective: what was minimised.
-        found: where the search ended.
-        costs: (2,) of the logs with either values; minus the log-likelihood where that is what was best,
-            corrected for the noise of the controls if a note says so.
-        held_out_costs: (2,) the same of the logs held out, if any.
-        folds: a row per fold: the values by all other logs, and what its own logs cost with them.
+        label: the label of the estimator.
+        logs, held_out_logs: the logs of the search, and other logs on which the values are judged.
+        settings: the estimator's settings with the start values, and with the tuned values.
+        objective: the cost that was minimised.
+        found: the end of the search.
+        costs: (2,) of the logs with the start and the tuned values: minus the log-likelihood if that was
+            optimised, corrected for the noise of the controls if a note says so.
+        held_out_costs: (2,) the same for the held-out logs, if any.
+        folds: a row per fold: the values found on all other logs, and the costs of its own logs.
         gate: the probability of the gate that was open in the search.
         advice: sentences on what to record next.
-        files: texts that are written beside the settings, by their names.
+        files: texts that are written next to the settings, by file name.
     """
 
     label: str
@@ -75,7 +75,7 @@ class Tuning:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """Return a row per parameter: start, value, 95 % interval (NaN where there is none)."""
+        """Return a row per parameter: start, value, 95 % interval (NaN if unknown)."""
         free = self.found.coordinates.free
         point, reach = self.found.coordinates.of(self.found.optimum), QUANTILE * self.standard_errors
         low, high = map(self.found.coordinates.unbounded, (point - reach, point + reach))
@@ -91,7 +91,7 @@ class Tuning:
 
     @property
     def standard_errors(self) -> Floats:
-        """Return (k,) of logarithms of what is positive, of others in units of their own; else NaN."""
+        """Return standard errors (k,), of logarithms for positive parameters; NaN if unknown."""
         errors = np.full(len(self.found.optimum), np.nan)
         if self.found.confidence is not None:
             errors[list(self.found.confidence.places)] = self.found.confidence.errors
@@ -99,7 +99,7 @@ class Tuning:
 
     @property
     def correlation(self) -> pd.DataFrame:
-        """Return how the errors of what was searched for (logarithms, where positive) correlate."""
+        """Return the correlations of the parameters' errors (of logarithms, for positive parameters)."""
         if self.found.confidence is None:
             return pd.DataFrame()
         names = [self.found.coordinates.free[place].name for place in self.found.confidence.places]
@@ -107,7 +107,7 @@ class Tuning:
 
     @property
     def profile(self) -> pd.DataFrame:
-        """Return along each parameter its value, and the log-likelihood less its greatest."""
+        """Return values along each parameter, with their log-likelihoods relative to the maximum."""
         tables = [
             {
                 "parameter": each.name,
@@ -129,10 +129,11 @@ class Tuning:
 
     @cached_property
     def whiteness(self) -> pd.DataFrame:
-        """Return a row per measured component with either values.
+        """Return a row per measured component with the start and the tuned values.
 
-        How many innovations there are, the mean square of the normalised ones, their correlation with
-        the next, Ljung and Box's Q, and how probable a larger one is if they are white.
+        The columns are the number of innovations, the mean square of the normalised innovations, their
+        correlation with the next one, the Ljung-Box statistic Q, and the probability of a larger Q if
+        the innovations are white.
         """
         rows = []
         start = np.array([each.default for each in self.found.coordinates.free])
@@ -161,12 +162,12 @@ class Tuning:
 
     @cached_property
     def replay(self) -> Replay:
-        """Return the logs replayed with either values: the estimators `start` and `tuned`."""
+        """Return the replay of the logs with both sets of values: the estimators `start` and `tuned`."""
         return replay(self.logs, self.settings, gap_limit_s=self.objective.gap_limit_s)
 
     @cached_property
     def held_out(self) -> Replay | None:
-        """Return the logs held out, likewise; None where there are none."""
+        """Return the same replay of the held-out logs; None without such logs."""
         if not self.held_out_logs:
             return None
         named = {f"{label}-held-out": values for label, values in self.settings.items()}
@@ -174,17 +175,17 @@ class Tuning:
 
     @property
     def replays(self) -> list[Replay]:
-        """Return both replays, or the one that there is."""
+        """Return the replays of the logs and, if any, of the held-out logs."""
         return [self.replay, *([self.held_out] if self.held_out else [])]
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Return a row per metric of all logs with either values: estimator, quantity, case, value."""
+        """Return a row per metric with both sets of values: estimator, quantity, case, value."""
         return joined(each.metrics for each in self.replays)
 
     @cached_property
     def notes(self) -> list[str]:
-        """Return a sentence for everything that one has to know of the values."""
+        """Return a sentence for everything that one should know about the values."""
         return [
             *self.notes_of_search,
             *(each for each in self.replay.judge.notes_of_coverage if each.startswith(TUNED)),
@@ -196,7 +197,7 @@ class Tuning:
 
     @property
     def notes_of_search(self) -> list[str]:
-        """Return the notes of the search alone, which need no replay."""
+        """Return the notes on the search, which need no replay."""
         return list(self._notes_of_search())
 
     def _notes_of_search(self) -> Iterator[str]:
@@ -284,7 +285,7 @@ class Tuning:
                 )
 
     def _notes_of_truth(self) -> Iterator[str]:
-        """Say what innovations do not see: errors that the state follows."""
+        """Report large errors that innovations do not show because the state follows them."""
         for replayed in self.replays:
             metrics = replayed.judge.metrics
             for key, (_, high) in replayed.judge.bounds.items():
@@ -304,7 +305,7 @@ class Tuning:
                 )
 
     def _notes_of_others(self) -> Iterator[str]:
-        """Say whether logs that were not searched by are explained better too."""
+        """Report whether logs outside the search are explained better too."""
         if self.held_out_costs is not None:
             before, after = self.held_out_costs
             what, sign = "cost", 1.0
@@ -320,7 +321,7 @@ class Tuning:
 
     @property
     def _scale(self) -> str:
-        """Say what the log-likelihood of the logs held out is, beside that of the tables."""
+        """Describe the scale of the held-out logs' log-likelihood, in contrast to that of the tables."""
         count = len(self.held_out_logs)
         total = "of 1 log" if count == 1 else f"the sum over {count} logs"
         is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")
@@ -328,7 +329,7 @@ class Tuning:
 
     @property
     def toml(self) -> str:
-        """Return the tuned settings, as --settings takes them."""
+        """Return the tuned settings as TOML text for --settings."""
         values = {name: each for name, each in self.settings[TUNED].items() if _is_toml(each)}
         if values.get("kind") == self.label:
             del values["kind"]
@@ -337,7 +338,7 @@ class Tuning:
     def save(self, folder: str | Path) -> ResultFolder:
         """Write settings.toml, tables, figures, metrics and timeline to the result folder `folder`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder exists and is not a fuselog result.
         """
         place = Path(folder)
         check_folder(place, {"input": [path for each in self.replays for path in each.paths]})
@@ -382,12 +383,12 @@ class Tuning:
 
     @property
     def _meanings(self) -> Mapping[str, str]:
-        """Say what the estimator's parameters are, in a few words."""
+        """Return the meanings of the estimator's parameters, in a few words each."""
         return next(iter(self.replay.done.meanings.values()), {})
 
     @property
     def profile_chart(self) -> Chart:
-        """Return the log-likelihood along each parameter, and where 95 % of it ends."""
+        """Return a chart of the log-likelihood along each parameter, with its 95 % limit."""
         positive = {each.name: each.is_log for each in self.found.coordinates.free}
         panels = [
             Panel(
@@ -408,7 +409,7 @@ class Tuning:
 
 
 def _is_toml(value: Any) -> bool:
-    """Tell whether a setting can be written: an estimator of a program's own cannot, nor can None."""
+    """Test whether a setting can be written as TOML: None and estimators defined in Python cannot."""
     return isinstance(value, bool | int | float | str | list | dict)
 
 

@@ -1,7 +1,7 @@
-"""Searches for the parameters of least cost.
+"""Search for the parameters with the least cost.
 
-It goes over the logarithm of what is positive, a standard deviation say; anything else has a unit of its
-own.
+Positive parameters, such as standard deviations, are searched by their logarithm; all others have a unit
+of their own.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,51 +17,52 @@ from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 
-CURVATURE_STEP = 1e-2  # of the differences, in coordinates
-DESCENTS = 20  # each of which ends where another parameter's change costs less
-FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
-# of a calibration's parameter in a scan, in useful units
+CURVATURE_STEP = 1e-2  # step of differences, in coordinates
+DESCENTS = 20  # the search stops when no change of a single parameter reduces the cost further
+# factors by which a scan changes a positive parameter
+FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])
+# changes of a calibration parameter in a scan, in useful units
 MOVES = np.array([-10.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 10.0])
-LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
-LOOKS = 3  # at how far a parameter that is not positive reaches
-UNIT = 10.0  # standard errors that it has alone
+LEAST_GAIN = 1e-3  # smallest gain of a scan's step: far less than any log can resolve
+LOOKS = 3  # attempts to find the scale of a parameter that is not positive
+UNIT = 10.0  # standard errors of the parameter if all others are fixed
 
 MOST_GRID_POINTS = 10_000
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Holds what is searched over: of k parameters the logarithm, or the value in a unit of its own."""
+    """Coordinates of k parameters: the logarithm, or the value in a unit of the parameter's own."""
 
     free: Sequence[Parameter]
     units: Floats
 
     def of(self, values: Floats) -> Floats:
-        """Return the coordinates (..., k) of values."""
+        """Compute the coordinates (..., k) of values."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self._is_log, np.log(values), values / self.units)
 
     def values(self, coordinates: Floats) -> Floats:
-        """Return the values (..., k) at coordinates, never beyond the bounds by rounding."""
+        """Compute the values (..., k) at coordinates, clipped to the bounds."""
         return np.clip(self.unbounded(coordinates), *self._ends)
 
     def unbounded(self, coordinates: Floats) -> Floats:
-        """Return the values (..., k) at coordinates, which may lie beyond the bounds."""
+        """Compute the values (..., k) at coordinates that may be outside the bounds."""
         with np.errstate(over="ignore"):
             return np.where(self._is_log, np.exp(coordinates), coordinates * self.units)
 
     def over(self, cost: Cost) -> Cost:
-        """Return the cost of coordinates (n, k)."""
+        """Turn a cost of values into a cost of coordinates (n, k)."""
         return lambda points: cost(self.values(points))
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
-        """Return the bounds (k,), (k,) in coordinates."""
+        """Return the lower and upper bounds (k,), (k,) in coordinates."""
         low, high = map(self.of, self._ends)
         return low, high
 
     def at_bounds(self, point: Floats) -> NDArray[np.bool_]:
-        """Return which coordinates (k,) of a point lie at a bound."""
+        """Test which coordinates (k,) of a point are at a bound."""
         low, high = self.bounds
         return (point - low < CURVATURE_STEP) | (high - point < CURVATURE_STEP)
 
@@ -75,17 +76,17 @@ class Coordinates:
 
 
 def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coordinates:
-    """Return the coordinates to search in.
+    """Choose the coordinates of a search.
 
     Args:
-        cost: what values (n, k) cost.
+        cost: computes the costs of values (n, k).
         free: the k parameters.
-        about: (k,), the values about which the cost bends as their units say.
+        about: (k,), the values around which the curvature of the cost determines the units.
 
     Returns:
         The coordinates.
 
-    Raises BadInput where the cost does not change with a parameter.
+    Raises BadInput if the cost does not depend on a parameter.
     """
     units = np.ones(len(free))
     for place, each in enumerate(free):
@@ -94,7 +95,6 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
         value = float(about[place])
 
         def near(steps: Sequence[float], place: int = place, each: Parameter = each) -> Floats:
-            """Return what it costs so far from the values along this parameter."""
             points = np.tile(about, (len(steps), 1))
             points[:, place] = np.clip(about[place] + np.array(steps), each.low, each.high)
             return cost(points)
@@ -113,9 +113,9 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
-    """Find UNIT standard errors of one parameter alone, by the curvature about a value, and costs."""
+    """Find `UNIT` standard errors of a parameter by the curvature around a value, and three costs."""
     step = 1e-3 * max(abs(value), 1.0)
-    for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
+    for _ in range(LOOKS):  # the cost is not a parabola here: use a smaller or larger step
         costs = near([-step, 0.0, step])
         with np.errstate(invalid="ignore"):  # infinite costs have no curvature
             bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
@@ -126,7 +126,7 @@ def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[floa
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     """Return the start (k,) in coordinates, or the point of a grid between the bounds that costs less.
 
-    Raises BadInput where the grid has no end, or too many points.
+    Raises BadInput if a bound is infinite or the grid has too many points.
     """
     low, high = coordinates.bounds
     for each, begin, end in zip(coordinates.free, low, high, strict=True):
@@ -154,21 +154,22 @@ def least(
     is_smooth: bool,
     tolerance: float = TOLERANCE,
 ) -> tuple[Floats, bool]:
-    """Find where the cost is least.
+    """Find the minimum of a cost.
 
-    A descent from far off can end in another minimum than the least, such as one in which two modes have
-    changed their parts, or the spike of a filter that diverges. So it begins, and ends, where no change
-    of a single parameter by one of `FACTORS`, or of a calibration's by one of `MOVES`, costs less.
+    A descent from a distant start can end in a local minimum, such as one in which two modes are
+    swapped, or the spike of a diverging filter. The search therefore begins and ends at points at which
+    no change of a single parameter by one of `FACTORS`, or of a calibration parameter by one of `MOVES`,
+    reduces the cost.
 
     Args:
-        cost: what values (n, k) cost.
-        coordinates: what is searched over.
+        cost: computes the costs of values (n, k).
+        coordinates: the coordinates of the search.
         start: (k,), in coordinates.
-        is_smooth: whether the cost has a gradient, so that the search may follow it.
-        tolerance: the share of a smooth cost that a step has to gain for the search to go on.
+        is_smooth: whether the cost has a gradient that the search can follow.
+        tolerance: the relative decrease of a smooth cost below which the search ends.
 
     Returns:
-        Where the cost is least (k,), in coordinates, and whether the search came to its end.
+        The minimum (k,) in coordinates, and whether the search converged.
     """
     point = scanned(cost, coordinates, start)
     for _ in range(DESCENTS):
@@ -182,13 +183,13 @@ def least(
 
 
 def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """Find a point from which no change of one parameter costs less, see `least`.
+    """Move to a point from which no change of a single parameter reduces the cost, see `least`.
 
-    Ends after `ITERATIONS` changes where the cost falls without an end.
+    The scan ends after `ITERATIONS` changes if the cost keeps falling.
 
     Args:
-        cost: what values (n, k) cost.
-        coordinates: what is searched over.
+        cost: computes the costs of values (n, k).
+        coordinates: the coordinates of the search.
         start: (k,), in coordinates.
 
     Returns:
@@ -219,7 +220,7 @@ def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
 def _minimum(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool, tolerance: float
 ) -> tuple[Floats, bool]:
-    """Find the minimum (k,) that the cost falls to, and whether the search converged."""
+    """Find a local minimum (k,) by descent, and whether the descent converged."""
     bounds = coordinates.bounds
     if all(each.is_fixed for each in coordinates.free):
         return bounds[0], True

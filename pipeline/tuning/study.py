@@ -1,8 +1,8 @@
-"""Studies tuning: how well maximum likelihood finds what a scenario was recorded with.
+"""A study of tuning: how well maximum likelihood finds the values with which a scenario was recorded.
 
-Every run is tuned by itself, at several lengths, from the settings of the experiment's one estimator;
-the tuning is not told what is true. How often 95 % intervals hold the truth, how far values are from
-it, and how often the logs are said to tell too little.
+Every run is tuned separately, for several durations, from the settings of the experiment's one
+estimator; the tuning does not know the true values. The study measures how often 95 % intervals cover
+the truth, the errors of the values, and how often the notes report that the logs determine too little.
 """
 
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ COVERAGE = 0.95
 
 
 class TuningOptions(Parameters):
-    """States how long logs are, and what is searched for.
+    """Options of the study: the logs' durations, and the free parameters.
 
     Attributes:
-        durations_s: lengths of the logs, in s.
-        true: the value that each parameter was recorded with, by name; these are searched for.
+        durations_s: durations of the logs, in s.
+        true: the value of each parameter in the recording, by name; these parameters are searched for.
     """
 
     durations_s: tuple[PositiveFloat, ...] = (20.0, 60.0, 300.0)
@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _rows(
     source: MemorySource, label: str, settings: Mapping[str, Any], true: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Return a row per parameter of one log: true and tuned value, interval, standard error, doubt."""
+    """Tune on a log and return per parameter: true and tuned value, interval, standard error, doubt."""
     found = tune(source, {label: settings}, list(true))
     tables, errors = found.parameters.to_dict("records"), found.standard_errors
     return [
@@ -85,7 +85,7 @@ def _rows(
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Sum up runs: coverage, the spread of log(value / true), its standard error, doubts."""
+    """Summarise runs: coverage, the spread of log(value / true), its standard error, doubts."""
     ratios = np.log(rows["value"] / rows["true"])
     return pd.Series(
         {
@@ -98,7 +98,7 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 
 def _chart(summary: pd.DataFrame) -> Chart:
-    """Draw coverage, and the values' spread beside their standard errors, over the logs' length."""
+    """Draw coverage and the spread of values with their standard errors against the logs' duration."""
     x = Axis(label="length of the log (s)", log=True)
     covered = Panel(x=x, y=Axis(label="95 % intervals that hold the truth", limits=(0.0, 1.05)))
     spread = Panel(x=x, y=Axis(label="spread of log(value / true)", log=True))

@@ -1,7 +1,7 @@
-"""Searches for the parameters of an estimator that explain logs best.
+"""Search for the parameters of an estimator that explain logs best.
 
-By maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012,
-chapter 7.
+The main method is maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space Methods,
+2nd ed. 2012, chapter 7.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -58,15 +58,17 @@ from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
-REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
+# a positive parameter without bounds is searched between its start divided by this and times this
+REACH = 1e4
 OPEN = {"gate_probability": 1.0}
-MOVED = 0.5  # of log-likelihood, by which the noise of the controls may change it
-REACHES = np.array([1.0, 3.0, 10.0])  # standard errors off the optimum, where that is looked at
-NOISY_STEP = 0.2  # of differences where they are corrected, in coordinates: two standard errors
-NOISY_REACH = 5.0  # standard errors, to which they reach at most if another step is useful
-NOISY_PAIRS = 32  # of copies that tell what the noise of the controls adds to slopes; a power of two
-DIVERGED = 2.0  # NIS per component: twice what it should be
-ROUNDS = 4  # of searches, each from where filters begin with the values of the one before
+MOVED = 0.5  # change of the log-likelihood from which the noise of the controls matters
+# standard errors from the optimum at which the effect of that noise is evaluated
+REACHES = np.array([1.0, 3.0, 10.0])
+NOISY_STEP = 0.2  # step of differences of a corrected cost, in coordinates: two standard errors
+NOISY_REACH = 5.0  # largest such step in standard errors, if the step follows from a useful error
+NOISY_PAIRS = 32  # pairs of copies for the covariance of slopes; a power of two
+DIVERGED = 2.0  # NIS per component: twice its expected value
+ROUNDS = 4  # searches, each starting where filters begin with the values of the previous one
 
 
 @without_warnings_of_numbers()
@@ -87,32 +89,33 @@ def tune(
     executor: Executor | None = None,
     on_best: Callable[[Best], None] = silent,
 ) -> Tuning:
-    """Search the parameters of an estimator that explain logs best.
+    """Find the parameters of an estimator that explain logs best.
 
     Args:
-        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        logs: one or several logs with the same topics: paths, opened logs or recordings.
         estimator: a registered name, or a label of your own with what it stands for; see `replay`.
-        free: the parameters to search for, by their full names.
-        by: "likelihood" of the measurements, which needs no truth; "nis", mean squares of the normalised
-            innovations of one; "nees" of one; or the least "rmse". By default the likelihood, and "rmse"
-            for an estimator that gives no innovations.
-        set: other parameters, and where the search starts; by default what the log's channels state.
-            And how topics are altered; see `replay`.
-        bounds: between what values a parameter lies; where both are positive, so is the parameter.
-        grid: the search starts from the best of so many values of each parameter between the bounds.
-        validate: logs that are held out, to judge the values by.
-        folds: cut the logs into so many parts, and judge what all others give by each.
+        free: the full names of the parameters to search for.
+        by: what is optimised. "likelihood" is that of the measurements and needs no truth; "nis" brings
+            the mean squares of normalised innovations to one, "nees" those of normalised errors; "rmse"
+            minimises the RMSE. Default: "likelihood", or "rmse" if the estimator gives no innovations.
+        set: values of other parameters, and start values; by default what the log's channels state. It
+            can also alter topics; see `replay`.
+        bounds: the interval of each parameter. If both bounds are positive, the parameter is positive.
+        grid: number of values per parameter between its bounds; the search starts from the best point.
+        validate: held-out logs on which the values are judged.
+        folds: number of folds for cross-validation: each fold is judged with the values from all others.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        workers: processes that share points and logs, as for `run`; by default threads of this one.
+        workers: processes that share points and logs, as for `run`; by default threads of this process.
         scheduler: as for `run`.
         executor: as for `run`.
-        on_best: is told of the best values again and again.
+        on_best: called repeatedly with the best values so far.
 
     Returns:
-        The parameters with 95 % intervals, and the logs replayed with the values before and after.
+        The parameters with 95 % intervals, and replays of the logs with the start and the tuned values.
 
-    Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
-    Raises BadInput where there is nothing to search, or no log can be replayed at the start.
+    Ctrl-C ends the search and keeps the best values so far. The gate is open while "likelihood" or "nis"
+    is optimised. Raises BadInput if there is nothing to search for, or if a log cannot be replayed with
+    the start values.
 
     >>> from fuselog.pipeline.api.api import record
     >>> log = record("landmarks", duration_s=20.0)
@@ -182,25 +185,25 @@ def tune(
 def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
 ) -> AbstractContextManager[WorkerPool | None]:
-    """Return who evaluates; None stands for threads of this process."""
+    """Choose the executor of evaluations; None stands for threads of this process."""
     if workers is None and scheduler is None and executor is None:
         return nullcontext()
     return pool_for(workers, scheduler, 1, executor)()
 
 
 def _criterion(run: Run, bound: Sequence[Bound]) -> By:
-    """Choose by what an estimator is tuned: its likelihood, or errors where it has no innovations."""
+    """Choose the criterion: likelihood, or RMSE if the estimator gives no innovations."""
     outputs = collect(replay(run.ensemble, bound))
     return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
 
 
 def gate_of(bound: Sequence[Bound]) -> float:
-    """Return the probability that a measurement is let in by the gate, if there is one."""
+    """Return the probability with which the gate accepts a correct measurement; 1 without a gate."""
     return float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
 
 
 def _refuse_random(label: str, bound: Sequence[Bound], by: By) -> None:
-    """Raise BadInput where a search would follow the noise of an estimator's own random numbers."""
+    """Raise BadInput if a search would follow the estimator's own random numbers."""
     if CRITERIA[by].is_smooth and any(isinstance(each, Recursive) and each.is_random for each in bound):
         raise BadInput(
             f"estimator {label}: draws random numbers, so that its likelihood changes by chance from "
@@ -216,9 +219,9 @@ def _searched(
     source: Source,
     bound: Sequence[Bound],
 ) -> list[Parameter]:
-    """List what is searched for, by the parameters that an estimator was bound with.
+    """Describe the parameters to search for.
 
-    Raises BadInput where a name is none, stands twice, or its start or bounds cannot be.
+    Raises BadInput for unknown or repeated names, and for start values or bounds that cannot be used.
     """
     if not names:
         raise BadInput("--free: name at least one parameter to search for")
@@ -270,9 +273,9 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
 
 
 def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
-    """Return a number's value on a log for an estimator, by its full name, and whether it is assumed.
+    """Return a parameter's value on a log, by its full name, and whether this value is assumed.
 
-    Raises BadInput where neither the settings nor the log's channels state it.
+    Raises BadInput if neither the settings nor the log's channels state it.
     """
     value: Any = bound.parameters
     for part in [field_of(name)] if is_of_topic(name) else name.split("."):
@@ -288,9 +291,10 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
 
 
 def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
-    """Find the values of least cost, corrected if the noise of the controls moves it; and no spike.
+    """Search for the values with the least cost.
 
-    Ctrl-C ends it, wherever it is, with the best values so far.
+    The cost is corrected if the noise of the controls matters, and a spike of the likelihood is
+    rejected. Ctrl-C ends the search with the best values so far.
     """
     start = np.array([each.default for each in free])
     try:
@@ -302,7 +306,7 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
             found = _settled(objective, free, grid)
         if _is_moved_by_noise(objective, found):
             objective.begin(start)
-            objective(np.array([found.optimum]))  # the best so far, also by the cost from here on
+            objective(np.array([found.optimum]))  # the best so far, measured by the new cost
             found = _settled(objective, free, grid)
         return _confirmed(objective, found)
     except KeyboardInterrupt as stopped:
@@ -314,9 +318,9 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
 
 
 def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
-    """Return how far calibrated parameters may reach that beside values (k,) give fewer measurements.
+    """Return how far calibration parameters reach that lose measurements near values (k,).
 
-    A delay does so if it puts a message before the start.
+    This happens if a delay moves a message to before the start of the filter.
     """
     places = [place for place, each in enumerate(free) if each.useful and not each.is_fixed]
     if not places:
@@ -330,11 +334,11 @@ def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) ->
 
 
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
-    """Correct the cost for the noise of the controls, if that noise may decide where it is least.
+    """Correct the cost for the noise of the controls if this noise may decide where the cost is least.
 
-    It may if it changes the cost by MOVED or more, and by half of what the cost rises, a few standard
-    errors of a parameter away. One alone is too near: where stamps are shifted by half a step, the noise
-    gains most, and about the same on both sides.
+    It may if, a few standard errors of a parameter away, it changes the cost by at least MOVED and by at
+    least half of the cost's rise. One standard error is too near: if stamps are shifted by half a step,
+    the noise gains most, and about equally on both sides.
     """
     if found.confidence is None:
         return False
@@ -361,11 +365,12 @@ def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
 
 
 def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
-    """Find the values of least cost with which filters begin where they began in the search.
+    """Search until filters begin with the values found where they began in the search.
 
-    Without a prior in the log, where a filter begins depends on the values: on how far it trusts its
-    path between the first fixes, say. That is held during a search, else likelihoods of different
-    measurements would be compared; the next search holds where filters begin with the values found.
+    Without a prior in the log, the begin of a filter depends on the values, for example on how much it
+    trusts its path between the first fixes. The begin is fixed during a search, because likelihoods of
+    different measurements cannot be compared; the next search begins with the values found by the
+    previous one.
     """
     start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)
@@ -387,10 +392,10 @@ def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> Sear
 def _held(
     objective: Objective, free: Sequence[Parameter], values: Floats
 ) -> tuple[list[Parameter], dict[str, Any]]:
-    """Keep at its start what of a calibration the motion does not determine, at values (k,).
+    """Fix calibration parameters at their start if the motion does not determine them at values (k,).
 
-    Far from the best values innovations are large, so that it is looked at there once more. What was
-    held before stays so.
+    Innovations are large far from the best values, so that this is tested again near them. Parameters
+    that were fixed before stay fixed.
     """
     places = [place for place, each in enumerate(free) if each.useful]
     if objective.by != "likelihood" or not places:
@@ -413,10 +418,10 @@ def _held(
 def _search(
     objective: Objective, free: Sequence[Parameter], grid: int, point: Floats | None = None
 ) -> SearchOutcome:
-    """Find the values of least cost, and how well they are told; from a point (k,), if given.
+    """Search, from a point (k,) if given, for the values with the least cost and their confidence.
 
-    A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
-    change with one of them.
+    A parameter on which the logs have no information stays at its start. Raises BadInput if the cost
+    does not depend on a parameter.
     """
     start = np.array([each.default for each in free])
     coordinates = coordinates_of(objective, free, start)
@@ -425,7 +430,7 @@ def _search(
     if grid > 1:
         point = least_of_grid(objective, coordinates, grid)
     begin = coordinates.values(scanned(objective, coordinates, point))
-    if not np.array_equal(begin, start):  # where a filter diverges, no unit can be told
+    if not np.array_equal(begin, start):  # no unit can be found where a filter diverges
         coordinates = coordinates_of(objective, free, begin)
         point = coordinates.of(begin)
     is_smooth = CRITERIA[objective.by].is_smooth
@@ -449,9 +454,10 @@ def _search(
 def _confidence_at(
     objective: Objective, coordinates: Coordinates, point: Floats
 ) -> tuple[Floats, Confidence | None, list[str]]:
-    """Compute how well a search tells what lies at no bound, and name that beside which runs fail.
+    """Compute the confidence in parameters that are not at a bound.
 
-    If the cost is corrected for the noise of the controls, the point is moved too, see `_levelled`.
+    Parameters are listed if runs fail close to their values. If the cost is corrected for the noise of
+    the controls, the point is moved too; see `_levelled`.
     """
     inner = np.flatnonzero(~coordinates.at_bounds(point))
     if objective.by != "likelihood" or not len(inner):
@@ -479,11 +485,11 @@ def _confidence_at(
 def _noisy_steps(
     objective: Objective, coordinates: Coordinates, point: Floats, places: Sequence[int]
 ) -> Floats:
-    """Choose steps (m,) of differences of a cost that the noise of the controls makes jagged.
+    """Choose the steps (m,) of differences of a cost that the noise of the controls makes jagged.
 
-    Where shifted stamps meet those of a control, the cost has an edge, by chance up or down. So
-    differences by a calibration's parameter are as wide as its useful error, but at most NOISY_REACH
-    standard errors.
+    The cost has an edge, randomly up or down, where shifted stamps coincide with those of a control.
+    Differences for calibration parameters are therefore as wide as the useful error, but at most
+    NOISY_REACH standard errors.
     """
     free, units = [coordinates.free[place] for place in places], coordinates.units[list(places)]
     useful = np.array([0.0 if each.is_log else each.useful for each in free]) / units
@@ -505,9 +511,10 @@ def _curvature(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Compute a curvature (m, m), by twice the steps if the cost is corrected.
+    """Compute the curvature (m, m), with twice the steps if the cost is corrected.
 
-    Then an edge next to the point changes it as it does the differences of slopes over these steps.
+    An edge next to the point then has the same effect on it as on differences of slopes over these
+    steps.
     """
     times = 2.0 if objective.is_corrected else 1.0
     return curvature(coordinates.over(objective), point, places, times * steps)[1]
@@ -520,9 +527,10 @@ def _levelled(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Move a point to where it costs as much a step (m,) ahead as behind, if such a point is near.
+    """Move a point to where the costs one step (m,) ahead and behind are equal, if such a point is near.
 
-    There the mean of the cost over these steps is least, which no edge of the cost attracts.
+    The mean of the cost over these steps is least there, and edges of the cost do not attract this
+    point.
     """
     low, high = coordinates.bounds
     rows = list(places)
@@ -546,9 +554,9 @@ def _noise_of_slopes(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Compute the covariance (m, m) of the cost's slopes by the noise of the controls.
+    """Compute the covariance (m, m) of the cost's slopes caused by the noise of the controls.
 
-    Not finite where the copies fail.
+    The result is not finite if the copies fail.
     """
     along = steps[:, None] * np.eye(len(point))[list(places)]
     points = coordinates.values(np.concatenate([point + along, point - along]))
@@ -562,15 +570,15 @@ def _noise_of_slopes(
 
 
 def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
-    """Search from a second start, if innovations are too large with the values that were found.
+    """Search from a second start if innovations are too large with the values found.
 
-    If that does not find them again but values that explain the logs less, the optimum is a spike of
-    the likelihood of a filter that diverges, and has no interval.
+    If this search ends at other values that explain the logs less well, the optimum is a spike of the
+    likelihood of a diverging filter, and has no interval.
     """
     if found.confidence is None or objective.nis(found.optimum) < DIVERGED:
         return found
     coordinates = found.coordinates
-    moves = [  # none that the scan makes up for
+    moves = [  # not steps that the scan would undo
         0.0 if each.is_fixed else np.log(2.0) if each.is_log else 2.0 * (each.useful or unit) / unit
         for each, unit in zip(coordinates.free, coordinates.units, strict=True)
     ]
@@ -589,7 +597,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Parameter], grid: int
 ) -> dict[str, Any]:
-    """Return what all other logs give, and what the logs of a fold cost with that."""
+    """Tune on all other logs and compute the cost of the logs of one fold with the result."""
     found = _found(rest, free, grid)
     start = np.array([each.default for each in free])
     costs = left_out(np.array([start, found.optimum]))

@@ -1,4 +1,4 @@
-"""Makes logs with one fault planted, as new users have them: a car with wheels, fixes, a compass.
+"""A benchmark of logs with planted faults: a car with wheels, position fixes and a compass.
 
-Begin with `car`; `study` counts how often the fault is named first.
+Begin with `car`; `battery` counts how often the fault is named first.
 """

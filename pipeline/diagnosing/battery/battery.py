@@ -1,6 +1,6 @@
-"""Counts how often the planted fault of a car's log is the first that a diagnosis names.
+"""A benchmark of how often a diagnosis names the planted fault of a car's log first.
 
-The inertial unit's faults are told without a filter.
+Faults of the inertial unit are found without a filter.
 """
 
 import re
@@ -27,11 +27,11 @@ from fuselog.recorders.checks.lint import compared
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
 UNIT, VELOCITY = "/car/inertial", "/car/velocity"
-UNIT_RUNS = 5  # of each fault of the unit, for one of each cell: they cost a tenth
+UNIT_RUNS = 5  # runs of each fault of the unit per run of a cell: they take a tenth of the time
 
 
 class Right(NamedTuple):
-    """States what a diagnosis should name: kind, topic, component, and the number if it has one."""
+    """What a diagnosis should name: kind, topic, component, and the number if there is one."""
 
     kind: Kind
     topic: str
@@ -66,8 +66,8 @@ RIGHT: dict[str, Sequence[Right]] = {
     "compass clockwise from north": (Right("convention", HEADING, "heading_rad"),),
 }
 
-# The sheet's standard deviations over runs of the numbers that are found, with a compass and without;
-# of noise those of the logarithm of a sigma, half of that of a variance.
+# Standard deviations of the reference implementation's estimates over runs, with and without a compass;
+# for noise, those of the logarithm of a sigma, which is half of that of a variance.
 SPREADS: dict[str, tuple[float, float]] = {
     "fixes .3 s late": (0.00685, 0.0113),
     "turn rate's sign": (0.0056, 0.00616),
@@ -86,7 +86,7 @@ SPREADS: dict[str, tuple[float, float]] = {
     "gyro density / 5": (0.1885, 0.2255),
     "compass + 4.5 deg": (0.00165, np.nan),
 }
-# Of the unit's faults: what is told, of which topic, and the number.
+# Expected finding for each fault of the unit: kind, topic and number.
 UNIT_RIGHT: dict[str, tuple[Kind, str, float] | None] = {
     "nothing": None,
     "accelerometer in g": ("gravity", UNIT, 1.0 / 9.80665),
@@ -99,7 +99,7 @@ UNIT_RIGHT: dict[str, tuple[Kind, str, float] | None] = {
     "E, N exchanged": ("sign", VELOCITY, -1.0),
 }
 
-# Two at once, each of which hides how large the other is.
+# Two faults together, each of which hides how large the other is.
 PAIRS = (
     ("speed x 3.6", "fixes 18 s late"),
     ("E, N exchanged", "speed / 3.6"),
@@ -111,7 +111,7 @@ PAIRS = (
 
 
 class Cell(NamedTuple):
-    """Describes a planted fault, and what the log has beside wheels and fixes."""
+    """A planted fault, and whether the log has a compass and a prior in addition to wheels and fixes."""
 
     fault: str
     has_compass: bool
@@ -119,13 +119,13 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the fault with what the log has."""
+        """Return the fault and what the log has in addition."""
         more = [*["compass"] * self.has_compass, *["prior"] * self.has_prior]
         return ", ".join([self.fault, *more])
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """Yield all faults, with a compass and, those that are not of it, without."""
+    """Yield all faults with a compass and, unless they concern the compass, without one."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):
@@ -133,7 +133,7 @@ def cells(*, has_prior: bool = False) -> Iterator[Cell]:
 
 
 def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
-    """Plant a fault, and look for the likeliest causes, so many at most."""
+    """Plant a fault and search for at most `most` causes."""
     log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
     seen = [each for each in of_log(log, list(log.streams)) if is_told(each)]
     found = seek(log, "ekf", OPEN, most)
@@ -169,7 +169,7 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
 
 
 def unit_tried(fault: str, seed: int) -> dict[str, Any]:
-    """Plant a fault into the unit's log, and see whether it is what is told without a filter."""
+    """Plant a fault in the unit's log and test whether it is found without a filter."""
     found = compared(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
     right = UNIT_RIGHT[fault]
     named = [(each.kind, each.where) for each in found]
@@ -179,12 +179,12 @@ def unit_tried(fault: str, seed: int) -> dict[str, Any]:
         "findings": len(named),
         "is_first": named[:1] == [right[:2]] if right else not named,
         "first": " ".join(named[0]) if named else "",
-        "value": abs(found[0].value) if found else np.nan,  # of half a turn the sign says nothing
+        "value": abs(found[0].value) if found else np.nan,  # for half a turn the sign has no meaning
     }
 
 
 def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False) -> dict[str, Any]:
-    """Plant faults at once into a log with a compass, and see whether three causes name all."""
+    """Plant several faults in a log with a compass and test whether three causes name all of them."""
     log = recorded(faulty(seed, *faults), has_prior=has_prior)
     found = seek(log, "ekf", OPEN, 3)
     named = {one[:3] for cause in found.causes for one in named_by(cause)}
@@ -198,7 +198,7 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
 
 
 def named_by(cause: Cause) -> Iterator[Right]:
-    """Yield what a cause names, and what the log does not tell from it; factors as logarithms."""
+    """Yield what a cause names, with alternatives that the log does not distinguish."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for estimate in each.numbers:
@@ -209,9 +209,9 @@ def named_by(cause: Cause) -> Iterator[Right]:
 def results(
     seeds: Sequence[int], progress: Progress
 ) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
-    """Try all cells, with and without a prior, all pairs, and the unit: with these seeds, it with more.
+    """Compute tables and metrics over all cells with and without a prior, all pairs, and the unit.
 
-    Returns tables and metrics.
+    The unit gets more seeds than the others.
     """
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:
@@ -237,7 +237,7 @@ def results(
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Count the runs of each cell, and those that are right; its median gain, value and spread."""
+    """Count each cell's runs and the correct ones, with median gain, mean value and spread."""
     by = rows.groupby("cell", sort=False)
     return by.agg(
         runs=("seed", "size"),
@@ -250,7 +250,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Count by cell the runs whose fault is named first, and with its number within 4 sigma."""
+    """Count, by cell, runs whose fault is named first, and those whose number is within 4 sigma."""
     found = {
         f"diagnosis.battery_{quantity}.{case_of(row['cell'])}": float(row[quantity])
         for row in summary(rows).to_dict("records")
@@ -268,7 +268,7 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the runs of the unit whose fault is told first, and the spread of the number, by fault."""
+    """Compute by fault how often the unit's fault is found first, and the number's mean and spread."""
     found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
     for fault, own in rows.groupby("fault", sort=False):
         found[f"diagnosis.unit_first.{case_of(str(fault))}"] = float(own["is_first"].sum())
@@ -279,5 +279,5 @@ def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def case_of(cell: str) -> str:
-    """Return a cell's name as the case of a metric."""
+    """Convert a cell's name to the case of a metric."""
     return re.sub(r"[^a-z0-9]+", "-", cell.lower()).strip("-")

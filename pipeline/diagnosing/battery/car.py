@@ -1,7 +1,7 @@
-"""Puts faults into logs of a car that drives after 10 s at rest, with a prior or without.
+"""Faults in logs of a car that drives after 10 s at rest, with or without a prior.
 
-They go by name, as do those of an inertial unit that rides with it. Faults are put into the columns
-themselves, not by what a diagnosis undoes them with.
+Faults of the car and of an inertial unit on it are selected by name. They change the columns directly,
+not with the alterations by which a diagnosis corrects them.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ CLEAN: dict[str, Any] = {
 
 
 def drive(seed: int, **changed: float) -> Car:
-    """Return the car without a fault; `changed` are parameters of its own."""
+    """Simulate the car without a fault; `changed` are parameters of the simulation."""
     return simulated(CarParameters(**{**CLEAN, **changed}), philox(seed))._replace(seed=seed)
 
 
@@ -36,17 +36,17 @@ def drive(seed: int, **changed: float) -> Car:
 
 
 def late(by_s: float) -> Callable[[Car], Car]:
-    """Make fixes say where the antenna was so long before."""
+    """Make fixes report where the antenna was `by_s` earlier."""
     return lambda car: _seen(car._replace(fix_late_s=by_s), car)
 
 
 def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
-    """Make fixes those of an antenna beside the car's own point."""
+    """Make fixes report an antenna away from the car's reference point."""
     return lambda car: _seen(car._replace(lever_m=(forward_m, left_m)), car)
 
 
 def _seen(car: Car, before: Car) -> Car:
-    """Move fixes to where the antenna is, by its place and by how late they are."""
+    """Move fixes to the antenna's position, given its lever arm and the delay of fixes."""
     return car._replace(fix_m=car.fix_m + _antenna(car) - _antenna(before))
 
 
@@ -58,7 +58,7 @@ def _antenna(car: Car) -> Floats:
 
 
 def half_lost(car: Car) -> Car:
-    """Drop half of the odometry, but for its first."""
+    """Drop half of the odometry, except its first message."""
     kept = philox(car.seed + 10**6).random(len(car.odometry_s)) < 0.5
     kept[0] = True
     return car._replace(
@@ -91,12 +91,12 @@ FAULTS: dict[str, Callable[[Car], Car]] = {
 
 
 def faulty(seed: int, *names: str) -> Car:
-    """Return the car with one of the `FAULTS`, or with several, put one after the other."""
+    """Simulate the car with one or several of the `FAULTS`, applied in order."""
     return reduce(lambda car, name: FAULTS[name](car), names, drive(seed))
 
 
 def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
-    """Return the car as a log, which `fl.write` writes; a prior is about the true start."""
+    """Make a log of the car, which `fl.write` can write; a prior is centred on the true start."""
     return source(streams_of(car, has_compass=has_compass, has_prior=has_prior))
 
 
@@ -106,7 +106,7 @@ def source(streams: list[Stream]) -> MemorySource:
 
 
 def car(seed: int, stated: float = 1.0) -> MemorySource:
-    """Return the log without a compass; its fixes state so many times their variance."""
+    """Make a log without a compass whose fixes state `stated` times their true variance."""
     clean = drive(seed)
     return recorded(clean._replace(fix_variance_m2=stated * clean.fix_variance_m2), has_compass=False)
 
@@ -115,7 +115,7 @@ def car(seed: int, stated: float = 1.0) -> MemorySource:
 
 
 class Unit(NamedTuple):
-    """Describes an inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
+    """Samples of an inertial unit on the car, and a receiver's east and north velocities (m, 2)."""
 
     sample_s: Floats
     force_mps2: Floats
@@ -125,7 +125,7 @@ class Unit(NamedTuple):
 
 
 def ride(seed: int) -> Unit:
-    """Return the unit without a fault."""
+    """Simulate the unit without a fault."""
     truth, rng = drive(seed, odometry_step_s=0.02).truth, philox(seed + 500_000)
     n = len(truth.speed_mps)
     force, turn = rng.standard_normal((n, 3)), rng.standard_normal(n)
@@ -149,7 +149,7 @@ def ride(seed: int) -> Unit:
 
 
 def remapped(*axes: tuple[int, int]) -> Callable[[Unit], Unit]:
-    """Make each axis of the force another one with a sign."""
+    """Make a fault that maps each axis of the specific force to another axis with a sign."""
 
     def put(unit: Unit) -> Unit:
         return unit._replace(
@@ -173,7 +173,7 @@ UNIT_FAULTS: dict[str, Callable[[Unit], Unit]] = {
 
 
 def recorded_unit(unit: Unit) -> MemorySource:
-    """Return the log of the unit and of the receiver's velocities."""
+    """Make a log of the unit and of the receiver's velocities."""
     zero = np.zeros_like(unit.turn_radps)
     samples = make_stream(
         "/car/inertial",

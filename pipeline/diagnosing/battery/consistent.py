@@ -1,7 +1,7 @@
-"""Counts the causes that are named in logs of the car with nothing wrong, whatever noise is the largest.
+"""A count of causes that are named in logs of the car without any fault, for many ratios of noise.
 
-The wheels have the noise of `car`. Their error between two fixes is a multiple of the error of a fix,
-and between two headings a multiple of that of a heading; the options list these ratios.
+The wheels have the noise of `car`. Their error between two fixes is a multiple of a fix's error, and
+between two headings a multiple of a heading's error; the options list these ratios.
 """
 
 from itertools import product
@@ -21,25 +21,26 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 
 class FalseCausesOptions(Parameters):
-    """States which settings of the noise are tried: each of one with each of the other.
+    """Options of the study: noise ratios, each combined with each of the other list.
 
     Attributes:
         to_fix: ratios of the wheels' error between two fixes to the error of a fix.
-        to_compass: ratios of their error between two headings to that of a heading; 0 is no compass.
+        to_compass: ratios of their error between two headings to that of a heading; 0 stands for no
+            compass.
     """
 
     to_fix: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.1, 0.3, 1.0, 3.0, 10.0)
     to_compass: Annotated[tuple[NonNegativeFloat, ...], Field(min_length=1)] = (0.0, 0.1, 1.0, 10.0)
 
     def ratios(self) -> list["Ratios"]:
-        """Return all settings."""
+        """Return all combinations."""
         return [
             Ratios(to_fix, to_compass) for to_compass, to_fix in product(self.to_compass, self.to_fix)
         ]
 
 
 class Ratios(NamedTuple):
-    """States how many times larger the wheels' error between two messages is than a message's own."""
+    """Ratios of the wheels' error between two messages to the error of a message."""
 
     to_fix: float
     to_compass: float  # 0: there is no compass
@@ -57,13 +58,13 @@ class Ratios(NamedTuple):
 
 
 def log_of(ratios: Ratios, seed: int) -> MemorySource:
-    """Return a log in which nothing is wrong."""
+    """Make a log without a fault."""
     car = drive(seed, **ratios.noise)
     return recorded(car, has_compass=ratios.to_compass > 0.0, has_prior=True)
 
 
 def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
-    """Look for a cause in a log in which nothing is wrong; it has no name if none is found."""
+    """Search for a cause in a log without a fault; its name is empty if none is found."""
     found = seek(log_of(ratios, seed), "ekf", {"kind": "ekf", "gate_probability": 1.0}, 1)
     named = [cause.hypothesis.name for cause in found.causes]
     return {**ratios._asdict(), "seed": seed, "cause": named[0] if named else ""}

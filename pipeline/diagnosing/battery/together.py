@@ -1,6 +1,6 @@
-"""Counts how often several faults that are planted into a car's log at once are all named, with values.
+"""A count of how often several faults planted in a car's log are all named, with their values.
 
-The logs have a compass and a prior, so that most faults can be told apart.
+The logs have a compass and a prior, so that most faults can be distinguished.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,8 @@ from fuselog.replay.judging.intervals import Interval
 
 PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"
-# What each fault is of. Two faults of one number hide one another, such as opposite factors.
+# The quantity that each fault changes. Two faults of one quantity hide each other, such as opposite
+# factors.
 FIELDS: dict[str, Sequence[str]] = {
     "stamps of fixes": ("fixes .3 s late", "fixes 18 s late"),
     "turn rate": ("turn rate's sign", "degrees as radians", "gyro bias .02", "gyro bias .0004 t"),
@@ -37,44 +38,44 @@ FIELDS: dict[str, Sequence[str]] = {
     "noise of turns": ("gyro density / 5",),
     "compass": ("compass + 4.5 deg", "compass clockwise from north"),
 }
-# Any two of these are the third: each mirrors one of what turns, where the car is and its heading.
+# Any two of these amount to the third: each mirrors one of turn rate, position and heading.
 MIRRORS = {"turn rate's sign", AXES, "compass clockwise from north"}
 # Fixes that are 3.6 times too far apart explain both: they also look 3.6 times noisier.
 ALIKE = {"speed / 3.6", "fix variance / 16"}
-# Lost messages are told by the stamps, and "nothing" is no fault.
+# Lost messages are found by the stamps, and "nothing" is no fault.
 NOT_PAIRED = {"nothing", "half of the odometry lost"}
 
 
 class TogetherOptions(Parameters):
-    """States how many sets of faults are tried.
+    """Options of the study: the number of sets of faults.
 
     Attributes:
-        pairs: how many of the pairs, from the first on.
-        triples: how many of the triples.
+        pairs: the number of pairs, from the first on.
+        triples: the number of triples.
     """
 
     pairs: Annotated[int, Field(ge=1, le=PAIRS)] = PAIRS
     triples: Annotated[int, Field(ge=1, le=TRIPLES)] = TRIPLES
 
     def sets(self) -> list[tuple[str, ...]]:
-        """Return the pairs, and then the triples."""
+        """Return the pairs, followed by the triples."""
         return [*pairs()[: self.pairs], *triples()[: self.triples]]
 
 
 def pairs() -> list[tuple[str, ...]]:
-    """Return all pairs of faults of different fields that a log can tell apart."""
+    """Return all pairs of faults of different quantities that a log can distinguish."""
     return [each for each in combinations(_in_order(), 2) if _is_told(each)]
 
 
 def triples() -> list[tuple[str, ...]]:
-    """Return some of the triples of which a log can tell each two apart, drawn once for all."""
+    """Return a fixed random choice of triples whose faults a log can distinguish in pairs."""
     every = [each for each in combinations(_in_order(), 3) if _is_told(each)]
     chosen = philox(63).choice(len(every), TRIPLES, replace=False)
     return [every[place] for place in sorted(chosen.tolist())]
 
 
 def _in_order() -> list[str]:
-    """Return the faults as they are put: axes are exchanged after all else of fixes."""
+    """Return the faults in the order in which they are planted: axes are swapped last."""
     return sorted((name for name in FAULTS if name not in NOT_PAIRED), key=lambda name: name == AXES)
 
 
@@ -85,7 +86,7 @@ def _is_told(faults: Sequence[str]) -> bool:
 
 
 def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
-    """Plant faults, look for causes, and see which are named and whether intervals have the values."""
+    """Plant faults, and test whether causes name them with intervals that cover the values."""
     log = recorded(faulty(seed, *faults), has_prior=True)
     causes = seek(log, "ekf", OPEN, MOST_SENTENCES).causes
     planted = [RIGHT[name][0] for name in faults]
@@ -109,7 +110,7 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def _estimate(causes: Sequence[Cause], right: Right) -> Interval | None:
-    """Return the number of a planted fault, by any name that causes have for it; of noise logarithms."""
+    """Return the number that causes give for a planted fault, under any name; logarithms for noise."""
     for cause in causes:
         for each in (cause, *cause.others):
             for number in each.numbers:
@@ -137,13 +138,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _seeds(experiment: Experiment, case: int) -> range:
-    """Give each case seeds of its own: logs of one seed have the same noise, and so the same misses."""
+    """Return the seeds of a case; logs of one seed would share their noise, and so their misses."""
     first = experiment.seed + case * experiment.runs
     return range(first, first + experiment.runs)
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Count over all logs, over pairs and triples, and by what was planted."""
+    """Count over all logs, over pairs and triples, and by planted faults."""
     metrics = dict[str, float]()
     for case, own in (("pairs", rows[rows["planted"] == 2]), ("triples", rows[rows["planted"] == 3])):
         metrics |= {

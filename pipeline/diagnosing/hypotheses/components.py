@@ -1,4 +1,4 @@
-"""Tries faults of the numbers read of a topic: factors, signs, biases, axes, conventions."""
+"""Hypotheses on the numbers read from a topic: factors, signs, biases, axes, conventions."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -26,14 +26,14 @@ from fuselog.replay.engine.replaying.estimator import Reading
 FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
 ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)
 TURNS_RAD = (0.5 * np.pi, -0.5 * np.pi, np.pi)
-SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # of how much what is read varies
-LARGEST_FACTOR = 12.0  # its logarithm
+SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # shares of the variation of the numbers
+LARGEST_FACTOR = 12.0  # a logarithm
 
 
 def of_components(
     stream: Stream, reading: Reading | None, parameters: Parameters | None, first_ns: int
 ) -> Iterator[Hypothesis]:
-    """Yield all faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
+    """Yield all faults of the numbers of a topic; a drifting bias begins to grow at `first_ns`."""
     is_control = reading is not None and stream.topic in reading.controls
     entries = entries_of(stream, reading)
     if "latitude_deg" in stream.columns:
@@ -58,16 +58,16 @@ def of_components(
             continue
         whole = Entry(field, None, field, False, None, 1.0)
         yield _factor(stream.topic, whole, 0.0 if is_control else len(places), None)
-        if len(places) > 2:  # of two it is half a turn
+        if len(places) > 2:  # for two axes this is half a turn
             yield _sign(stream.topic, whole)
         for pair in combinations(places, 2):
             yield _exchange(stream.topic, field, pair)
 
 
 class _Own(NamedTuple):
-    """Names the parameters that a number of a topic has: its bias, and its factor.
+    """The parameters of a number of a topic: its bias and its factor.
 
-    `bias_sign` is by what a bias of the number is multiplied for the parameter's, whose value is
+    A bias of the number is multiplied by `bias_sign` to give that of the parameter, whose value is
     `bias_value`.
     """
 
@@ -214,7 +214,7 @@ def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:
 
 
 def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis]:
-    """Suppose faults of the headings of orientations."""
+    """Yield faults of the headings of orientations."""
 
     def words(at: float, low: float, high: float) -> str:
         at, low, high = (float(np.degrees(each)) for each in (at, low, high))

@@ -1,4 +1,4 @@
-"""Tries faults of numbers: two of a map, or two topics, stand for each other."""
+"""Hypotheses on identifiers: two numbers of a map, or two topics, are swapped."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -15,14 +15,14 @@ from fuselog.replay.engine.replaying.estimator import Bound
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.errors.evaluation import split_topic
 
-SUSPECT = 2.0  # a mean NIS per component, above which numbers may be exchanged
-SUSPECTS = 12  # of which all pairs are tried
+SUSPECT = 2.0  # mean NIS per component above which numbers may be swapped
+SUSPECTS = 12  # number of suspects of which all pairs are tried
 
 
 def of_numbers(
     bound: Sequence[Bound], source: MemorySource, innovations: Mapping[str, Stream]
 ) -> Iterator[Hypothesis]:
-    """Suppose that two numbers of a map, or two topics, stand for each other."""
+    """Yield hypotheses that two numbers of a map, or two topics, are swapped."""
     maps = {
         topic: field.name
         for each in bound
@@ -55,12 +55,12 @@ def of_numbers(
 
 
 def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
-    """Return the trial with the messages of two topics exchanged."""
+    """Make a function that swaps the messages of two topics in a trial."""
     return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Choose those with the largest mean NIS, if that is too large at all."""
+    """Choose the parts with the largest mean NIS, if any is too large."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

@@ -1,4 +1,4 @@
-"""Defines a hypothesis: one thing that may be wrong, and how it is undone."""
+"""The definition of a hypothesis: one possible fault, and how to correct it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,35 +16,37 @@ from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters, field_of
 from fuselog.replay.engine import chi2
 
-Number = Any  # a float; of a fault of several numbers a tuple of floats
+Number = Any  # a float, or a tuple of floats for a fault of several numbers
 NOISES = ("measurement noise", "process noise")
-COMPONENTS = 3  # of a measurement, hardly more
-SPIKE = 10.0  # of log-likelihood that it falls within a standard error: 20 times what it may
+COMPONENTS = 3  # of a measurement; rarely more
+# drop in log-likelihood within a standard error above which a peak is a spike: 20 times the expected
+SPIKE = 10.0
 SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
-PARTS = 20  # of a log, whose slopes are compared
-FALL = 2.0  # of log-likelihood, about, from its greatest to where its slope is taken
-BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)  # an inflation in 1 of 1,000 logs
+PARTS = 20  # parts of a log whose slopes are compared
+FALL = 2.0  # approximate drop in log-likelihood from the maximum to where the slope is taken
+# an inflation that occurs in 1 of 1,000 logs
+BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Describes one way in which a log or its settings may be wrong.
+    """One way in which a log or its settings may be wrong.
 
     Attributes:
-        kind: what those that cannot be told apart have in common.
-        topic: the topic that it is of, or the parameter.
-        part: the component of the topic, if it is of one.
-        tried: numbers to begin the search with, the first two of them nearest to zero; none where it is
-            so, or is not. Of a fault of several numbers the step of each.
-        limit: of the number's magnitude.
-        without: the trial without the fault of this number.
-        words: what is wrong, from the number and the ends of its 95 % interval.
-        mend: what to try against this number; None where it is done already.
-        specials: numbers that are tried as they are, such as the factor of a unit.
-        size: of how many numbers it is.
-        floor: of the magnitude: what is less is no fault.
-        reported: the number as tables have it: a factor, where it is searched by its logarithm.
-        already: how much of it a parameter undoes already, which the number adds to.
+        kind: the common name of faults that cannot be distinguished.
+        topic: the topic, or the parameter, that is wrong.
+        part: the component of the topic, if only one is wrong.
+        tried: numbers to begin the search with, the first two nearest to zero; empty for a fault without
+            a number. For a fault of several numbers, the step of each.
+        limit: the largest magnitude of the number.
+        without: returns the trial without a fault of this number.
+        words: describes the fault, from the number and the ends of its 95 % interval.
+        mend: returns advice for this number; None if it is followed already.
+        specials: numbers that are tried exactly, such as the factor of a unit.
+        size: how many numbers the fault has.
+        floor: the magnitude below which the number is no fault.
+        reported: converts the number for tables, for example from a logarithm to a factor.
+        already: the part that a parameter corrects already, to which the number is added.
     """
 
     kind: Kind
@@ -63,12 +65,12 @@ class Hypothesis:
 
     @property
     def has_end(self) -> bool:
-        """Tell whether what lies beyond the limit is not searched; an angle is, where it comes round."""
+        """Test whether the search ends at the limit; that of an angle does not, since it wraps."""
         return bool(self.tried) and self.size == 1 and self.limit not in (np.pi, np.inf)
 
     @property
     def name(self) -> str:
-        """Return what it is of, in a few words."""
+        """Return a short name of the fault."""
         return " ".join(filter(None, (self.kind, self.topic, self.part)))
 
 
@@ -84,7 +86,7 @@ def supposed(
     advice: Advice | None,
     reported: Callable[[float], float] = float,
 ) -> Hypothesis:
-    """Return the hypothesis of what is so or is not, and has no number: see `Hypothesis`."""
+    """Make a hypothesis without a number, see `Hypothesis`."""
     return Hypothesis(
         kind,
         topic,
@@ -102,9 +104,9 @@ def supposed(
 def in_topic(
     topic: str, alteration: alter.Alteration, stretched: float = 0.0
 ) -> Callable[[Trial, Any], Trial]:
-    """Return the trial with the opposite of an alteration of a topic.
+    """Make a function that applies the opposite of an alteration to a topic of a trial.
 
-    `stretched` is by how much the number stretches what is measured, see `Trial`.
+    `stretched` is the factor by which the number stretches measurements, see `Trial`.
     """
 
     def without(trial: Trial, value: Any) -> Trial:
@@ -120,12 +122,12 @@ def in_topic(
 
 
 def has(parameters: Parameters | None, name: str) -> bool:
-    """Tell whether there is a parameter of this name."""
+    """Test whether the parameters have one of this name."""
     return parameters is not None and name in type(parameters).model_fields
 
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
-    """Return a parameter that a topic is read with: as given, or stated by the channel, or zero."""
+    """Return a parameter of a topic: as given, or as stated by the channel, or zero."""
     if not has(parameters, field_of(name)):
         return 0.0
     value = getattr(parameters, field_of(name))
@@ -134,7 +136,7 @@ def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
 
 
 def times(at: float, low: float, high: float) -> str:
-    """Say by what factor a standard deviation is wrong, from logarithms."""
+    """Describe the factor by which a standard deviation is wrong, from logarithms."""
     least, most = (
         "1" if at * end <= 0 else number(np.exp(abs(end))) for end in sorted((low, high), key=abs)
     )
@@ -143,14 +145,14 @@ def times(at: float, low: float, high: float) -> str:
 
 
 def size_of(at: float) -> str:
-    """Say whether it is too small or too large by so much."""
+    """Return "small" or "large" for what is too small or too large by this logarithm."""
     return "small" if at > 0.0 else "large"
 
 
 def in_sense(
     at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
 ) -> tuple[str, float, float, float]:
-    """Return the word for a number's sign, the number's size, and its interval in that sense.
+    """Return the word for a number's sign, the number's size, and its interval in that direction.
 
     >>> in_sense(-0.3, -0.4, -0.2)
     ('too small', 0.3, 0.2, 0.4)
@@ -161,7 +163,7 @@ def in_sense(
 
 
 def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
-    """Return what undoing faults of these numbers, each by itself, gains over a trial."""
+    """Make a function that computes the gains of correcting single faults over a trial."""
     known: list[float] = []  # the trial's own log-likelihood
 
     def gains(asked: Sequence[tuple[Hypothesis, Number]]) -> list[float]:
@@ -173,12 +175,12 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
 
 
 def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, gain: float) -> bool:
-    """Tell whether the gain of a noise falls faster beside its peak than so many measurements allow.
+    """Test whether the gain of a noise falls faster next to its peak than the measurements allow.
 
-    Each of n measurements of m components tells at most 2 m of the information on the logarithm of a
-    standard deviation (Fisher's, of a Gaussian), so that the gain falls by about 1/2 within
-    (2 m n)^-1/2. A faster fall is that of a filter that diverges for most values: the likelihood is
-    jagged there, and its peak is none.
+    Each of n measurements with m components holds at most 2 m of the (Fisher) information on the
+    logarithm of a standard deviation, so that the gain falls by about 1/2 within (2 m n)^-1/2. A faster
+    fall means that the filter diverges for most values: the likelihood is jagged there, and its peak has
+    no meaning.
     """
     if of.kind not in NOISES:
         return False
@@ -189,13 +191,13 @@ def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, g
 def noise_gain_over(
     likelihood: Likelihood, now: Trial
 ) -> Callable[[Hypothesis, Number], tuple[float, float]]:
-    """Return a function that says what undoing a fault gains by the noise of the controls alone.
+    """Make a function that computes the gain of correcting a fault caused by control noise.
 
-    The mean and the standard deviation over logs, see `fuselog.pipeline.tuning.control_noise`. Of noises
-    and
-    outliers it is zero: their likelihood is meant to have that noise.
+    It returns the mean and the standard deviation over logs, see
+    `fuselog.pipeline.tuning.control_noise`. For noises and outliers both are zero: their likelihood is
+    meant to contain that noise.
     """
-    most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, all of it this noise
+    most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, if all of it were this noise
 
     @cache
     def disturbed() -> tuple[list[Trial], NDArray[np.float64]]:
@@ -212,35 +214,35 @@ def noise_gain_over(
         gained = gained[np.isfinite(gained)]  # a filter may fail with more noise
         if len(gained) < 2:
             return 0.0, 0.0
-        mean = float(np.clip(np.mean(gained), -most, most))  # more where a filter diverges
+        mean = float(np.clip(np.mean(gained), -most, most))  # it would be larger if a filter diverges
         variance = min(float(np.var(gained, ddof=1)) * (1.0 + 1.0 / len(gained)), most)
-        # and together with the noise of the measurements: a likelihood ratio varies by twice its mean
+        # with the noise of the measurements: the variance of a likelihood ratio is twice its mean
         return mean, (variance + 2.0 * max(mean, 0.0)) ** 0.5
 
     return gain
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute what each pair of opposite noises costs the first trial in log-likelihood (pairs,)."""
+    """Compute the costs (pairs,) of pairs of opposite noises on the first trial in log-likelihood."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)
 
 
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:
-    """Return a function that says how many times smaller than it looks a fault's gain is.
+    """Make a function that computes the inflation of a fault's gain.
 
-    Where the log's parts disagree about the number more than their likelihoods say, a gain is so many
-    times smaller than it looks: the variance of the slopes of PARTS of the log, at the greatest gain, is
-    compared with the curvature of all, which is the same where the model is right. Kent, Robust
-    properties of likelihood ratio tests, Biometrika 69, 1982, pages 19 to 27. It is 1 where chance may
-    explain it, and of what is so or is not, where no number is known.
+    If parts of the log disagree about the number more than their likelihoods imply, the gain is inflated
+    by this factor: the variance of the slopes of PARTS of the log at the maximum is compared with the
+    curvature of the whole, which is equal to it for a correct model. Kent, Robust properties of
+    likelihood ratio tests, Biometrika 69, 1982, pages 19 to 27. The factor is 1 if chance may explain
+    the disagreement, and for faults without a number.
     """
 
     def inflation(of: Hypothesis, value: Number, gain: float) -> float:
         if not of.tried:
             return 1.0
-        step = min(1.0, (FALL / gain) ** 0.5)  # the gain is about a parabola from zero
+        step = min(1.0, (FALL / gain) ** 0.5)  # from zero, the gain is about a parabola
         below, at, above = likelihood.over_parts(
             [of.without(now, _times(value, each)) for each in (1.0 - step, 1.0, 1.0 + step)], PARTS
         )

@@ -1,4 +1,4 @@
-"""Lists all that may be wrong of a run and the estimator that is bound to it."""
+"""A list of all hypotheses on a run and the estimator that is bound to it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,7 +19,7 @@ from fuselog.pipeline.diagnosing.likelihood import Trial
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Bound, Reading
 
-FEWEST = 20  # messages of which a topic's errors can be told
+FEWEST = 20  # fewest messages from which a topic's errors can be found
 
 
 def hypotheses(
@@ -28,13 +28,13 @@ def hypotheses(
     innovations: Mapping[str, Stream],
     readings: Mapping[str, Reading],
 ) -> list[Hypothesis]:
-    """Return all that may be wrong.
+    """List all hypotheses.
 
     Args:
-        bound: what is estimated.
-        base: the run as it is, and the settings.
-        innovations: of the run as it is, without a gate.
-        readings: by what is estimated, what is read.
+        bound: the bound estimators.
+        base: the unaltered run, and the settings.
+        innovations: of the unaltered run, without a gate.
+        readings: what is read, by the name of what is estimated.
     """
     source, parameters = base.source, bound[0].parameters
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))

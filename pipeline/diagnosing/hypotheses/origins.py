@@ -1,4 +1,4 @@
-"""Tries faults of the origin of positions, or of the plane that geodetic fixes are taken into."""
+"""Hypotheses on the origin of positions, or of the tangent plane of geodetic fixes."""
 
 from collections.abc import Callable, Iterator
 
@@ -19,7 +19,7 @@ Metres = tuple[float, float]
 
 
 def of_origin(stream: Stream, reading: Reading | None) -> Iterator[Hypothesis]:
-    """Suppose another origin than a topic's positions are given in, or geodetic fixes state."""
+    """Yield another origin than that of a topic's positions, or than geodetic fixes state."""
     if "latitude_deg" in stream.columns:
         yield from _of_geodetic(stream)
     elif "position_m" in stream.columns and reading and stream.topic not in reading.controls:
@@ -47,14 +47,14 @@ def _of_positions(stream: Stream) -> Hypothesis:
 
 
 def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
-    """Suppose another origin than geodetic fixes state; nothing where they state none."""
+    """Yield another origin than geodetic fixes state; nothing if they state none."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return
     origin = stated
 
     def right(by_m: Metres) -> Origin:
-        """Return the origin, where fixes are so far east and north of where they should be."""
+        """Compute the origin from the eastward and northward errors of fixes."""
         latitude, longitude, _ = out_of_tangent_plane(by_m, origin)
         return origin._replace(latitude_deg=float(latitude), longitude_deg=float(longitude))
 

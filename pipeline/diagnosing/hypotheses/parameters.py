@@ -1,4 +1,4 @@
-"""Tries faults of parameters: noise, what may be estimated beside the state, and the gate."""
+"""Hypotheses on parameters: noise, what may be estimated in addition to the state, and the gate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -42,14 +42,14 @@ from fuselog.replay.foreign.programs import ProgramParameters
 GATE = 0.999
 REOPENS_S, NEVER_S = 1.0, 1e9
 LARGEST_SCALE = 12.0  # a logarithm
-# By unit the step from which a parameter is searched; without one a share.
+# First step of the search for a parameter, by unit; without a unit, it is a factor.
 STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0.1, "": 0.02}
 
 
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """Yield the noise that the estimator's parameters state, channels for them, or that is assumed."""
+    """Yield noises that are assumed, or stated by the estimator's parameters or by channels."""
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
     parameters = bound[0].parameters
     if parameters is None:
@@ -62,10 +62,10 @@ def of_noises(
 
 
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
-    """Suppose other values of the numbers that an estimator declares; of one whose reading is not known.
+    """Yield other values of the numbers that an estimator declares, if its reading is unknown.
 
-    What is a noise, or cannot be below zero, is scaled; and so is a number above zero in the command of
-    a program that reads a log, which says no more of it.
+    Noises and numbers that cannot be negative are scaled, and so are positive numbers in the command of
+    a program that reads a log, which states no more about them.
     """
     parameters = bound[0].parameters
     if parameters is None:
@@ -83,7 +83,7 @@ def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypoth
 
 
 def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
-    """Suppose that a number above zero is stated too small or too large by a factor."""
+    """Make a hypothesis that a positive number is too small or too large by a factor."""
     name, what = of.name, in_few_words(of.meaning)
     named = f"{name} ({what})" if what else name
     letter = {"measurement noise": "R", "process noise": "Q"}.get(kind)
@@ -103,7 +103,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
-    """Return the value of a number: given, stated by a channel, or assumed; NaN where it has none."""
+    """Return the value of a number: given, stated by a channel, or assumed; NaN if there is none."""
     for each in bound:
         with suppress(BadInput):
             value, _ = value_at_start(name, source, each)
@@ -113,7 +113,7 @@ def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
-    """Yield the covariances that messages state, or their channel for them."""
+    """Yield the covariances that messages, or their channels, state."""
     fields = [
         (field, alter.spread(field))
         for field in ("covariance_m2", "covariance_m2ps2", "covariance")
@@ -130,7 +130,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
         def mend(at: float) -> Advice:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
 
-        # undone by a covariance that is larger, where it is stated too small
+        # a covariance stated too small is corrected by a larger one
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
         yield Hypothesis(
@@ -139,7 +139,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
 
 
 def _factor(logarithm: float) -> float:
-    """Return how many times as large a standard deviation should be."""
+    """Convert a logarithm to the factor of a standard deviation."""
     return float(np.exp(logarithm))
 
 
@@ -148,10 +148,11 @@ def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float
 
 
 def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
-    """Suppose other values of the parameters that may be estimated; of one unit they are a vector.
+    """Yield other values of parameters that may be estimated; those of one unit form a vector.
 
-    Those that are the bias or factor of a number of a topic are left out: that is tried by itself.
-    Angles are tried one by one as well, all around: a unit is mounted a quarter turn off, not by three.
+    Biases and factors of a topic's numbers are left out, because they are tried separately. Angles are
+    also tried one by one over the full circle: a unit is mounted a quarter turn off about one axis, not
+    about three.
     """
     parameters = bound[0].parameters
     groups: dict[tuple[Any, ...], list[str]] = {}
@@ -180,7 +181,7 @@ def _parameters(
     *,
     is_angle: bool,
 ) -> Hypothesis:
-    """Suppose that some parameters have other values; the numbers are by how much."""
+    """Make a hypothesis that some parameters have other values; its numbers are the differences."""
     size = len(names)
 
     def numbers(by: Any) -> tuple[float, ...]:
@@ -224,10 +225,10 @@ def _parameters(
 
 
 def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
-    """Suppose that some measurements are of something else; a gate keeps these out.
+    """Yield the hypothesis that some measurements are outliers; a gate rejects them.
 
-    The number is after how many seconds the gate opens again: `REOPENS_S` for single outliers, and
-    `NEVER_S` for a stretch of them, of which another one would be accepted each second.
+    The number is the time in seconds after which the gate opens again: `REOPENS_S` for single outliers,
+    and `NEVER_S` for a stretch of them, of which another one would be accepted every second.
     """
     if not has(parameters, "gate_probability"):
         return

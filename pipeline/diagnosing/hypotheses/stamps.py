@@ -1,4 +1,4 @@
-"""Tries faults of stamps: messages are late, or a clock gains."""
+"""Hypotheses on stamps: delayed messages, or a drifting clock."""
 
 from collections.abc import Iterator, Mapping
 
@@ -18,8 +18,8 @@ SPECIAL_S = {18.0: "the leap seconds between GPS and UTC", -18.0: "the leap seco
 RATES = (-1e-4, 1e-4, -1e-3, 1e-3, -0.01, 0.01, -0.03, 0.03, -0.1, 0.1)
 LONGEST_DELAY_S, LARGEST_RATE = 30.0, 0.2
 LAGS_S = np.arange(-30.0, 30.05, 0.1)
-FEWEST = 20  # speeds that tell a lag
-MOST_CELLS = 1_000_000  # of lags and speeds that are held at once
+FEWEST = 20  # fewest speeds from which a lag is found
+MOST_CELLS = 1_000_000  # lags times speeds in memory at a time
 
 
 def of_stamps(
@@ -30,15 +30,15 @@ def of_stamps(
     hold_s: float,
     lags_s: tuple[float, ...],
 ) -> Iterator[Hypothesis]:
-    """Yield a topic's delay and its clock.
+    """Yield a topic's delay and its clock drift.
 
     Args:
         stream: the topic's messages.
-        reading: of what is estimated.
-        parameters: the estimator's, one of which may be this delay.
-        first_ns: where the run begins.
-        hold_s: half of how long a control holds: a smaller delay is how it is held, and no fault.
-        lags_s: what else may be its delay.
+        reading: what is read for the estimated object.
+        parameters: the estimator's parameters, one of which may be this delay.
+        first_ns: the first stamp of the run.
+        hold_s: half of the time for which a control holds; a smaller delay is no fault.
+        lags_s: further delays to try.
     """
     topic = stream.topic
     own = reading.delays.get(topic, "") if reading else ""
@@ -82,7 +82,7 @@ def of_stamps(
 
 
 def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
-    """Return half of the longest usual step of what drives, in s."""
+    """Return half of the longest median step of the controls, in s."""
     steps = [
         np.median(np.diff(streams[topic].publish_time_ns))
         for topic in controls
@@ -92,9 +92,10 @@ def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
 
 
 def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
-    """Find how much later the speeds of positions are than a control that goes with them, in s.
+    """Estimate the lag of the speeds of positions behind a control that correlates with them, in s.
 
-    By the best correlation over a grid; a tenth of a second is near enough to begin a search at.
+    The lag has the best correlation over a grid of a tenth of a second, which is near enough to begin a
+    search.
     """
     if "position_m" not in stream.columns or len(stream) < FEWEST:
         return ()
@@ -119,12 +120,12 @@ def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
 
 
 def _correlations(rows: Floats, column: Floats, is_in: NDArray[np.bool_]) -> Floats:
-    """Correlate each row (k, n) with a column (n,) where both count; -1 where that is unknown."""
+    """Correlate each row (k, n) with a column (n,) over common values; -1 if unknown."""
     count = np.maximum(is_in.sum(axis=1, keepdims=True), 1)
     rows, columns = (
         np.where(is_in, each - np.where(is_in, each, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
         for each in (rows, column)
     )
     size = np.sqrt((rows**2).sum(axis=1) * (columns**2).sum(axis=1))
-    is_known = (count[:, 0] >= FEWEST) & (size > 0.0)  # false where one is NaN
+    is_known = (count[:, 0] >= FEWEST) & (size > 0.0)  # false if one is NaN
     return np.where(is_known, (rows * columns).sum(axis=1) / np.where(is_known, size, 1.0), -1.0)
