@@ -1,0 +1,104 @@
+"""Finds habits and terms of `words.toml` in the prose of pages, docstrings, comments and messages."""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[2]
+ROOMS = ("fuselog", "recorders", "replay", "pipeline")
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
+CODE = re.compile(r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+", re.DOTALL)
+LEAST_BLANKS = 2  # of a string that counts as prose
+
+
+class Habit(NamedTuple):
+    """A word or a way of writing to avoid: its pattern, what to write, and other senses."""
+
+    pattern: re.Pattern[str]
+    write: str
+    other_sense: re.Pattern[str] | None
+
+
+class Text(NamedTuple):
+    """A piece of prose with the line of its file on which it begins."""
+
+    line: int
+    words: str
+
+
+def habits() -> list[Habit]:
+    """Read the list of habits and terms."""
+    with (Path(__file__).parent / "words.toml").open("rb") as file:
+        listed = tomllib.load(file)
+    return [
+        Habit(
+            re.compile(each["pattern"], re.IGNORECASE | re.MULTILINE),
+            each["write"],
+            re.compile(each["except"], re.IGNORECASE) if "except" in each else None,
+        )
+        for each in [*listed["term"], *listed["habit"]]
+    ]
+
+
+def texts_of_code(source: str) -> Iterator[Text]:
+    """Yield the docstrings, other strings of several words, and comments of a Python file."""
+    for node in ast.walk(ast.parse(source)):
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and node.value.count(" ") >= LEAST_BLANKS
+        ):
+            yield Text(node.lineno, node.value)
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield Text(token.start[0], token.string.lstrip("# "))
+
+
+def texts_of(path: Path) -> Iterable[Text]:
+    """Return the prose of a file."""
+    source = path.read_text(encoding="utf-8")
+    return texts_of_code(source) if path.suffix == ".py" else [Text(1, source)]
+
+
+def faults_of(text: Text, listed: Iterable[Habit]) -> Iterator[tuple[int, str, Habit]]:
+    """Yield the line, the words and the habit of each place to rewrite. Code in the text is left out."""
+    words = CODE.sub(lambda code: re.sub(r"[^\n]", "\0", code[0]), text.words)
+    for habit in listed:
+        for found in habit.pattern.finditer(words):
+            around = words[max(found.start() - 40, 0) : found.end() + 40]
+            if habit.other_sense is None or not habit.other_sense.search(around):
+                yield text.line + words.count("\n", 0, found.start()), found[0].strip(), habit
+
+
+def paths(names: Iterable[str]) -> Iterator[Path]:
+    """Yield the files of prose: those of the given files and folders, or of all."""
+    given = [ROOT / name for name in names]
+    for each in given or [ROOT / room for room in ROOMS]:
+        yield from sorted(each.rglob("*.py")) if each.is_dir() else [each]
+    if not given:
+        for pattern in PAGES:
+            yield from sorted(ROOT.glob(pattern))
+
+
+def main(names: list[str]) -> int:
+    """Print each place to rewrite; return 1 if there is one."""
+    listed, counts = habits(), Counter[str]()
+    for path in paths(names):
+        for text in texts_of(path):
+            for line, words, habit in faults_of(text, listed):
+                counts[habit.pattern.pattern] += 1
+                print(f'{path.relative_to(ROOT)}:{line}: "{words}": write {habit.write}')
+    for pattern, count in counts.most_common():
+        print(f"{count:6d} {pattern}")
+    return int(bool(counts))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
