@@ -14,7 +14,9 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 ROOMS = ("fuselog", "recorders", "replay", "pipeline")
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
-CODE = re.compile(r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+", re.DOTALL)
+CODE = re.compile(
+    r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+", re.DOTALL
+)
 LEAST_BLANKS = 2  # of a string that counts as prose
 
 
@@ -48,14 +50,20 @@ def habits() -> list[Habit]:
 
 
 def texts_of_code(source: str) -> Iterator[Text]:
-    """Yield the docstrings, other strings of several words, and comments of a Python file."""
-    for node in ast.walk(ast.parse(source)):
-        if (
-            isinstance(node, ast.Constant)
-            and isinstance(node.value, str)
-            and node.value.count(" ") >= LEAST_BLANKS
-        ):
-            yield Text(node.lineno, node.value)
+    """Yield the docstrings and other strings of several words, and the comments of a Python file."""
+    waiting: list[ast.AST] = [ast.parse(source)]
+    while waiting:
+        node = waiting.pop()
+        inner = list(ast.iter_child_nodes(node))
+        words = ""
+        if isinstance(node, ast.JoinedStr):
+            words = "".join(each.value if isinstance(each, ast.Constant) else "{}" for each in inner)
+            inner = [each for each in inner if not isinstance(each, ast.Constant)]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            words = node.value
+        if words.count(" ") >= LEAST_BLANKS or words.endswith("."):
+            yield Text(node.lineno, words)
+        waiting += inner
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield Text(token.start[0], token.string.lstrip("# "))
