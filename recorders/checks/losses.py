@@ -16,6 +16,9 @@ LONG_S = 10.0
 SILENT = 20.0  # usual steps
 PAUSES = 0.95  # of the steps
 FEWEST_BURSTS = 20
+RARE = (
+    1e-3  # expected number of steps as long, below which a sensor saw nothing rather than lost messages
+)
 MOST_LOST = 0.6  # where more lacks, the stamps are of a clock's ticks, and no rate
 # What comes regularly: what sees targets is silent where there are none.
 REGULARS = {
@@ -47,9 +50,14 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     is_regular = np.abs(steps_s / usual_s - multiples) < TOLERANCE
     is_gap = steps_s > 1.5 * np.median(steps_s)
     is_gap |= is_regular & (multiples > 1) & (np.median(multiples) > 1)
+    is_sure = stream.schema.full_name in REGULARS
+    if not is_sure:  # messages lost one by one explain no step as long as when nothing is seen
+        is_likely = len(steps_s) * np.mean(is_gap) ** np.maximum(multiples - 1.0, 0.0) >= RARE
+        begin_ns, steps_s, is_regular, is_gap = (
+            each[is_likely] for each in (begin_ns, steps_s, is_regular, is_gap)
+        )
     lost = 1.0 - (len(steps_s) + 1) / (float(np.sum(steps_s)) / usual_s + 1.0)
     is_lossy = np.mean(is_gap) > GAPS or (lost > LOST and is_gap.any())
-    is_sure = stream.schema.full_name in REGULARS
     if np.mean(is_regular) < REGULAR or not is_lossy or lost > MOST_LOST:
         return
     if not is_sure and _are_bursts(is_gap):

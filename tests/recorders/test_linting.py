@@ -31,7 +31,7 @@ from fuselog.recorders.log import (
 )
 from fuselog.recorders.log.impossible import YEAR_NS
 from fuselog.recorders.parameters import parse_settings
-from fuselog.recorders.recording import import_run
+from fuselog.recorders.recording import import_run, record_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
 BEGIN_NS = 1_700_000_000 * 10**9
@@ -457,6 +457,17 @@ def test_the_share_that_is_lost_is_the_sheets() -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.parametrize(("lost", "kinds"), [(0.0, []), (0.2, ["lost messages"])])
+def test_a_sensor_that_sees_nothing_for_a_while_has_lost_nothing(lost: float, kinds: list[str]) -> None:
+    """The robot sees no landmark for 2.0, 2.4 and 3.0 s; messages lost at random are still found."""
+    recording, _ = record_run("landmarks", {"speed_mps": 2.0}, 100, 18)
+    [seen] = [each for each in recording.streams if each.topic == "/robot1/range_bearing"]
+    stamps = np.unique(seen.publish_time_ns)
+    kept = stamps[np.random.default_rng(1).random(len(stamps)) >= lost]
+    found = lint([{seen.topic: seen.take(np.isin(seen.publish_time_ns, kept))}])
+    assert [each.kind for each in found] == kinds
+
+
 def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     """From the file, as the command's --set reads it."""
     advised = 0
