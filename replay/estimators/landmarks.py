@@ -238,7 +238,7 @@ def read_turn_rate(stream: Stream) -> Floats:
     return stream["turn_rate_radps"][:, 2:]
 
 
-COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearize at
+COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearise at
 PLANAR = [0, 1, 5]  # x, y and the rotation about z, among the six components of a pose
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
