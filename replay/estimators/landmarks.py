@@ -38,9 +38,10 @@ class DeadReckoningParameters(ModelParameters):
             the square root of the step.
         turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
             square root of the step.
-        forward_scale: true forward speed divided by that of the odometry.
-        turn_scale: true turn rate divided by that of the odometry, before the bias is added.
-        turn_bias_radps: bias that is added to the turn rate of the odometry, after scaling.
+        forward_scale: scale factor of the forward speed: true speed divided by that of the odometry.
+        turn_scale: scale factor of the turn rate: true turn rate divided by that of the odometry,
+            without the bias.
+        turn_bias_radps: bias of the turn rate, which is added to that of the odometry after scaling.
     """
 
     forward_noise_density: NonNegativeFloat | None = None
@@ -58,11 +59,11 @@ class LocalizationParameters(DeadReckoningParameters):
             own.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
-        bias_range_m: measured range minus true range.
-        bias_bearing_rad: measured bearing minus true bearing.
-        bias_heading_rad: measured heading minus true heading, such as of a compass that is mounted
+        bias_range_m: bias of ranges: measured minus true.
+        bias_bearing_rad: bias of bearings: measured minus true.
+        bias_heading_rad: bias of headings: measured minus true, such as of a compass that is mounted
             rotated.
-        fix_delay_s: time by which a position fix is stamped after its measurement.
+        fix_delay_s: delay of position fixes: time from the measurement to the stamp.
         lever_x_m, lever_y_m: position of the antenna on the robot, ahead of and to the left of the point
         that it turns about.
     """
@@ -237,7 +238,7 @@ def read_turn_rate(stream: Stream) -> Floats:
     return stream["turn_rate_radps"][:, 2:]
 
 
-COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearize at
+COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearise at
 PLANAR = [0, 1, 5]  # x, y and the rotation about z, among the six components of a pose
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}

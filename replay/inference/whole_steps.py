@@ -41,14 +41,14 @@ class WholeSteps(NamedTuple):
         innovate: one step for each sensor of m components; takes (..., data, parameters) and gives v
             (m), G, u, N and H (m, t). If the sensor is sampled, it takes (..., data, parameters, centre)
             and does not give H. If updates are iterated, it takes (..., data, parameters, step, slope)
-            and gives the innovation about the mean, linearized at the mean moved by the step.
+            and gives the innovation about the mean, linearised at the mean moved by the step.
         direction: gives `a` (t), the direction along which the correction bends; None if it does not
             bend.
         correct: takes (..., step, slope) and gives the mean, and F if the correction also transforms the
             covariance by F.
         gap: takes the arguments of `predict` and gives N, added over a gap of the control; None if the
             estimate ends at a gap.
-        sampled: for the motion and every sensor, the function that is sampled; None if it is linearized.
+        sampled: for the motion and every sensor, the function that is sampled; None if it is linearised.
         is_iterated: whether updates are iterated.
     """
 
@@ -83,7 +83,7 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 
     Args:
         filtering: the filter, bound to a log.
-        kind: EXTENDED to use derivatives, ITERATED to linearize again at every iteration of an update,
+        kind: EXTENDED to use derivatives, ITERATED to linearise again at every iteration of an update,
             SAMPLED to use regression at samples.
 
     Raises BadInput if a step cannot be traced.

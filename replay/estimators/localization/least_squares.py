@@ -100,7 +100,7 @@ class Solution(NamedTuple):
 
 
 class _Whitened(NamedTuple):
-    """A linearization in units of standard deviations, and the whitener that was applied."""
+    """A linearisation in units of standard deviations, and the whitener that was applied."""
 
     residual: Floats
     jacobian: Floats
@@ -125,7 +125,7 @@ def solve(model: Model, start: Floats, *, max_iterations: int = 50) -> Solution:
     metric of its own information; that step is still taken.
 
     Args:
-        model: (parameters (k, n), rows (k,)) -> linearization of these runs; k may be zero.
+        model: (parameters (k, n), rows (k,)) -> linearisation of these runs; k may be zero.
         start: (runs, n); not finite for a run without a starting point.
         max_iterations: maximum number of steps.
 
@@ -321,7 +321,7 @@ def mask_missing(at: Linearization, present: Booleans) -> Linearization:
     """Remove the information of measurements that are not `present`.
 
     Args:
-        at: linearization of the runs.
+        at: linearisation of the runs.
         present: (runs, m) whether each measurement is present.
     """
     if present.all():

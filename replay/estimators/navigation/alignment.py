@@ -61,15 +61,15 @@ class AlignmentParameters(ModelParameters):
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: relative scale error of the specific force on this
+        force_scale_x, force_scale_y, force_scale_z: relative scale error of the force, per axis.
         axis.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative scale error of the turn rate about this axis.
-        fix_delay_s: time by which a position fix is stamped after its measurement.
-        velocity_delay_s: time by which a velocity is stamped after its measurement.
-        inertial_delay_s: time by which an inertial sample is stamped after its measurement.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative scale error of the turn rate, per axis.
+        fix_delay_s: delay of position fixes: time from the measurement to the stamp.
+        velocity_delay_s: delay of velocities: time from the measurement to the stamp.
+        inertial_delay_s: delay of inertial samples: time from the measurement to the stamp.
         level_s: duration of the first samples, from which the tilt is computed.
-        still_mps: speed above which the body is moving.
-        rest_margin_s: time before the body first moves until which it is assumed to be at rest.
+        still_mps: lowest speed of a moving body.
+        rest_margin_s: margin before the first motion, until which the body is assumed to be at rest.
         course_mps: speed above which the course determines the heading.
         course_s: duration over which courses are compared with the turn of the gyro to estimate the
             heading's standard deviation.

@@ -50,9 +50,9 @@ class AttitudeParameters(ModelParameters):
         gravity_mps2: acceleration of gravity.
         sigma_velocity_mps: standard deviation of the velocity about zero.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
-        inertial_gap_s: time without samples above which the unit has a gap, in which the body may turn.
+        inertial_gap_s: time without samples that counts as a gap, in which the body may turn.
         gap_turn_radps: standard deviation of the turn rate in a gap.
-        rest_s: duration for which the body is at rest at the start.
+        rest_s: duration of the rest at the start.
         start_sigma_rad: standard deviation of the orientation at the start, per axis.
         gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.

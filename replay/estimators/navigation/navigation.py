@@ -55,7 +55,7 @@ class NavigationParameters(AlignmentParameters):
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         origin_latitude_deg: latitude of the plane's origin.
         origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
-        inertial_gap_s: time without samples above which the unit has a gap.
+        inertial_gap_s: time without samples that counts as a gap.
         gap_acceleration_mps2: standard deviation of the acceleration in a gap.
         gap_turn_radps: standard deviation of the turn rate in a gap.
         gap_tilt_rad: standard deviation of the tilt after a gap.
@@ -65,8 +65,9 @@ class NavigationParameters(AlignmentParameters):
         of the body (forward, left, up).
         wheel_scale: relative scale error of the wheels' speed.
         field_east_ut, field_north_ut, field_up_ut: local magnetic field in this direction.
-        range_delay_s: time by which a range is stamped after its measurement.
-        standing_delay_s: time by which a message that the body stands still is stamped late.
+        range_delay_s: delay of ranges: time from the measurement to the stamp.
+        standing_delay_s: delay of messages that the body stands still: time from the measurement to the
+            stamp.
         sigma_velocity_mps: standard deviation of each component of a velocity that does not state its
             covariance.
         sigma_heading_rad: standard deviation of a heading.

@@ -1,4 +1,4 @@
-"""Iterated updates: the sensor is linearized again at every iterate until convergence."""
+"""Iterated updates: the sensor is linearised again at every iterate until convergence."""
 
 import numpy as np
 
@@ -36,7 +36,7 @@ SETTLED = 1e-12  # largest component of the last step
 
 
 def iterated_update(stage: Stage, number: int) -> Update:
-    """Make the update that relinearizes at every iterate: Gauss-Newton on the posterior.
+    """Make the update that relinearises at every iterate: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds, the Jacobian is H at x (+) d times the right
     Jacobian at d. The gate and the weight of the measurement are determined at the prediction;

@@ -209,7 +209,7 @@ def _exact_sensor(stage: Stage, number: int) -> Innovate:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """Name a sensor whose linearized components are dependent at every state, including their noise.
+    """Name a sensor whose linearised components are dependent at every state, including their noise.
 
     The innovation covariance is then singular, as for a coordinate and its square.
     """

@@ -1,7 +1,7 @@
 """Parts of extended and unscented square-root filters, which store factors of covariances.
 
 Let X be the columns of the state's factor or its weighted samples, Y their images under a function, and
-N a factor of the noise. One factorization then computes a prediction or an update:
+N a factor of the noise. One factorisation then computes a prediction or an update:
 
     [Y  N]     [L  0]    for a motion, L is the factor of P-, and W = G L with the smoother's gain G;
     [X  0]  =  [W  V]    for a sensor, L is that of S, W = K L with the Kalman gain K, and V that of P+.

@@ -1,4 +1,4 @@
-"""Update of a Gaussian by a sensor: linearization, innovation, and Kalman gain."""
+"""Update of a Gaussian by a sensor: linearisation, innovation, and Kalman gain."""
 
 from typing import NamedTuple, Protocol
 
@@ -68,7 +68,7 @@ class LineariseSensor(Protocol):
 
 
 class CompareLinear(Protocol):
-    """Function that computes the innovation of a linearized measurement; see `linear_innovation`."""
+    """Function that computes the innovation of a linearised measurement; see `linear_innovation`."""
 
     def __call__(
         self, covariance: Floats, data: Floats, parameters: Settings, work: Workspace, /
@@ -76,7 +76,7 @@ class CompareLinear(Protocol):
 
 
 class WhitenResidual(Protocol):
-    """Function that expresses a linearized measurement in units of its noise; see `whitening`."""
+    """Function that expresses a linearised measurement in units of its noise; see `whitening`."""
 
     def __call__(self, data: Floats, parameters: Settings, work: Workspace, /) -> tuple[int, float]: ...
 
@@ -189,7 +189,7 @@ def linear_sensor(stage: Stage, number: int) -> Innovate:
 
 
 def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = None) -> CompareLinear:
-    """Make the function that computes the innovation of a linearized measurement.
+    """Make the function that computes the innovation of a linearised measurement.
 
     Args:
         sensor: the sensor, with m measured components.
@@ -213,7 +213,7 @@ def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = Non
 
 
 def whitening(sensor: Sensor, number: int) -> WhitenResidual:
-    """Make the function that expresses a linearized measurement in units of its noise.
+    """Make the function that expresses a linearised measurement in units of its noise.
 
     Args:
         sensor: the sensor, with m measured components.

@@ -1,4 +1,4 @@
-"""Lower factors S of covariances P = S S', computed by weighted Gram-Schmidt orthogonalization.
+"""Lower factors S of covariances P = S S', computed by weighted Gram-Schmidt orthogonalisation.
 
 Thornton, JPL Technical Memorandum 33-798, 1976; Bierman, Factorization Methods for Discrete Sequential
 Estimation, 1977, VI.4.
@@ -21,7 +21,7 @@ NOTHING_LEFT = 1e-28  # relative square of a row that depends on others, because
 def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
     """Compute the lower factor L (r, r) of A diag(w) A' = L L' from the rows of A (r, c).
 
-    This is modified Gram-Schmidt orthogonalization, which does not form products of A with itself;
+    This is modified Gram-Schmidt orthogonalisation, which does not form products of A with itself;
     weights may be negative. The diagonal of L is positive; if a row depends on earlier rows, its
     diagonal entry and the entries below are zero. If the product is not positive semidefinite, the pivot
     is NaN.
@@ -63,7 +63,7 @@ def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
 def fill_root(rows: Floats, covariance: Floats) -> bool:
     """Fill the first columns of `rows` with a factor N (n, n) of a covariance N N'.
 
-    This is a Cholesky factorization with pivoting by the relative size of the pivots, since the
+    This is a Cholesky factorisation with pivoting by the relative size of the pivots, since the
     covariance may be singular.
 
     Args:

@@ -25,7 +25,7 @@ _PRODUCT = (
 )
 
 
-# The inputs, the other arguments and the workspace; their number depends on the linearized function.
+# The inputs, the other arguments and the workspace; their number depends on the linearised function.
 Linearise = Callable[..., None]  # type: ignore[explicit-any]
 Place = tuple[str, int, int]  # an array of the workspace, row and column
 

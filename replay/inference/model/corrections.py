@@ -50,7 +50,7 @@ class ComparisonWork(CorrectionWork, Protocol):
 
 
 class RelinearisingWork(CorrectionWork, Protocol):
-    """Working arrays of a relinearization, with `turned` (t,)."""
+    """Working arrays of a relinearisation, with `turned` (t,)."""
 
     @property
     def turned(self) -> Floats: ...
@@ -201,7 +201,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
 
 
 def relinearising(model: Model) -> tuple[StepTo, Chain]:
-    """Make the functions that find an iterated update's linearization point and apply the chain rule.
+    """Make the functions that find an iterated update's linearisation point and apply the chain rule.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`. After that, `chain(rows,
     work)` converts a Jacobian (m, t) at that state to one by the step.

@@ -109,12 +109,12 @@ class MixModes(Protocol):
 
 @lru_cache(maxsize=16)
 def transition_matrix(modes: int) -> FillTransition:
-    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformization.
+    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformisation.
 
     With L dt added to the diagonal, where L is the fastest rate at which a mode is left, the matrix has
     no negative entries, so that no digits cancel; the factor exp(-L dt) compensates for this. The
     duration is halved until the series is short, and the result is squared as often; finally the rows
-    are normalized to a sum of one.
+    are normalised to a sum of one.
     """
     changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
     rate_of = tuple(

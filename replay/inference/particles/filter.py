@@ -53,8 +53,8 @@ class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
 
     Attributes:
         particles: number of particles.
-        resample_below: fraction of the particles; they are resampled if their effective number, 1 / sum
-            w^2, is lower.
+        resample_below: threshold of the effective number of particles, 1 / sum w^2, as a fraction of
+            all; below it, the particles are resampled.
         seed: seed of the random numbers.
         cloud: whether to also write all particles of every estimate.
         progressive: whether to process a measurement in several parts if it would reduce the effective

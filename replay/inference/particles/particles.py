@@ -245,7 +245,7 @@ def effective_number(weight: Floats) -> float:
 
 
 def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
-    """Multiply weights of sum 1 by a power of likelihoods, and normalize them.
+    """Multiply weights of sum 1 by a power of likelihoods, and normalise them.
 
     A particle whose likelihood is NaN gets the mean of the others.
 

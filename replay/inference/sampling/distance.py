@@ -93,7 +93,7 @@ def _quadrature(dimension: int) -> _Quadrature:
     )
 
 
-# The costly loops below do not sum over their innermost index, so a compiler can vectorize them without
+# The costly loops below do not sum over their innermost index, so a compiler can vectorise them without
 # reordering. With fastmath, the results depended on whether numba's cache was warm.
 
 

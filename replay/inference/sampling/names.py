@@ -4,7 +4,7 @@ ukf  ukf:kappa=0              unscented
 gf-25                         25 Gaussian-filter points on each axis
 rukf-12                       randomised unscented, 12 iterations
 s2kf-50  s2kf-50:symmetric    50 LCD samples
-s2kf-50:seed=3:rotation=7     from another optimization, and rotated at random
+s2kf-50:seed=3:rotation=7     from another optimisation, and rotated at random
 """
 
 import re

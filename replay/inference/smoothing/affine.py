@@ -1,6 +1,6 @@
 """Affine filter about a trajectory: the forward pass of a Gauss-Newton iteration.
 
-With motion and sensors linearized at the latest states x_k of a run, the unknowns are the tangent
+With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
 vectors d_k from these, which are in flat space:
 
     d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
@@ -74,7 +74,7 @@ def no_factors(count: int, t: int) -> Factors:
 
 
 class Trajectory(NamedTuple):
-    """Trajectory at which everything is linearized, and results of a pass over it.
+    """Trajectory at which everything is linearised, and results of a pass over it.
 
     Attributes:
         mean: (nodes, n) states.

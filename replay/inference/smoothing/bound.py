@@ -1,6 +1,6 @@
 """Posterior Cramer-Rao bound: the information of the measurements along the true states.
 
-Each node, a stamp with an estimate, has the covariance of an extended Kalman filter that linearizes at
+Each node, a stamp with an estimate, has the covariance of an extended Kalman filter that linearises at
 the truth, or of its smoother (`bound:smoother`), along this one trajectory. This needs no inverse of the
 process noise, which may be singular. The steps themselves are also written;
 `fuselog.replay.judging.consistency.bounds` computes the bound over an ensemble from them.

@@ -1,4 +1,4 @@
-"""Prediction and update of the covariance of a filter that linearizes at the true states."""
+"""Prediction and update of the covariance of a filter that linearises at the true states."""
 
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class TrueTrajectory(NamedTuple):
 
     Attributes:
         mean: (runs, n) true state.
-        covariance: (runs, t, t) covariance of a filter that linearizes at the true state.
+        covariance: (runs, t, t) covariance of a filter that linearises at the true state.
         transition, noise: (runs, t, t) since the last node.
         information: (runs, t, t) information of the measurements since the last node, the sum of H' R^-1
             H.
@@ -73,7 +73,7 @@ class BoundMemory(NamedTuple):
 
 
 def bound_steps(stage: Stage) -> Steps:
-    """Make the steps of an extended Kalman filter that linearizes at the true states."""
+    """Make the steps of an extended Kalman filter that linearises at the true states."""
     model, motion = stage.model, stage.motion
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     linearise = motion_derivative(model, motion, by_state=True)

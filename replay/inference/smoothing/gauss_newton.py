@@ -1,6 +1,6 @@
-"""Minimization of the cost of all states of a run by damped Gauss-Newton steps.
+"""Minimisation of the cost of all states of a run by damped Gauss-Newton steps.
 
-The cost is minimized over the state at the prior's time and at every later stamp:
+The cost is minimised over the state at the prior's time and at every later stamp:
 
     1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
 
