@@ -30,14 +30,17 @@ def renamed(**names: str) -> Callable[[Target], Target]:
     ...     area(length=2.0)
     4.0
     >>> print(caught[0].message)
-    area: 'length' is called 'length_m' now; the old name goes in the next release
+    area: 'length' was renamed to 'length_m'; the old name will be removed in the next release
     """
 
     def accepting(function: Taking, owner: str) -> Taking:
         @wraps(function)
         def call(*arguments: object, **given: object) -> object:
             for old in names.keys() & given.keys():
-                notice = f"'{old}' is called '{names[old]}' now; the old name goes in the next release"
+                notice = (
+                    f"'{old}' was renamed to '{names[old]}'; the old name will be removed in the next "
+                    "release"
+                )
                 warnings.warn(f"{owner}: {notice}", FutureWarning, stacklevel=2)
                 given[names[old]] = given.pop(old)
             return function(*arguments, **given)

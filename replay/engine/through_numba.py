@@ -53,7 +53,7 @@ class _Loop:
         except ImportError as error:
             raise DoesNotCompile(
                 f"{run_once.__qualname__} is compiled by numba, which cannot be imported ({error}); "
-                "pip install 'fuselog[numba]', or set allocates=False if it makes no arrays"
+                "pip install 'fuselog[numba]', or set allocates=False if it creates no arrays"
             ) from error
         bounds = environment.is_on(environment.BOUNDSCHECK)
         # a division by zero gives infinity, which fails the run, instead of an exception
@@ -105,7 +105,9 @@ class _Loop:
         except Exception as error:  # no folder for the cache, a full disk, a damaged file
             if not is_kept:
                 raise
-            say_once(f"numba's cache fails ({error}): {self._title} is compiled in every process")
+            say_once(
+                f"numba's cache cannot be used ({error}): {self._title} is compiled in every process"
+            )
             return self._first_called(kernel, leaves, is_kept=False)
         return made
 
@@ -194,6 +196,6 @@ def _refuse_random(function: FunctionType, steps: Sequence[_Step], outside: Mapp
         if is_module or used is np.random or getattr(used, "__self__", None) is np.random.mtrand._rand:
             place = f"{function.__code__.co_filename}, line {line}"
             raise DoesNotCompile(
-                f"{function.__qualname__} uses np.random ({place}): its numbers would depend on how "
-                "runs are shared among cores; draw from the generator that the run is given (draws=True)"
+                f"{function.__qualname__} uses np.random ({place}), so its numbers would depend on how "
+                "runs are distributed over cores; use the generator that it is given with draws=True"
             )

@@ -67,7 +67,7 @@ class TopicRead(_Part):
         for field in fields:
             name, bracket, size = field.partition("[")
             if not name or (bracket and not (size.endswith("]") and size[:-1].isdecimal())):
-                raise ValueError(f"'{field}' is no field; name it, or name[SIZE] for a vector")
+                raise ValueError(f"'{field}' is not a field; give its name, or name[SIZE] for a vector")
         return fields
 
     @cached_property
@@ -194,32 +194,38 @@ def read_description(text: str | bytes, where: str) -> Description:
     try:
         found = parse_json(text.decode() if isinstance(text, bytes) else text)
     except (ValueError, RecursionError) as error:
-        raise BadInput(f"{where}: its description is no JSON ({error}); mend what it gives") from None
+        raise BadInput(f"{where}: its description is not valid JSON ({error}); correct it") from None
     if not isinstance(found, dict):
-        raise BadInput(f"{where}: its description is no JSON object; give {{...}} with topics and state")
+        raise BadInput(
+            f"{where}: its description is not a JSON object; give {{...}} with topics and state"
+        )
     made = build(_Described, {"description": found}, where, "entry").description
     names = [each.topic for each in made.topics]
     for name in names:
         if names.count(name) > 1:
-            raise BadInput(f"{where}: its description has topic {name} twice; name all fields at once")
+            raise BadInput(
+                f"{where}: its description has topic {name} twice; give all fields in one entry"
+            )
     for each in made.topics:
         if each.target and each.target not in each.sizes:
             raise BadInput(
-                f"{where}: topic {each.topic}: its target {each.target} is none of its fields; add it"
+                f"{where}: topic {each.topic}: its target {each.target} is not one of its fields; add it"
             )
     for name in made.parameters:
         if not name.isidentifier() or name in ForeignParameters.model_fields or name in _TAKEN:
-            raise BadInput(f"{where}: its parameter '{name}' cannot have this name; give it another")
+            raise BadInput(
+                f"{where}: its parameter '{name}' has a name that is reserved or invalid; choose another"
+            )
     for components in (made.state, made.innovation):
         for name in components:
             if not re.fullmatch(r"\w+", name):
                 raise BadInput(
-                    f"{where}: '{name}' cannot be a component's name; use letters, digits and '_'"
+                    f"{where}: '{name}' is not a valid component name; use letters, digits and '_'"
                 )
         if not are_kinds(list(components.values())):
             raise BadInput(
-                f"{where}: the components {', '.join(components)} are none: an axis has two, "
-                "a quaternion four, side by side"
+                f"{where}: the components {', '.join(components)} do not fit their kinds: an axis needs "
+                "two adjacent components, a quaternion four"
             )
     build(made.parameters_over(ForeignParameters), {}, f"{where}, its defaults")
     return made

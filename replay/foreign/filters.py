@@ -173,8 +173,8 @@ def _named(
     ]
     if others:
         raise BadInput(
-            f"estimator {label}: its description names the {what} {topic}, which the log lacks; it has "
-            f"{', '.join(others)}"
+            f"estimator {label}: its description names the {what} {topic}, which is not in the "
+            f"log; it has {', '.join(others)}"
         )
     return ""
 
@@ -363,8 +363,8 @@ def _going_back(found: FoundFilter, follow_runs: FollowRuns, window_ns: int) -> 
     """Bind a filter to messages in order of arrival; raise BadInput if `every_s` is set."""
     if found.parameters.every_s is not None:
         raise BadInput(
-            f"estimator {found.name}: --late rewind: there are no estimates between messages (every_s, "
-            "--every) then; give --late drop or --late wait:SECONDS"
+            f"estimator {found.name}: --late rewind gives no estimates between messages (every_s, "
+            "--every); give --late drop or --late wait:SECONDS"
         )
     return bind_apart(found, follow_runs, window_ns)
 
@@ -402,7 +402,7 @@ def unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> lis
 
 
 LIB = _OfLibraries(
-    "a filter of your own in C, C++ or Rust, behind fuselog_filter.h: -e lib:PATH",
+    "your own filter in C, C++ or Rust, with the functions of fuselog_filter.h: -e lib:PATH",
     "the topics that the filter's description names",
     LibraryParameters,
     unspecified,

@@ -41,7 +41,7 @@ def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
             continue
         if values.ndim == 1 and size:
             raise BadInput(
-                f"topic {stream.topic}: {field} is one number, no vector of {size}; name it {field}"
+                f"topic {stream.topic}: {field} is one number, not a vector of {size}; name it {field}"
             )
         check_width(stream, field, size or 1) if values.ndim == 2 else None
         data[:, column : column + (size or 1)] = values.reshape(len(stream), -1)

@@ -40,7 +40,7 @@ def shorthand(name: str) -> tuple[str, dict[str, Any]]:
     if not colon or kind not in KINDS:
         return name, {}
     if not rest.strip():
-        raise BadInput(f"-e {name}: names no {KINDS[kind]}; give it behind the colon")
+        raise BadInput(f"-e {name}: no {KINDS[kind]} is given; give it after the colon")
     return _label(kind, rest), {"kind": kind, KINDS[kind]: Allowed(rest)}
 
 
@@ -78,9 +78,11 @@ def split_command(command: str) -> list[str]:
     try:
         words = shlex.split(command)
     except ValueError as error:
-        raise BadInput(f"exec:{command}: is no command ({error}); close the quote") from None
+        raise BadInput(
+            f"exec:{command}: is not a valid command ({error}); close the quotation mark"
+        ) from None
     if not words:
-        raise BadInput("exec: names no command; give it behind the colon")
+        raise BadInput("exec: no command is given; give it after the colon")
     return words
 
 
@@ -138,8 +140,8 @@ def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
         for entry in KINDS.values() if isinstance(own, Mapping) else ():
             if entry in own and not isinstance(own[entry], Allowed):
                 raise BadInput(
-                    f"{where}: {label} has {entry} = {own[entry]}, a program, which runs only where you "
-                    "name it; give it with -e, or add --allow-programs"
+                    f"{where}: {label} has {entry} = {own[entry]}, and a program that is named in a "
+                    "file does not run; give it with -e, or add --allow-programs"
                 )
 
 
@@ -152,8 +154,8 @@ def what_runs(label: str, kind: str, settings: Mapping[str, Any]) -> str:
         )
     if not isinstance(text, Allowed):
         raise BadInput(
-            f"estimator {label}: a file that was read names the program {text}, which runs only where "
-            f"you name it; give -e {kind}:{text}, or add --allow-programs"
+            f"estimator {label}: the program {text} is named in a file and therefore does not run; "
+            f"give -e {kind}:{text}, or add --allow-programs"
         )
     return text
 

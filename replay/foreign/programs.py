@@ -71,8 +71,8 @@ class _OfPrograms(Estimator[Any]):
         for word in words:
             if _PLACE.search(word):
                 raise BadInput(
-                    f"estimator {label}: {word}: a program that streams has no places to fill; give "
-                    "{log} and {out} to one that reads a log"
+                    f"estimator {label}: {word}: a program that streams has no placeholders; give "
+                    "{log} and {out} to a program that reads a log"
                 )
         own = {name: settings[name] for name in LIMITS if name in settings}
         limits = Limits.of(build(StreamParameters, own, f"estimator {label}"))
@@ -80,8 +80,8 @@ class _OfPrograms(Estimator[Any]):
 
 
 EXEC = _OfPrograms(
-    "a program of your own: -e 'exec:./run_filter {log} {out}', or one that streams",
-    "what the program says that it reads",
+    "your own program: -e 'exec:./run_filter {log} {out}', or one that streams",
+    "the topics that the program's description names",
     StreamParameters,
     unspecified,
 )
@@ -108,8 +108,8 @@ def _of_stream(words: tuple[str, ...], limits: Limits) -> Estimator[Any]:
 def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
     """Raise BadInput because programs cannot reprocess messages."""
     raise BadInput(
-        f"estimator {label}: --late rewind: a program cannot be copied, as a filter of a library (lib:) "
-        "can; give --late drop or --late wait:SECONDS"
+        f"estimator {label}: --late rewind: a program cannot be copied, unlike a filter of a library "
+        "(lib:); give --late drop or --late wait:SECONDS"
     )
 
 
@@ -138,7 +138,7 @@ def _described(
 def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
     defaults = _parameters_in(label, words)
     fields: dict[str, Any] = {
-        name: (float, Field(value, description="of the program's command"))
+        name: (float, Field(value, description="parameter of the program's command"))
         for name, value in defaults.items()
     }
     parameters = create_model(
@@ -176,11 +176,13 @@ def _parameters_in(label: str, words: Sequence[str]) -> dict[str, float]:
             found[name] = float(default)
         except ValueError:
             raise BadInput(
-                f"estimator {label}: {{{name}}} in its command is nothing that is filled in; give "
+                f"estimator {label}: {{{name}}} in its command is not a placeholder; give "
                 f"{{log}}, {{csv}}, {{out}}, or a parameter with its default, {{{name}=0.1}}"
             ) from None
         if name in ProgramParameters.model_fields:
-            raise BadInput(f"estimator {label}: {{{name}}} in its command cannot have this name")
+            raise BadInput(
+                f"estimator {label}: {{{name}}} in its command has a reserved name; choose another"
+            )
     return found
 
 
@@ -196,10 +198,12 @@ def _truth(label: str, topics: Mapping[str, Topic], named: str) -> Topic | None:
         if topic.schema_name == TRUTH and not name.startswith(ESTIMATE)
     }
     if named and named not in truths:
-        raise BadInput(f"estimator {label}: truth = {named}: the log has none; {choices(named, truths)}")
+        raise BadInput(
+            f"estimator {label}: truth = {named}: the log has no such truth; {choices(named, truths)}"
+        )
     if not named and len(truths) > 1:
         raise BadInput(
-            f"estimator {label}: the log has the truths {', '.join(truths)}; say which with "
+            f"estimator {label}: the log has the truths {', '.join(truths)}; choose one with "
             f"--set {label}.truth=..."
         )
     return truths[named] if named else next(iter(truths.values()), None)
@@ -267,7 +271,7 @@ def _run(
         program.wait(limits)
         found = sorted(folder.glob("estimates*"))
         if not found:
-            raise Ended("the program wrote no estimates: there is nothing in the place {out}")
+            raise Ended("the program wrote no estimates: there is no file at {out}")
         return read_estimates(found[0], label, truth)
 
 

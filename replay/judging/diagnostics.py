@@ -120,15 +120,15 @@ class Diagnostics:
             share = estimated_share(found.covered)
             if share is not None and share < LEAST_SHARE:
                 percent = f"{100 * share:.1f} % of the span was estimated"
-                notes.append(f"{name_of(topic)}: {percent}; its figures are of that")
+                notes.append(f"{name_of(topic)}: {percent}; its figures cover only this part")
             for reason, count in found.skipped.items():
                 notes.append(f"{name_of(topic)}: {count} not used: {reason}")
             for angle, count in found.wide.items():
                 notes.append(
                     f"{name_of(topic)}: {angle} has a standard deviation above {WIDE_RAD:g} rad in "
-                    f"{count} of {found.estimates} estimates: a Gaussian says little of such an angle, "
-                    "and positions, NEES and likelihood that follow from it may be wrong; bank and "
-                    "particles carry several at a time"
+                    f"{count} of {found.estimates} estimates: a Gaussian is a poor model of such an "
+                    "angle, so positions, NEES and likelihood may be wrong; the methods bank and "
+                    "particles represent several hypotheses"
                 )
         return notes
 

@@ -68,7 +68,7 @@ class Interval(NamedTuple):
 
 def too_few(runs: int) -> str:
     """Return why there is no interval over this number of runs."""
-    there = "is 1" if runs == 1 else f"are {runs}"
+    there = "is only 1" if runs == 1 else f"are only {runs}"
     return f"an interval needs at least {FEWEST_RUNS} runs, and there {there}"
 
 

@@ -339,7 +339,7 @@ class Judge:
     @property
     def notes_of_coverage(self) -> list[str]:
         """Return sentences on assumptions, time spans without estimates, unused messages and bounds."""
-        averaged = "averaged along the true trajectories, since"
+        averaged = "averaged along the true trajectories, because"
         return [*self._diagnostics.notes(), *self._notes] + [
             f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
             for what, bounds in self._bounds.items()

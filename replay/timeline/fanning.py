@@ -35,5 +35,5 @@ def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Contain
         own = [fan for fan in fans if fan.estimate == estimate]
         for fan, colour in zip(own, cycle(PALETTE), strict=False):
             draw_curve(canvas, plot, fan.copy, colour, fan.time_ns, fan.sigmas, LINE)
-        plots.append(plot_view(plot, f"{estimate}: from the estimate to each copy", "sigma"))
+        plots.append(plot_view(plot, f"{estimate}: distance of each copy", "sigma"))
     return rrb.Vertical(layout, rrb.Tabs(*plots), row_shares=[4.0, 1.0])

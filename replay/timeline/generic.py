@@ -83,8 +83,8 @@ def draw(canvas: Canvas, scene: Scene) -> Board:
     if not scene.outputs and not any(scene.source.topics[topic].messages for topic in topics):
         held = ", ".join(f"{each.name} ({each.encoding})" for each in scene.source.topics.values())
         raise BadInput(
-            f"{scene.source.name}: has nothing to draw, no protobuf messages with numeric fields; its "
-            f"topics are {held or 'none'}"
+            f"{scene.source.name}: there is nothing to draw, because it has no protobuf messages with "
+            f"numeric fields; its topics are {held or 'none'}"
         )
     turn_up(canvas)
     return draw_cases(scene, partial(_draw_case, canvas, scene))
@@ -124,7 +124,7 @@ def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
     """Return the reasons why topics are not drawn, by topic."""
     shown_elsewhere = NOT_SENSED - {schemas.LINK_EVENT.full_name}
     return {
-        stream.topic: "none of its fields is a quantity over time"
+        stream.topic: "it has no field that can be plotted over time"
         for stream in sensed
         if stream.schema.full_name not in shown_elsewhere and not list(curves_of(stream))
     }

@@ -39,7 +39,9 @@ def worst_at(moments: Sequence[Moment], at: str) -> Moment:
     """
     estimator = at.partition(":")[2]
     if not moments:
-        raise BadInput(f"--at {at}: the timeline has no errors of estimates; give seconds, as --at 30")
+        raise BadInput(
+            f"--at {at}: the timeline has no errors of estimates; give seconds, such as --at 30"
+        )
     known = list(dict.fromkeys(moment.estimator for moment in moments))
     if estimator and estimator not in known:
         raise BadInput(f"--at {at}: no estimator with this name has errors; {choices(estimator, known)}")

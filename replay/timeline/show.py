@@ -154,7 +154,7 @@ class Drawing:
     def _draw(self, recording: rr.RecordingStream, scene: Scene, *, is_still: bool = False) -> None:
         if self._focus is not None and self._focus not in scene.cases:
             known = choices(self._focus, scene.cases)
-            raise BadInput(f"--focus {self._focus}: nothing in this log has that name; {known}")
+            raise BadInput(f"--focus {self._focus}: no case in this log has this name; {known}")
         canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
         layout = self._timeline.draw(canvas, scene)
         keep_moments(recording, scene.moments)

@@ -71,7 +71,7 @@ def _draw_differences(
         name = f"{estimator} - {estimators[0]}"
         draw_curve(canvas, plot, name, scene.colour(estimator), time_ns, larger, LINE)
         drawn = drawn or len(time_ns) > 0
-    title = " ".join(filter(None, (case, "difference of the errors' size")))
+    title = " ".join(filter(None, (case, "difference in the size of errors")))
     return [plot_view(plot, title, unit)] if drawn else []
 
 

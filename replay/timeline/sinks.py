@@ -86,7 +86,7 @@ def _finish(recording: rr.RecordingStream, connect: str) -> None:
             f"--connect {connect}: the connection to the receiver was lost; start it again"
         ) from failure
     if failure is not None or not is_closed:
-        why = failure or "Rerun does not end"
+        why = failure or "Rerun did not end"
         raise BadInput(f"{connect}: the timeline could not be sent ({why})") from failure
 
 

@@ -246,7 +246,7 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
             return
         time.sleep(0.05)
-    raise BadInput(f"Rerun's viewer does not answer within {_START_S:g} s of its start; try again")
+    raise BadInput(f"Rerun's viewer did not answer within {_START_S:g} s of its start; try again")
 
 
 def _ended(process: subprocess.Popen[bytes]) -> bool:
@@ -292,10 +292,10 @@ def _set_cursor(client: ViewerClient, rrd: Path, at_s: float | None) -> None:
     times = next((each for each in timelines if each.name == "sim_time"), None)
     if times is None or times.start is None or times.end is None:
         if at_s is not None:
-            raise BadInput(f"{rrd}: has no timeline sim_time for --at; leave it out")
+            raise BadInput(f"{rrd}: has no timeline sim_time; leave out --at")
         return
     start_s, end_s = times.start * 1e-9, times.end * 1e-9
     cursor_s = 0.5 * (start_s + end_s) if at_s is None else at_s
     if not start_s <= cursor_s <= end_s:
-        raise BadInput(f"--at {at_s:g}: the run goes from {start_s:g} to {end_s:g} s")
+        raise BadInput(f"--at {at_s:g}: give a time within the run, from {start_s:g} to {end_s:g} s")
     client.set_time("sim_time", duration=cursor_s, play_state="paused")

@@ -83,7 +83,7 @@ def judged() -> tuple[Any, dict[str, Any]]:
     accepted, on_map = int(done.innovations["accepted"].sum()), int(np.isin(sightings, known).sum())
     assert (row["messages"], row["skipped"]) == (len(sightings), 0)
     assert (row["used"], row["gated"]) == (accepted, on_map - accepted)
-    assert row["why"] == f"{len(sightings) - on_map} are of targets that the map lacks"
+    assert row["why"] == f"{len(sightings) - on_map} measure targets that are not in the map"
     assert done.losses[0].endswith(row["why"])
     assert [each.kind for each in done.alarms] == ["unused", "innovations"]
     return done, {

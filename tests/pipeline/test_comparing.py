@@ -187,7 +187,7 @@ def test_a_trajectory_is_compared_like_estimates(
     own = fl.compare(log, estimators=["ekf", "ukf"]).table.query("quantity == 'position_rmse_m'").iloc[0]
     assert row["difference"] == pytest.approx(own["difference"], rel=1e-6)
     assert row["verdict"] == "undecided"
-    assert "an interval needs at least 5 runs, and there is 1" in found.sentences[0]
+    assert "an interval needs at least 5 runs, and there is only 1" in found.sentences[0]
     assert "nees" not in set(found.table["quantity"])
     found.draw(tmp_path / "both.rrd")
     other = fl.compare(file, file, truth=file).table

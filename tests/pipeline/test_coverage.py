@@ -74,7 +74,7 @@ def _another_truth(streams: Streams) -> None:
     ("change", "words"),
     [
         (_as_it_is, ""),
-        (_another_map, "{n} of {n} not used: {n} are of targets that the map lacks"),
+        (_another_map, "{n} of {n} not used: {n} measure targets that are not in the map"),
         (
             _another_topic,
             "ekf: /robot1/front/range_bearing: {n} of {n} not used: the estimator does not",
@@ -83,15 +83,15 @@ def _another_truth(streams: Streams) -> None:
             _infinite,
             f"ekf: {SIGHTINGS}: 1 of {{n}} not used: 1 message is left out: range_m is infinite",
         ),
-        (_repeated, f"ekf: {SIGHTINGS}: 5 repeat the message before"),
+        (_repeated, f"ekf: {SIGHTINGS}: 5 repeat the previous message"),
         (_a_landmark_twice, f"ekf: {MAP}: landmark "),
         (
             _the_truth_at_two_places,
-            f"ekf: {TRUTH}: a truth is stated twice at one stamp: y_m differs by up to 100",
+            f"ekf: {TRUTH}: a truth is stated twice with the same stamp: y_m differs by up to 100",
         ),
         (
             _another_truth,
-            f"ekf: {TRUTH}: /robot1/laser states the truth of the same thing, and is not used: y_m "
+            f"ekf: {TRUTH}: /robot1/laser states the truth of the same object and is not used: y_m "
             "differs by up to 100",
         ),
     ],
@@ -157,7 +157,7 @@ def test_a_result_has_the_table_over_all_runs(
     ekf = table.loc["ekf", SIGHTINGS]
     assert ekf["used"] + ekf["gated"] == ekf["messages"] > 130
     bare = table.loc["dead-reckoning", SIGHTINGS]
-    assert (bare["used"], bare["why"]) == (0, "the estimator does not take this topic")
+    assert (bare["used"], bare["why"]) == (0, "the estimator does not use this topic")
 
 
 def test_what_lies_outside_the_span_is_not_counted(
@@ -243,6 +243,6 @@ def test_topics_that_an_estimator_does_not_take_are_one_sentence() -> None:
     assert sentences(rows) == [
         "ekf: 5 topics not used: it does not take /gps0/fix, /gps1/fix, /gps2/fix and 2 more",
         "ekf: /radar: 2 of 10 not used: they gave no innovation",
-        "ukf: /odd: 4 of 4 not used: the estimator does not take this topic",
+        "ukf: /odd: 4 of 4 not used: the estimator does not use this topic",
     ]
     assert sentences([rows[0]]) == []  # of one that takes no measurements it is its nature

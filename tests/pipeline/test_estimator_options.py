@@ -160,7 +160,7 @@ def test_a_start_without_a_prior_is_of_the_models_own_states_and_parameters():
 
 def test_a_name_and_a_setting_that_differ_are_refused():
     """What the name says stood, and the setting did nothing."""
-    with pytest.raises(BadInput, match="tracker:jipda says association = jipda, and a setting nearest;"):
+    with pytest.raises(BadInput, match="jipda sets association = jipda, but a setting says nearest;"):
         configure("tracker:jipda", {"association": "nearest"})
     configure("tracker:jipda", {"association": "jipda"})
     configure("particles:50", {"particles": 50})

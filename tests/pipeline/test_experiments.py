@@ -525,7 +525,7 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
     assert "nees: no interval of its mean over the runs: an interval needs at least 5 runs" in four
     fuselog("report", out, "-o", tmp_path / "four.html")
     page = (tmp_path / "four.html").read_text(encoding="utf-8")
-    assert "No 95 % intervals: an interval needs at least 5 runs, and there are 4." in page
+    assert "No 95 % intervals: an interval needs at least 5 runs, and there are only 4." in page
 
 
 def test_a_parameter_goes_to_all_estimators_that_have_it() -> None:

@@ -77,7 +77,7 @@ def test_steps_are_rounded_not_cut() -> None:
 
 def test_zero_seconds_are_a_window() -> None:
     assert parse_late("wait:0", arrival_order=True) == Late("wait", 0)
-    with pytest.raises(BadInput, match="give seconds from zero on"):
+    with pytest.raises(BadInput, match="give zero or more seconds"):
         parse_late("wait:-0.001", arrival_order=True)
 
 

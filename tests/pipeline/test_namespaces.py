@@ -115,7 +115,7 @@ def test_three_namespaces_and_a_truth_are_one_robot(fuselog: Callable[..., Any],
     metrics = said.json["metrics"]
     assert metrics["ekf.position_rmse_m.wheel"] < SIGMA_M
     assert 1.5 < metrics["ekf.nees.wheel"] < 5.0
-    unused = "the estimator does not take this topic; with --set topics.turn_rate=/imu/inertial it does"
+    unused = "the estimator does not use this topic; with --set topics.turn_rate=/imu/inertial it does"
     printed = fuselog(*replay).out
     assert f"/imu/inertial: 1200 of 1200 not used: {unused}" in printed
     assert "is assumed" not in printed  # the noise of the wheels is that of their covariance
@@ -144,7 +144,7 @@ def test_two_of_a_kind_are_not_taken_unasked(fuselog: Callable[..., Any], tmp_pa
     assert said.code == 0, said.err
     takes = f"with --set topics.fix={','.join(receivers)} it does"
     for topic in receivers:
-        assert f"{topic}: 60 of 60 not used: the estimator does not take this topic; {takes}" in said.out
+        assert f"{topic}: 60 of 60 not used: the estimator does not use this topic; {takes}" in said.out
     one = fuselog("replay", path, "-e", "ekf", "--set", "topics.fix=/gps1/fix", "--json")
     assert one.json["metrics"]["ekf.position_rmse_m.wheel"] < SIGMA_M
     assert one.json["metrics"]["ekf.nis_per_component.wheel"] == pytest.approx(1.0, abs=0.5)

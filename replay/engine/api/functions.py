@@ -162,9 +162,11 @@ def recursive(
     [5.0, 3.0, 3.0]
     """
     if sum(each is not None for each in (follow, follow_all, advance)) != 1:
-        raise BadInput(f"estimator '{summary}': give one of follow, follow_all and advance")
+        raise BadInput(f"estimator '{summary}': give exactly one of follow, follow_all and advance")
     if advance is None and (out_of_sequence or finish):
-        raise BadInput(f"estimator '{summary}': out_of_sequence and finish need advance; give that too")
+        raise BadInput(
+            f"estimator '{summary}': out_of_sequence and finish need advance; give it as well"
+        )
     for leaf, schema in outputs.items():
         _require_numbers(summary, leaf, schema)
 
@@ -257,8 +259,8 @@ def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
     for field in schema.fields[1:]:
         if field.kind == "vector":
             raise BadInput(
-                f"estimator '{summary}': field {field.name} of its output {leaf} is a vector; give a "
-                "further output of a recursion fields of one number each"
+                f"estimator '{summary}': field {field.name} of its output {leaf} is a vector; each "
+                "field of a further output of a recursion must be one number"
             )
 
 

@@ -304,7 +304,7 @@ def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
     """
     if not re.fullmatch(r"[\w:=-]+", label):
         raise BadInput(
-            f"estimator '{label}': a label may have letters, digits and '-', '_', ':', '=' alone; "
+            f"estimator '{label}': a label can only have letters, digits, '-', '_', ':' and '='; "
             "choose another"
         )
     estimator, values = specified(label, settings)
@@ -328,8 +328,8 @@ def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
     for name, value in variant.items():
         if str(values.get(name, value)) != value:
             raise BadInput(
-                f"estimator {label}: {kind} says {name} = {value}, and a setting {values[name]}; "
-                "give one of them"
+                f"estimator {label}: {kind} sets {name} = {value}, but a setting says {values[name]}; "
+                "give only one of them"
             )
     return estimator.specified(label, values), {**values, **variant}
 

@@ -62,8 +62,8 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
         )
     if not arrival_order:
         raise BadInput(
-            f"--late {text}: messages are late only in the order of their arrival; add --arrival-order "
-            "(in Python arrival_order=True)"
+            f"--late {text}: messages can be late only if they are processed in order of arrival; add "
+            "--arrival-order (in Python arrival_order=True)"
         )
     if policy == "drop":
         if text != policy:
@@ -74,7 +74,7 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
     except ValueError:
         window_s = np.nan
     if not 0 <= window_s <= LONGEST_S:
-        raise BadInput(f"--late {text}: give seconds from zero on, as in {policy}:0.5")
+        raise BadInput(f"--late {text}: give zero or more seconds, such as {policy}:0.5")
     return Late(policy, round(window_s * 1e9))
 
 
@@ -89,14 +89,15 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
     """
     if not isinstance(bound, Recursive):
         raise BadInput(
-            f"estimator {bound.name}: solves for all messages at once, so that none can be late; "
+            f"estimator {bound.name}: it solves for all messages together, so no message can be late; "
             "leave out --late"
         )
     if late.policy == "rewind":
         if bound.out_of_sequence is None:
             raise BadInput(
-                f"estimator {bound.name}: cannot go back to a late message, as those made of a model "
-                "and a method, and filters of libraries, can; give --late drop or --late wait:SECONDS"
+                f"estimator {bound.name}: it cannot reprocess out-of-sequence messages (only estimators "
+                "of a model and a method, and filters of libraries, can); give --late drop or "
+                "--late wait:SECONDS"
             )
         bound = bound.out_of_sequence(late.window_ns)
     return replace(

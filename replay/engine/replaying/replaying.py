@@ -303,8 +303,8 @@ def _refuse_old_priors(
             if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(
                     f"{ensemble[run].name}: the replay would start {bound.name} from {topic}, which is "
-                    f"{(start_ns - int(times_ns[0])) * 1e-9:g} s before the span; say what "
-                    "to start from with --start-from truth or --start-from ESTIMATES"
+                    f"{(start_ns - int(times_ns[0])) * 1e-9:g} s before the span; choose "
+                    "another start with --start-from truth or --start-from ESTIMATES"
                 )
 
 
@@ -317,7 +317,7 @@ def _refuse_asymmetric_priors(
         run = prior.findings.once("asymmetric", partial(_first_asymmetric, prior))
         if run is not None:
             raise BadInput(
-                f"{ensemble[run].name}: the covariance of {topic} is not symmetric; mend the prior"
+                f"{ensemble[run].name}: the covariance of {topic} is not symmetric; correct the prior"
             )
 
 

@@ -20,7 +20,7 @@ from fuselog.replay.engine.streams.failures import sentences_of
 # Messages that drive a motion are not measurements and have no innovations.
 CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}
 INNOVATION, SKIPPED = schemas.INNOVATION.full_name, schemas.SKIPPED.full_name
-UNTAKEN = "the estimator does not take this topic"
+UNTAKEN = "the estimator does not use this topic"
 SILENT, EARLY = "they gave no innovation", "come before the prior"
 LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 PRIOR = schemas.GAUSSIAN_ESTIMATE.full_name
@@ -112,7 +112,7 @@ class Usage:
         if apart_m.any():
             worst = int(np.argmax(apart_m))
             self.doubtful[topic] = (
-                f"landmark {number[worst]} is stated at two places, {apart_m[worst]:.3g} m apart"
+                f"landmark {number[worst]} is stated at two positions, {apart_m[worst]:.3g} m apart"
             )
 
     def note_given(
@@ -139,11 +139,11 @@ class Usage:
             if self.begins_ns is not None:
                 begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
                 facts[EARLY] += int((stream.times(order) < begins_ns).sum())
-            facts["repeat the message before"] += int(_repeated(stream).sum())
+            facts["repeat the previous message"] += int(_repeated(stream).sum())
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
                 known = np.concatenate([each["landmark_id"] for each in maps])
-                facts["are of targets that the map lacks"] += int(
+                facts["measure targets that are not in the map"] += int(
                     (~np.isin(stream["target_id"], known)).sum()
                 )
 

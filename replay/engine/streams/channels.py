@@ -35,7 +35,11 @@ def stated(
             number: float = _number(topic.name, other, topic.metadata[other], _Noise, other) ** power
             return number
     if needed:
-        mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
+        mend = (
+            "record the log again with this number"
+            if parameters is None
+            else f"give it with --set {name}=..."
+        )
         raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
     return np.nan
 
@@ -59,7 +63,7 @@ def _number(
         value = float(text)
     except ValueError:
         raise BadInput(
-            f"topic {topic} states {name} = {text}, which is not a number; state a number"
+            f"topic {topic} states {name} = {text}, which is not a number; give a number"
         ) from None
     if parameters is not None:
         build(parameters, {stands_for: value}, f"topic {topic}")

@@ -57,7 +57,7 @@ class Ensemble(list[SourceType]):
                 if there is None or (there.schema_name, there.metadata) != stated:
                     raise BadInput(
                         f"{source.name}: topic {topic} differs from that of {first.name}; the runs of "
-                        "an ensemble have the same topics and types, so replay this one on its own"
+                        "an ensemble must have the same topics and types, so replay this run separately"
                     )
             self._alike.add(topic)
 

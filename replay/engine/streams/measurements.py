@@ -132,7 +132,7 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
         return stream[covariance][:, :, None] * np.eye(size)
     raise BadInput(
         f"topic {stream.topic}: {covariance} has {width} numbers; {size**2} are needed for the {size} "
-        f"of {field}"
+        f"numbers of {field}"
     )
 
 
@@ -219,7 +219,7 @@ def _stated(stream: Stream, field: str) -> Mapping[str, str]:
     named = sum(1 for name in stated["components"].split(",") if name)
     if named not in (0, width):
         raise BadInput(
-            f"topic {stream.topic}: its channel names {named} components "
-            f"({stated['components']}), {field} has {width} numbers"
+            f"topic {stream.topic}: the channel names {named} components ({stated['components']}), but "
+            f"{field} has {width} numbers; name one component for each number"
         )
     return stated

@@ -125,8 +125,9 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
         columns |= _moved_fields(stream, movement)
     elif schema not in (*_STATES, schemas.GEODETIC_FIX.full_name):
         raise BadInput(
-            f"topic {stream.topic} states the origin {own} of its plane, and others state {origin}: its "
-            f"messages ({schema}) are not taken into another plane; record it with the others' origin"
+            f"topic {stream.topic} states the origin {own} of its plane, but other topics state "
+            f"{origin}; messages of type {schema} cannot be transformed between planes, so record them "
+            "with the origin of the others"
         )
     return replace(stream, columns=columns, metadata={**stream.metadata, **origin.metadata})
 

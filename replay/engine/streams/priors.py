@@ -65,8 +65,8 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
         widths = stream["mean"].shape[1], stream["covariance"].shape[1]
         if widths != (layout.stated, size**2):
             raise BadInput(
-                f"{where}: {layout.stated} components are stated, mean and covariance have {widths[0]} "
-                f"and {widths[1]} numbers; {layout.stated} and {size**2} are needed"
+                f"{where}: the channel states {layout.stated} components, but mean and covariance have "
+                f"{widths[0]} and {widths[1]} numbers; {layout.stated} and {size**2} are needed"
             )
         time_ns[present] = stream.publish_time_ns[first]
         mean[present] = stream["mean"][first][:, layout.columns]
@@ -76,7 +76,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
     usable = finite & is_positive_definite(covariance)
     if not usable.all():
         mean[~usable], covariance[~usable] = np.nan, np.nan
-        wanted = f"no prior of {len(components)} components ({', '.join(components)}) can be used"
+        wanted = f"no usable prior of {len(components)} components ({', '.join(components)})"
         for run in np.flatnonzero(~usable).tolist():
             reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
             reasons[run] = f"{where}: {wanted}: {reason if run in present else MISSING}"

@@ -38,12 +38,14 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
     for name, kind in wanted.items():
         if name not in kinds:
             raise BadInput(
-                f"{where}: no component {name}: its channel states "
-                f"{', '.join(names) or 'no components'}; {', '.join(wanted)} are needed, in any order; "
-                "name them alike in both"
+                f"{where}: the channel has no component {name}; it states "
+                f"{', '.join(names) or 'no components'}, and {', '.join(wanted)} are needed in any "
+                "order: use the same names in both"
             )
         if kinds[name] != kind:
-            raise BadInput(f"{where}: component {name} is stated as {kinds[name]}; it must be {kind}")
+            raise BadInput(
+                f"{where}: component {name} has the kind {kinds[name]}; the kind must be {kind}"
+            )
     return [names.index(name) for name in wanted]
 
 
@@ -82,8 +84,9 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
     kinds = listed.split(",") if listed else [wanted.get(name, "linear") for name in names]
     if len(set(names)) < len(names) or len(kinds) != len(names) or not are_kinds(kinds):
         raise BadInput(
-            f"{where}: components '{stated.get('components', '')}' with kinds '{listed}': give each "
-            "component a name of its own and a kind; an axis has two in a row, a quaternion four"
+            f"{where}: invalid components '{stated.get('components', '')}' with kinds '{listed}': give "
+            "each component a unique name and a kind; an axis needs two adjacent components, a "
+            "quaternion four"
         )
     return dict(zip(names, cast("list[Kind]", kinds), strict=True))
 

@@ -35,15 +35,17 @@ def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Str
     if first and first[0].startswith("time_"):
         stream = _of_table(path, f"/estimates/{label}{case}/state", truth)
     elif truth is None:
-        raise BadInput("the program wrote a trajectory, and the log has no truth that says of what")
+        raise BadInput(
+            "the program wrote a trajectory, but the log has no truth that states what it is of"
+        )
     else:
         like = empty_stream(truth.name, schemas.TRUTH_STATE, truth.metadata)
         try:
             stream = estimates_of(read_trajectory(path), f"/estimates/{label}{case}/state", like)
         except BadInput as error:
             raise BadInput(
-                f"the program wrote neither MCAP nor CSV that begins with time_ns, and as a trajectory "
-                f"{error}"
+                f"the program wrote neither MCAP nor CSV that begins with time_ns, and the file is not "
+                f"a valid trajectory: {error}"
             ) from None
     return {stream.topic: stream}
 
@@ -86,8 +88,8 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
     for name in map(str, table):
         if missing := np.flatnonzero(~np.isfinite(numbers[name])).tolist():
             raise BadInput(
-                f"the program's estimates have no number as {name} in row {missing[0] + 1} "
-                f"({len(missing)} in all); write one, or leave the row out"
+                f"the program's estimates have no number in column {name}, row {missing[0] + 1} "
+                f"({len(missing)} in total); write one, or leave out the row"
             )
     whole = table[clock].to_numpy()
     time_ns = whole.astype(np.int64) if clock == "time_ns" else np.rint(whole * 1e9).astype(np.int64)

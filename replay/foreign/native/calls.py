@@ -64,10 +64,10 @@ def _passed(emitter: Emitter, value: Any, kind: str) -> str:
     """Convert an argument to the form that C takes."""
     if isinstance(value, Array):
         if kind != "pointer" or value.dtype != "<f8":
-            raise TypeError("C is given arrays of real numbers where it wants a pointer")
+            raise TypeError("a pointer argument of a C function must be an array of real numbers")
         return value.pointer
     if isinstance(value, Number) and value.kind == REAL:
-        raise TypeError("C is given whole numbers and arrays here")
+        raise TypeError("an argument of a C function must be a whole number or an array")
     number = emitter.as_kind(value, WHOLE)
     if kind == "i64":
         return number.code

@@ -38,7 +38,7 @@ FAILURES = {
     NOT_CREATED: "fuselog_filter_create returned NULL",
     NOT_COPIED: "fuselog_filter_copy returned NULL",
     INNOVATION_UNSOUND: "the covariance of the filter's innovation is not positive definite",
-    UNDEFINED: "the filter returned a number below zero that fuselog_filter.h does not define",
+    UNDEFINED: "the filter returned a negative number that fuselog_filter.h does not define",
 }
 
 

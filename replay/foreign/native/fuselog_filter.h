@@ -1,11 +1,12 @@
 /* fuselog_filter.h: your filter in fuselog's replay. Version 1; C99, for C++, Rust and Ada as well.
  *
- * A shared library that has these functions is an estimator: fuselog replay run.mcap -e lib:./libmine.so
- * What each has to do stands beside it; docs/your-filter.md leads through an example.
+ * A shared library with these functions is an estimator: fuselog replay run.mcap -e lib:./libmine.so
+ * Each function is documented below; docs/your-filter.md explains an example.
  *
- * Keep all that a filter knows behind the pointer that `create` gives: several filters live at once, each
- * used by one thread at a time. Times are in nanoseconds. Matrices are row-major. The covariance is in the
- * tangent space, that is of as many rows as the state has components, but three for a quaternion's four.
+ * Keep the whole state of a filter behind the pointer that `create` returns: several filters exist at the
+ * same time, each used by one thread at a time. Times are in nanoseconds. Matrices are row-major. The
+ * covariance is in the tangent space: it has one row for each component of the state, but three rows for
+ * the four components of a quaternion.
  */
 #ifndef FUSELOG_FILTER_H
 #define FUSELOG_FILTER_H
@@ -14,11 +15,11 @@
 
 #define FUSELOG_FILTER_VERSION 1
 
-/* What functions return. A number from 1 on is a failure: it counts in `failures` of the description, and
- * ends the run with that sentence. A number below zero that is not one of these ends it, too. */
+/* Return values. A positive number is a failure: it is the number, counted from 1, of a sentence in
+ * `failures` of the description, and ends the run. Any other negative number also ends the run. */
 #define FUSELOG_FILTER_WELL 0
-#define FUSELOG_FILTER_NOTHING (-1)  /* there is none now: no estimate, no innovation */
-#define FUSELOG_FILTER_REJECTED (-2) /* of an innovation: a gate kept the measurement out */
+#define FUSELOG_FILTER_NOTHING (-1)  /* there is no estimate or innovation now */
+#define FUSELOG_FILTER_REJECTED (-2) /* for an innovation: a gate rejected the measurement */
 
 #if defined(_WIN32)
 #define FUSELOG_FILTER_EXPORT __declspec(dllexport)
@@ -32,43 +33,44 @@
 extern "C" {
 #endif
 
-/* Returns FUSELOG_FILTER_VERSION, as the library was compiled with. */
+/* Returns the FUSELOG_FILTER_VERSION with which the library was compiled. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_version(void);
 
-/* Returns JSON, in UTF-8, that stays where it is: the topics and fields that the filter reads, the
- * components of its state, its parameters. */
+/* Returns the description, JSON in UTF-8, whose memory must stay valid: the topics and fields that the
+ * filter reads, the components of its state, its parameters. */
 FUSELOG_FILTER_EXPORT const char *fuselog_filter_describe(void);
 
-/* Makes a filter; NULL where that fails. `parameters` are in the order of the description; `seed` is for
- * random numbers. */
+/* Creates a filter; returns NULL on failure. `parameters` are in the order of the description; `seed` is
+ * for random numbers. */
 FUSELOG_FILTER_EXPORT void *fuselog_filter_create(const double *parameters, uint64_t seed);
 
-/* Starts from a prior; both pointers are NULL where the log has none: then the time is that of the first
- * message. The messages of static topics, such as a map, were taken before. */
+/* Starts from a prior. If the log has no prior, both pointers are NULL and the time is that of the first
+ * message. The messages of static topics, such as a map, are passed before. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_start(void *filter, int64_t time_ns, const double *mean,
                                                    const double *covariance);
 
-/* Takes one message: of which topic, in the description's order from 0 on, when it was measured, and its
- * fields in the description's order. Times never go back; several messages may have one time. */
+/* Processes one message: the index of its topic in the description, from 0 on, the time of measurement,
+ * and its fields in the order of the description. Times never go back; several messages may have the same
+ * time. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns,
                                                   const double *fields);
 
-/* Predicts to a time at which nothing was measured. */
+/* Predicts to a time without a measurement. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_predict(void *filter, int64_t time_ns);
 
-/* Gives the state and its covariance. It is asked for after the last message of every time. */
+/* Writes the state and its covariance. Called after the last message of every time. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_state(const void *filter, double *mean, double *covariance);
 
-/* Optional. Gives the innovation, measured minus predicted, of the message that was taken last, and its
- * covariance before the update: all components of the description; NaN in the former where that message
- * did not measure one. */
+/* Optional. Writes the innovation (measured minus predicted) of the message that was processed last, and
+ * its covariance before the update, for all components in the description. In the innovation, components
+ * that the message did not measure are NaN. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_innovation(const void *filter, double *innovation,
                                                         double *covariance);
 
-/* Makes another filter that knows the same; NULL where that fails. */
+/* Makes an independent copy of a filter with the same state; returns NULL on failure. */
 FUSELOG_FILTER_EXPORT void *fuselog_filter_copy(const void *filter);
 
-/* Ends a filter. */
+/* Destroys a filter. */
 FUSELOG_FILTER_EXPORT void fuselog_filter_destroy(void *filter);
 
 #ifdef __cplusplus

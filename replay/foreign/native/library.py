@@ -49,7 +49,7 @@ class Library:
         except OSError as error:
             why = str(error).removeprefix(f"{path.resolve()}: ")
             if why.startswith(NOT_OPENED):
-                why = "it is of another CPU or system"
+                why = "it was compiled for another CPU or system"
             raise BadInput(
                 f"{path}: cannot be loaded ({why}); compile it as a shared library for this machine, "
                 f"{platform.system()} on {platform.machine()}"
@@ -58,7 +58,7 @@ class Library:
         if version != VERSION:
             raise BadInput(
                 f"{path}: was compiled with version {version} of fuselog_filter.h; this fuselog has "
-                f"version {VERSION}, so compile it again with {HEADER.name} of this one"
+                f"version {VERSION}, so compile it again with the {HEADER.name} of this version"
             )
         names = (*Addresses._fields[:-1], "describe", "create")
         functions = {name: self._function(name, None) for name in names}
@@ -67,7 +67,7 @@ class Library:
         self.addresses = Addresses(**required, innovation=_address(optional) if optional else 0)
         text = self._function("describe", ctypes.c_char_p)()
         if not text:
-            raise BadInput(f"{path}: fuselog_filter_describe returns no text; it has to return JSON")
+            raise BadInput(f"{path}: fuselog_filter_describe returns no text; it must return JSON")
         self.description: bytes = text
         self._create = self._function("create", ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64)
         self._copy = self._function("copy", ctypes.c_void_p, ctypes.c_void_p)
@@ -78,8 +78,8 @@ class Library:
             function = self._library[f"fuselog_filter_{name}"]
         except AttributeError:
             raise BadInput(
-                f"{self.path}: lacks the function fuselog_filter_{name}; it has to export all of "
-                f"{HEADER.name} but fuselog_filter_innovation"
+                f"{self.path}: lacks the function fuselog_filter_{name}; it must export all functions "
+                f"of {HEADER.name} except fuselog_filter_innovation"
             ) from None
         function.restype, function.argtypes = returns, takes
         return function

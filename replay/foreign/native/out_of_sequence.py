@@ -132,7 +132,7 @@ def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
 
 @lru_cache(maxsize=1)
 def _loop() -> OverRuns:
-    title = "filters of a library, which go back for late messages"
+    title = "filters of a library, with reprocessing of late messages"
     return compile_over_runs(follow_as_arrived, title=title)
 
 

@@ -323,7 +323,9 @@ def describe_apart(library: str) -> str:
         except Ended as ended:
             worker.end()
             if worker.code != IDLE:
-                raise BadInput(f"{library}: {ended} while it was asked what it is; mend it") from None
+                raise BadInput(
+                    f"{library}: {ended} while it was asked for its description; correct the library"
+                ) from None
         except BaseException:
             worker.end()
             raise

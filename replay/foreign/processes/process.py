@@ -30,7 +30,7 @@ class Program:
             )
         except OSError as error:
             raise BadInput(
-                f"exec:{words[0]}: cannot be started ({error.strerror}); give a program that there is"
+                f"exec:{words[0]}: cannot be started ({error.strerror}); give a program that exists"
             ) from None
         GUARD.tell(self.process.pid)
         self.tail = b""

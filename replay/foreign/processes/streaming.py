@@ -90,7 +90,7 @@ class Stream(Program):
                     size = _HEAD.unpack_from(buffer)[0]
                     if not 0 < size <= MOST_BYTES:
                         text = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
-                        fault = f"wrote '{text}' to standard output, which is no frame,"
+                        fault = f"wrote '{text}' to standard output, which is not a frame,"
                         self._frames.put(_Frame(b"", fault))
                         return
                     if len(buffer) < 4 + size:
@@ -125,7 +125,7 @@ class Stream(Program):
             if not frame.body:
                 raise Ended(self.how_ended())
             if frame.body[:1] != letter:
-                raise Ended(f"sent a frame {frame.body[:1]!r} where {letter!r} was due")
+                raise Ended(f"sent a frame {frame.body[:1]!r} instead of {letter!r}")
             return frame.body[1:]
 
     def check_end(self) -> None:
@@ -133,7 +133,7 @@ class Stream(Program):
         with suppress(queue.Empty):
             frame = self._frames.get(timeout=ENDS_S)
             if frame.body or frame.fault:
-                raise Ended(frame.fault or "sent one answer more than it was asked for,")
+                raise Ended(frame.fault or "sent one answer too many,")
 
 
 def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Description:
@@ -143,14 +143,14 @@ def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Descrip
         found = read_description(stream.next(b"D"), where)
     except Ended as ended:
         why = str(ended).rstrip(",")
-        raise BadInput(f"{where}: the program {why}, before it gave its description") from None
+        raise BadInput(f"{where}: the program {why} before it gave its description") from None
     finally:
         stream.end()
     if found.protocol != PROTOCOL:
         raise BadInput(
-            f"{where}: its description states protocol {found.protocol}, and this is {PROTOCOL}: add "
-            f'"protocol": {PROTOCOL} to it, and begin each answer with the number that S, T and P begin '
-            "with (u32), as this version's client.py and client.hpp do"
+            f"{where}: its description states protocol {found.protocol}, but this version uses "
+            f'{PROTOCOL}: add "protocol": {PROTOCOL} to it, and begin each answer with the number (u32) '
+            "at the beginning of the S, T or P frame, as this version's client.py and client.hpp do"
         )
     return found
 
@@ -238,15 +238,17 @@ def _reply(
     n, t, m = sizes_of(description)
     number, status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (due, 0, 0xFF)
     if number != due:
-        raise Ended(f"answered frame {number} where {due} was due: it has to answer every frame once,")
+        raise Ended(
+            f"answered frame {number} instead of {due} (it must answer every frame exactly once)"
+        )
     estimate, innovation = (n + t * t) * bool(flags & ESTIMATE), (m + m * m) * bool(flags & INNOVATION)
     wanted = _REPLY.size + 8 * (estimate + innovation)
     if len(body) != wanted:
-        sizes = f"{1 + len(body)} bytes with flags {flags}, where {1 + wanted} were due,"
+        sizes = f"{1 + len(body)} bytes with flags {flags} instead of {1 + wanted} bytes"
         raise Ended(f"sent a reply of {sizes}")
     if status < 0 or flags > ESTIMATE | INNOVATION | REJECTED:
         raise Ended(
-            f"answered with status {status} and flags {flags}, which this protocol does not have,"
+            f"answered with status {status} and flags {flags}, which this protocol does not define,"
         )
     if status > 0:
         raise _Failed(reason_of_code(OWN + status, description))

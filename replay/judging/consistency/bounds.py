@@ -27,7 +27,7 @@ from fuselog.replay.judging.metrics.metrics import squares_by_name
 from fuselog.replay.judging.metrics.sums import BinnedSums
 
 SINGULAR = "the process noise is singular"
-UNALIKE = "the runs have other stamps"
+UNALIKE = "the runs have different stamps"
 LONG = "there are too many steps"
 # A noise whose correlation matrix has a smaller eigenvalue counts as singular.
 LEAST_EIGENVALUE = 1e-10
@@ -206,7 +206,7 @@ def root_mean_squares(state: Bounds) -> dict[str, float]:
 
 
 BOUND = Metric(
-    "posterior Cramer-Rao bound over an ensemble, beside the RMSE that it bounds",
+    "posterior Cramer-Rao bound over an ensemble, for comparison with the RMSE",
     Output,
     Bounds,
     _add,

@@ -64,7 +64,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
         rotation = left * [1.0, 1.0, proper] @ right  # (40), (43)
     if not is_determined:
         needed = (
-            "two apart in the plane" if align in ("yaw", "se2") else "three that are not in one line"
+            "two different horizontal positions" if align in ("yaw", "se2") else "three not on one line"
         )
         raise BadInput(
             f"{where}: {len(estimate_m)} poses do not determine the {align} alignment, which needs "
@@ -151,7 +151,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
     )
     if is_flat and alignment.rotation[2, 2] < LEAST_COSINE:
         raise BadInput(
-            f"topic {estimates.topic}: is planar, and the alignment would turn it out of its plane; "
+            f"topic {estimates.topic}: is planar, and the alignment would rotate it out of its plane; "
             "give --align se2"
         )
     mean, jacobian = moved_states(components, estimates["mean"], alignment)

@@ -340,7 +340,7 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
         facts.append(f"it has {', '.join(true)}")
     elif position and rest:
         alone, others = ", ".join(position), ", ".join(rest)
-        facts.append(f"position_rmse_m is of {alone} alone, and not of {others}, which {truth} has")
+        facts.append(f"position_rmse_m covers only {alone}, and not {others}, which {truth} has")
     return f"{what}: {'; '.join(facts)}" if facts else ""
 
 
@@ -363,8 +363,8 @@ def _components(stream: Stream) -> dict[str, Any]:
     kinds = stream.metadata.get("kinds", "").split(",")
     if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):
         raise BadInput(
-            f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
-            f"out of {', '.join(WIDTHS)}; an axis has two in a row, a quaternion four"
+            f"topic {stream.topic}: the channel's metadata must name components and, for each, one of "
+            f"the kinds {', '.join(WIDTHS)}; an axis needs two adjacent components, a quaternion four"
         )
     return dict(zip(names, kinds, strict=True))
 

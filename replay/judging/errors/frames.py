@@ -43,7 +43,7 @@ def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Map
             measured = f"the frame of the measurements as {FRAME} on their channels"
             return (
                 f"they are in {own}, {topic} is in {frame_in_words(into)}, and no truth states the pose "
-                f"of {own} there; record {pose if frame else measured}"
+                f"of {own} in that frame; record {pose if frame else measured}"
             )
     return ""
 

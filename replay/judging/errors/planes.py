@@ -69,20 +69,20 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
             if own is not None and (is_first or truth.metadata.get(FRAME)):
                 at = "the first fix" if is_first else "their origin"
                 return (
-                    f"{topic} does not state the origin of its plane, and the estimates are east and "
-                    f"north of {own}, {at}; state it with --set {topic}.plane=LATITUDE,LONGITUDE,HEIGHT "
-                    "or bring one to the other with fuselog evaluate --align se2"
+                    f"{topic} does not state the origin of its plane, and the estimates are relative to "
+                    f"{own}, {at}; give it with --set {topic}.plane=LATITUDE,LONGITUDE,HEIGHT, or align "
+                    "the estimates with fuselog evaluate --align se2"
                 )
             of_truth = frame_of(truth.metadata)
             if own is None and frame != of_truth:
                 own_frame, other = frame_in_words(frame), frame_in_words(of_truth)
                 return (
-                    f"they are in {own_frame}, {topic} is in {other}; bring one to the other with "
+                    f"they are in {own_frame}, and {topic} is in {other}; align them with "
                     "fuselog evaluate --align se2"
                 )
         elif own is None and frame:
             return (
-                f"they are in {plane_in_words(stream.metadata)}, and {topic} is east and north of an "
-                "origin on earth; bring one to the other with fuselog evaluate --align se2"
+                f"they are in {plane_in_words(stream.metadata)}, and {topic} is relative to an origin "
+                "on earth; align them with fuselog evaluate --align se2"
             )
     return ""

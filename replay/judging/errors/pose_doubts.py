@@ -16,8 +16,8 @@ LOOSE_DEG = 1.0
 # Beyond this, an interval from the slope at the best rotation is meaningless.
 UNKNOWN_DEG = 60.0
 UNTURNED = (
-    "its orientations never turn although its path or the estimate does: it is taken as positions "
-    "without orientations, and no rotation errors are given"
+    "its orientations are constant although its path or the estimate turns; it is treated as positions "
+    "without orientations, so no rotation errors are given"
 )
 
 
@@ -69,8 +69,8 @@ def doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) -
         return []
     within = f"within {known_deg:.2g} deg (95 %)" if known_deg < UNKNOWN_DEG else "not at all"
     has_figures = estimate.rotation is not None
-    figures = "; absolute rotation errors (APE) are known no better" if has_figures else ""
+    figures = "; absolute rotation errors (APE) are equally uncertain" if has_figures else ""
     return [
-        f"{estimate.name}: its path is nearly straight or short for its errors, so that positions "
+        f"{estimate.name}: its path is nearly straight, or short compared with its errors, so positions "
         f"determine the rotation of the {align} alignment {within}{figures}"
     ]

@@ -156,9 +156,9 @@ def associate(
     if times is None or true_times is None:
         if len(estimate) != len(truth):
             raise BadInput(
-                f"{(estimate if times is None else truth).name}: has no stamps, so that poses are "
-                f"paired by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
-                f"{len(truth)}: give both with stamps"
+                f"{(estimate if times is None else truth).name}: has no stamps, so poses are paired by "
+                f"their order, but {estimate.name} has {len(estimate)} poses and {truth.name} "
+                f"{len(truth)}; give both with stamps"
             )
         return estimate, truth
     limit_s = comparison.max_difference_s
@@ -178,7 +178,7 @@ def associate(
         raise BadInput(
             f"{estimate.name}: has no stamps within {limit_s:g} s of those of {truth.name}: it is from "
             f"{first:.3f} to {last:.3f} s, the truth from {true_first:.3f} to {true_last:.3f} s; give "
-            "files of one run, a wider limit, or a time offset"
+            "files of the same run, a larger limit, or a time offset"
         )
     return found
 
@@ -234,7 +234,7 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
     if len(ends) < 2:
         length = steps.sum() * (1e-9 if unit == "s" else 1.0)
         raise BadInput(
-            f"{estimate.name}: the part with truth is {length:.6g} {unit} long; give a smaller delta "
+            f"{estimate.name}: the part with truth is {length:.6g} {unit} long; give a delta smaller "
             f"than {comparison.delta:g}"
         )
     return np.array(ends[:-1]), np.array(ends[1:])
@@ -316,7 +316,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
         speed = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
         if len(speed) < 2 or np.ptp(speed) <= 1e-6 * speed.max():
             raise BadInput(
-                f"{trajectory.name}: its speed never changes, so that no time offset can be found; "
+                f"{trajectory.name}: its speed never changes, so the time offset cannot be estimated; "
                 "give the offset in s"
             )
         speeds.append(speed - speed.mean())

@@ -60,7 +60,7 @@ def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
     Raises BadInput if the trajectory has no stamps, or the truth has none of its components.
     """
     if trajectory.time_ns is None:
-        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a TUM or EuRoC trajectory")
     stated = stated_components(truth.metadata, {}, f"topic {truth.topic}")
     columns = {
         name: trajectory.position_m[:, axis] for axis, name in enumerate(POSITION) if name in stated
@@ -73,7 +73,7 @@ def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
         elif stated.get(HEADING) == "angle":
             columns[HEADING] = turned.as_euler("ZYX")[:, 0]
     if not columns:
-        raise BadInput(f"{trajectory.name}: topic {truth.topic} states no position to judge it by")
+        raise BadInput(f"{trajectory.name}: topic {truth.topic} has no position to compare it with")
     kinds = [stated[name] for name in columns]
     width = len(tangent_components(list(columns), kinds))
     count = len(trajectory)
@@ -90,7 +90,7 @@ def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
 def truth_of(trajectory: Trajectory, topic: str) -> Stream:
     """Convert a trajectory to a truth stream; raise BadInput if it has no stamps."""
     if trajectory.time_ns is None:
-        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a TUM or EuRoC trajectory")
     names, state = [*POSITION], trajectory.position_m
     if trajectory.rotation is not None:
         turned = Rotation.from_matrix(trajectory.rotation).as_quat(scalar_first=True)

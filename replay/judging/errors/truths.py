@@ -81,9 +81,9 @@ class Truths:
                 continue
             name = max(apart, key=apart.__getitem__)
             if topic != other:
-                what = f"{other} states the truth of the same thing, and is not used"
+                what = f"{other} states the truth of the same object and is not used"
             elif apart[name]:
-                what = "a truth is stated twice at one stamp"
+                what = "a truth is stated twice with the same stamp"
             else:
                 continue
             found.setdefault(topic, []).append(f"{what}: {name} differs by up to {apart[name]:.3g}")

@@ -290,23 +290,25 @@ CONSISTENCY = Metric(
     "NEES against its chi-square bounds", Errors, _no_nees, _add_nees, _merge_nees, consistency
 )
 INNOVATION = metric_of_sums(
-    "NIS, and the share of measurements that a gate kept out", Innovations, _nis, innovation
+    "NIS, and the share of measurements that a gate rejected", Innovations, _nis, innovation
 )
 LIKELIHOOD = metric_of_sums(
     "log-likelihood of the measurements, per run", Innovations, _log_likelihoods, likelihood
 )
 FAILURES = metric_of_sums(
-    "how many runs an estimator could not follow to the end", Output, _failed, failures
+    "number of runs that an estimator could not process to the end", Output, _failed, failures
 )
 COVERAGE = metric_of_sums(
-    "what share of the span was estimated, what was not used, and how old late estimates are",
+    "share of the span that was estimated, unused measurements, and age of delayed estimates",
     Output,
     covered,
     coverage,
 )
-SOLUTION = metric_of_sums("how many batch solutions converged, and how fast", Output, _solved, solution)
+SOLUTION = metric_of_sums(
+    "share of batch solutions that converged, and their iterations", Output, _solved, solution
+)
 PARTICLES = metric_of_sums(
-    "what share of the particles is effective, their weights being unequal",
+    "effective share of the particles, given their weights",
     Output,
     _effective,
     effective,

@@ -43,8 +43,8 @@ STATES: Mapping[str, Mapping[float, str]] = {
         5: "solution single",
         6: "solution PPP",
     },
-    "standing": {0: "moves", 1: "stands: no velocity"},
-    "rolling": {0: "may slip", 1: "rolls: no velocity to the side or up"},
+    "standing": {0: "moves", 1: "stationary: zero velocity"},
+    "rolling": {0: "may slip", 1: "rolls: zero lateral and vertical velocity"},
 }
 
 
@@ -138,7 +138,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         times = stream.publish_time_ns
         drawn, span_s = len(thin(times)), (times[-1] - times[0]) * 1e-9
         if drawn < len(times):
-            text = f"drawn at {drawn / span_s:.3g} Hz of {len(times) / span_s:.3g} Hz"
+            text = f"drawn at {drawn / span_s:.3g} Hz instead of {len(times) / span_s:.3g} Hz"
             yield Happened(estimator, "INFO", times[:1], [text])
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         gated = stream.take(stream["accepted"] == 0)
@@ -154,13 +154,13 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
     for estimator, stream in scene.outputs_of(case, schemas.REWOUND):
         late_s = (stream.log_time_ns - stream.publish_time_ns) * 1e-9
         texts = [
-            f"came {delay:.3f} s late: went back and used {repeated} after it again"
+            f"came {delay:.3f} s late: {repeated} messages after it were reprocessed"
             for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
         ]
         yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.WAITED):
         texts = [
-            f"came late, {behind:.3f} s behind newer ones, which waited for it"
+            f"came late, {behind:.3f} s behind newer messages, which waited for it"
             for behind in stream["behind_s"].tolist()
         ]
         yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
@@ -169,7 +169,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.RELATIVE_BEARING):
         pairs = zip(stream["first_id"].tolist(), stream["second_id"].tolist(), strict=True)
-        texts = [f"empty set: the pair {first}, {second} is to blame" for first, second in pairs]
+        texts = [f"empty set, caused by the pair {first}, {second}" for first, second in pairs]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
 
 
@@ -190,7 +190,7 @@ def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
     for time_ns, target, square in of:
         sensors = [sensor for sensor, messages in there.items() if (time_ns, target) in messages]
         what = " or ".join(sensors) or "a measurement"
-        texts.append(f"gated {what}{f' of target {target}' if target else ''}: NIS {square:.1f}")
+        texts.append(f"rejected {what}{f' of target {target}' if target else ''}: NIS {square:.1f}")
     return texts
 
 
@@ -218,8 +218,8 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
         explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
         sensor = _within(topic, case)
         yield from _changes(sensor, scene.read(topic))
-        yield _spans(sensor, "dead for", outages)
-        yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])
+        yield _spans(sensor, "outage of", outages)
+        yield _spans(sensor, "no messages for", gaps[~explained.any(axis=1)])
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:

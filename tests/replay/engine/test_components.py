@@ -35,16 +35,16 @@ def test_a_covariance_keeps_a_quaternions_three_rows_together() -> None:
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        ({}, "no component x_m: its channel states no components"),
-        ({"components": "x_m,y_m,vx_mps"}, "no component vy_mps: .* states x_m, y_m, vx_mps"),
+        ({}, "no component x_m; it states no components"),
+        ({"components": "x_m,y_m,vx_mps"}, "no component vy_mps; it states x_m, y_m, vx_mps"),
         (
             {"components": "x_m,y_m,vx_mps,vy_mps", "kinds": "linear,angle,linear,linear"},
-            "y_m is stated as angle; it must be linear",
+            "y_m has the kind angle; the kind must be linear",
         ),
-        ({"components": "x_m,y_m,x_m"}, "a name of its own"),
+        ({"components": "x_m,y_m,x_m"}, "a unique name"),
         ({"components": "x_m,y_m", "kinds": "linear"}, "with kinds 'linear'"),
         ({"components": "x_m", "kinds": "straight"}, "with kinds 'straight'"),
-        ({"components": "a,b,c", "kinds": "axis,linear,axis"}, "an axis has two in a row"),
+        ({"components": "a,b,c", "kinds": "axis,linear,axis"}, "an axis needs two adjacent components"),
     ],
 )
 def test_what_is_missing_or_stated_badly_is_refused(stated: dict[str, str], words: str) -> None:

@@ -206,7 +206,7 @@ def test_failed_runs_are_told_when_and_the_others_go_on() -> None:
     assert failure.offsets.tolist() == [0, 1, 1, 2]
     assert failure.stream.publish_time_ns.tolist() == [110, 100]
     assert out["/estimates/m/a/state"].offsets.tolist() == [0, 1, 2, 2]
-    with pytest.raises(BadInput, match="topic /a/prior: no prior of 1 components"):
+    with pytest.raises(BadInput, match="topic /a/prior: no usable prior of 1 components"):
         run(make_mean(), [blind])
 
 

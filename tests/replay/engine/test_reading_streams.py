@@ -79,7 +79,10 @@ def test_a_planar_filter_takes_x_and_y_of_a_fix_by_their_names(estimator: str, o
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"components": "range_m,height_m"}, "position_m: no component x_m: .* range_m, height_m"),
+        (
+            {"components": "range_m,height_m"},
+            "position_m: .* no component x_m; it states range_m, height_m",
+        ),
         ({"components": "x_m,y_m,z_m"}, "names 3 components .* position_m has 2"),
         ({"width": "9"}, "covariance_m2 has 9 numbers; 4 are needed"),
     ],
@@ -127,7 +130,7 @@ def test_vectors_of_another_width_are_refused() -> None:
     source = record("batch-reactor")
     pressure = source.streams["/pressure"]
     double = replace(pressure, columns={**pressure.columns, "value": np.ones((len(pressure), 2))})
-    with pytest.raises(BadInput, match=r"/pressure: its channel names 1 components .* value has 2"):
+    with pytest.raises(BadInput, match=r"/pressure: the channel names 1 components .* value has 2"):
         replayed("analytic", changed(source, pressure=double))
     source = record("axis")
     axis = source.streams["/axis"]
@@ -216,7 +219,7 @@ def test_a_prior_without_a_component_is_refused(estimator: str) -> None:
         names = prior.metadata["components"].replace(missing, "other")
         return replace(prior, metadata={**prior.metadata, "components": names})
 
-    with pytest.raises(BadInput, match=f"prior: no component {missing}: its channel states .*other"):
+    with pytest.raises(BadInput, match=f"prior: .* no component {missing}; it states .*other"):
         replayed(estimator, with_priors(source, renamed))
 
 
@@ -257,7 +260,9 @@ def test_a_robot_whose_prior_does_not_fit_fails_alone(estimator: str) -> None:
     settings = {"anchors": [3]} if "coop" in estimator else {}
     out = replayed(estimator, changed(source, robot2__prior=misfit), **settings)
     (failure,) = sentences_of(out[f"/estimates/{estimator}/robot2/failure"].stream)
-    assert "/robot2/prior: no component heading_rad: its channel states x_m, y_m, speed_mps" in failure
+    assert (
+        "/robot2/prior: the channel has no component heading_rad; it states x_m, y_m, speed" in failure
+    )
     without = {k: v for k, v in source.streams.items() if not k.startswith("/robot2/")}
     rest = replayed(estimator, replace(source, streams=without), **settings)
     for robot in (1, 3):

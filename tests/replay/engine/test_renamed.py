@@ -36,7 +36,7 @@ def test_a_public_name_is_found_by_its_old_one() -> None:
     ],
 )
 def test_a_field_is_given_and_read_by_its_old_name(make: Any, old: str, new: str) -> None:
-    with pytest.warns(FutureWarning, match=f"'{old}' is called '{new}' now; the old name goes in"):
+    with pytest.warns(FutureWarning, match=f"'{old}' was renamed to '{new}'; the old name will be"):
         made = make()
     assert getattr(made, old) is getattr(made, new)
     assert type(made)(**{name: getattr(made, name) for name in made.__dataclass_fields__}) is not made

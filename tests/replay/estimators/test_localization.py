@@ -510,7 +510,7 @@ def test_what_no_run_can_use_is_bad_input():
     line = replace(
         landmarks, columns={**landmarks.columns, "position_m": landmarks["position_m"][:, :1]}
     )
-    with pytest.raises(BadInput, match="topic /landmarks: position_m: no component x_m"):
+    with pytest.raises(BadInput, match="topic /landmarks: position_m: the channel has no component x_m"):
         replayed("ekf", [replace(source, streams={**source.streams, "/landmarks": line})])
     for topic in ("/landmarks", "/robot1/range_bearing", "/robot1/prior", "/robot1/odometry"):
         said = f"run 0 of landmarks: .* ekf does not fit this log: model robot .* lacks .*{topic}"

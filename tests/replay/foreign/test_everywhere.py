@@ -83,7 +83,7 @@ def test_nothing_runs_that_nobody_named(here: Path, capsys: pytest.CaptureFixtur
         assert said.count("\n") == 1
         assert not Path("stolen").exists(), line
     assert main(["check", "run.mcap", "--against", "crafted.golden.xz"]) == 2
-    assert "names the program touch stolen, which runs only where you name it" in capsys.readouterr().err
+    assert "the program touch stolen is named in a file and therefore" in capsys.readouterr().err
     assert main(["check", "run.mcap", "--against", "crafted.golden.xz", "--allow-programs"]) == 2
     assert Path("stolen").exists()  # it is no filter, but it ran
     Path("stolen").unlink()
@@ -113,5 +113,5 @@ def test_estimates_that_name_a_program_are_judged_without_it(here: Path) -> None
     assert main(["replay", "run.mcap", "-e", MINE, "-o", "est.mcap"]) == 0
     Path("robot_ekf.so").unlink()
     assert main(["evaluate", "est.mcap"]) == 0
-    with pytest.raises(BadInput, match="a program, which runs only where you name it"):
+    with pytest.raises(BadInput, match="a program that is named in a file does not run"):
         fl.diagnose("est.mcap")

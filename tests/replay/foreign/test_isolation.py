@@ -30,7 +30,7 @@ RUNS = {
     NOT_A_NUMBER: "the filter's estimate or covariance is not finite",
     NEGATIVE: "a variance of the filter's covariance is negative",
     FAIL: "it was told to fail",
-    UNDEFINED: "returned a number below zero that fuselog_filter.h does not define",
+    UNDEFINED: "returned a negative number that fuselog_filter.h does not define",
 }
 
 

@@ -97,16 +97,16 @@ REFUSED = {
     ),
     "lacks a function": (
         {"WITHOUT_TAKE": 1},
-        "lacks the function fuselog_filter_take; it has to export all of fuselog_filter.h but "
-        "fuselog_filter_innovation",
+        "lacks the function fuselog_filter_take; it must export all functions of fuselog_filter.h "
+        "except fuselog_filter_innovation",
     ),
-    "no JSON": ({"DESCRIPTION": '"\\"{nothing"'}, "its description is no JSON"),
+    "no JSON": ({"DESCRIPTION": '"\\"{nothing"'}, "its description is not valid JSON"),
     "no topics": ({"DESCRIPTION": '"{}"'}, "entry 'description.summary' is missing"),
     "of another log": (
         {"TOPIC": '"/sonar"'},
         "does not fit this log: it needs /sonar; the log has /range",
     ),
-    "of another CPU": ({}, "cannot be loaded (it is of another CPU or system); compile it as a shared"),
+    "of another CPU": ({}, "cannot be loaded (it was compiled for another CPU or system); compile it"),
 }
 """What a library is, and the sentence on it."""
 

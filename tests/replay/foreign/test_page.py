@@ -88,8 +88,8 @@ def test_a_state_by_other_names_is_told_those_of_the_truth(
     fl.write("run.mcap", fl.record("vehicles", vehicles=1, duration_s=3.0))
     both = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
     one = (
-        "north is not judged: /vehicle1/truth lacks it; position_rmse_m is of x_m alone, and not "
-        "of y_m, which /vehicle1/truth has"
+        "north is not judged: /vehicle1/truth lacks it; position_rmse_m covers only x_m, and not "
+        "y_m, which /vehicle1/truth has"
     )
     for label, renamed, said in (
         ("east", {"x_m": "east", "y_m": "north"}, both),
@@ -114,7 +114,7 @@ def test_a_prior_or_truth_by_another_name_is_refused(
     Path(f"no_{what}.c").write_text(text.replace(named, named + "my_"), encoding="utf-8")
     path = str(compile_filter(Path(f"no_{what}.c").resolve()))
     log = fl.record("vehicles", vehicles=1, duration_s=1.0)
-    said = f"names the {what} /vehicle1/my_{what}, which the log lacks; it has /vehicle1/{what}"
+    said = f"names the {what} /vehicle1/my_{what}, which is not in the log; it has /vehicle1/{what}"
     with pytest.raises(BadInput, match=said):
         fl.replay(log, {"mine": {"kind": "lib", "path": path, "in_process": True}})
 

@@ -33,15 +33,15 @@ PROGRAM = Path(__file__).with_name("program.py")  # which has the same commands
 RUNS = {
     SANE: "",
     HALF: "the filter ended within a frame at message 500 (/range)",
-    PRINT: "the filter wrote 'hello from the filter' to standard output, which is no frame, at message",
+    PRINT: "the filter wrote 'hello from the filter' to standard output, which is not a frame, at",
     LEAVE: "the filter ended with exit code 1: no more at message 500 (/range)",
-    OTHER_SIZE: "sent a reply of 18 bytes with flags 1, where 26 were due, at message 500",
+    OTHER_SIZE: "sent a reply of 18 bytes with flags 1 instead of 26 bytes at message 500",
     MUTE: "the filter took longer than 3 s (time_limit_s) at message 500 (/range)",
     FAIL: "it was told to fail",
-    TWICE: "answered frame 500 where 501 was due",
-    SKIP: "answered frame 501 where 500 was due",
-    STATUS: "answered with status -1 and flags 1, which this protocol does not have",
-    FLAG: "answered with status 0 and flags 9, which this protocol does not have",
+    TWICE: "answered frame 500 instead of 501",
+    SKIP: "answered frame 501 instead of 500",
+    STATUS: "answered with status -1 and flags 1, which this protocol does not define",
+    FLAG: "answered with status 0 and flags 9, which this protocol does not define",
 }
 
 
@@ -72,7 +72,7 @@ def test_an_answer_too_many_at_the_end_is_an_error() -> None:
     done = fl.replay(
         memory_source(Recording(list(whole.values())), log.run), {"mine": program(python(PROGRAM))}
     )
-    assert ["one answer more" in each for each in done.failures] == [True]
+    assert ["one answer too many" in each for each in done.failures] == [True]
 
 
 def test_nobody_waits_for_what_a_program_leaves_behind(tmp_path: Path) -> None:
@@ -91,13 +91,13 @@ def test_a_program_that_does_not_describe_itself_as_this_version_is_refused(tmp_
     old = tmp_path / "old.py"
     old.write_text(PROGRAM.read_text().replace('"protocol": 2,', ""))
     with pytest.raises(
-        BadInput, match=r'states protocol 1, and this is 2: add "protocol": 2 to it, and'
+        BadInput, match=r'states protocol 1, but this version uses 2: add "protocol": 2 to it, and'
     ):
         fl.replay(run_with(SANE), {"mine": program(python(old))})
     silent = tmp_path / "silent.py"
     silent.write_text("import time; time.sleep(600)")
     mine = program(python(silent), time_limit_s=0.5)
-    with pytest.raises(BadInput, match=r"took longer than 0\.5 s \(time_limit_s\), before it gave its"):
+    with pytest.raises(BadInput, match=r"took longer than 0\.5 s \(time_limit_s\) before it gave its"):
         fl.replay(run_with(SANE), {"mine": mine})
 
 
@@ -222,7 +222,7 @@ def test_of_two_truths_one_is_named() -> None:
     kinds = {"/a/truth": schemas.TRUTH_STATE, "/b/truth": schemas.TRUTH_STATE, "/fix": schemas.RANGE}
     topics = {name: Topic(name, kind.full_name, "protobuf", (), {}, 1) for name, kind in kinds.items()}
     for named, sentence in (
-        ("", "the log has the truths /a/truth, /b/truth; say which with --set mine.truth=..."),
+        ("", "the log has the truths /a/truth, /b/truth; choose one with --set mine.truth=..."),
         ("/c/truth", "truth = /c/truth: the log has none"),
         ("/b/truth", ""),
     ):
@@ -257,7 +257,7 @@ def test_a_program_that_writes_mcap(tmp_path: Path) -> None:
     [
         ("fail", "the program ended with exit code 1: no such road"),
         ("nothing", "the program wrote no estimates"),
-        ("gap", r"have no number as x_m in row 2 \(2 in all\); write one, or leave the row out"),
+        ("gap", r"have no number in column x_m, row 2 \(2 in total\); write one, or leave out the row"),
         ("table", "have a column z_m, which /robot1/truth does not have; it has x_m, y_m, heading_rad"),
     ],
 )
@@ -278,12 +278,12 @@ def _answer(letter: str) -> str:
     ("command", "sentence"),
     [
         ("./no_such_filter", "exec:./no_such_filter: cannot be started"),
-        ("x {log} {out} {speed}", "{speed} in its command is nothing that is filled in"),
-        ("x {log}", "a program that streams has no places to fill"),
-        ("x 'open", "close the quote"),
-        (f"'{sys.executable}' -c 'print(12345)'", "wrote '12345' to standard output, which is no frame"),
+        ("x {log} {out} {speed}", "{speed} in its command is not a placeholder"),
+        ("x {log}", "a program that streams has no placeholders"),
+        ("x 'open", "close the quotation mark"),
+        (f"'{sys.executable}' -c 'print(12345)'", "wrote '12345' to standard output, which is not a"),
         *(
-            (_answer(letter), f"sent a frame b'{letter}' where b'D' was due")
+            (_answer(letter), f"sent a frame b'{letter}' instead of b'D'")
             for letter in "CE"  # either side of it
         ),
     ],
@@ -296,7 +296,7 @@ def test_commands_that_cannot_be_used(command: str, sentence: str) -> None:
 
 @pytest.mark.parametrize("field", ["", "[3]", "x[", "x[3", "x[a]", "x[-1]"])
 def test_a_field_is_a_name_with_a_size_or_without(field: str) -> None:
-    with pytest.raises(ValueError, match=r"is no field; name it, or name\[SIZE\] for a vector"):
+    with pytest.raises(ValueError, match=r"is not a field; give its name, or name\[SIZE\] for a vector"):
         TopicRead(topic="/x", fields=("y", "z[3]", field))
 
 

@@ -169,7 +169,9 @@ def test_singular_noise_and_other_stamps_are_averaged_along_the_trajectories() -
     )
     assert_allclose(ours, smoothed, atol=1e-12)
     unalike = [target(0), target(1, first=2)]
-    assert bounds_of(outputs(CV, "bound", unalike), unalike).complaint == "the runs have other stamps"
+    assert (
+        bounds_of(outputs(CV, "bound", unalike), unalike).complaint == "the runs have different stamps"
+    )
 
 
 @pytest.mark.usefixtures("uncompiled")

@@ -351,7 +351,7 @@ def test_who_cannot_go_back_says_why() -> None:
     cloud = bound(VEHICLE_A, "particles", [source], particles=50)
     (driven,) = bound(make_wheel(), "ekf", [driven_wheel()])
     for refused, late, words in (
-        (batch, "drop", "all messages at once"),
+        (batch, "drop", "all messages together"),
         (other, "rewind:1", "a model and a method"),
         (random[0], "rewind:1", "random"),
         (cloud[0], "rewind:1", "all particles"),

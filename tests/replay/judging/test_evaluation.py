@@ -178,10 +178,10 @@ def test_without_truth_or_with_that_of_something_else_nothing_is_judged():
     assert errors_of(stream, [*map(Truths, [source(nothing)])]) is None
     assert components_without_truth(stream, [source(nothing)]) == ("x_m", "y_m", "heading_rad")
     turned = truth([1], [[0, 0, 0]], kinds="linear,angle,angle")
-    with pytest.raises(BadInput, match="component y_m is stated as angle; it must be linear"):
+    with pytest.raises(BadInput, match="component y_m has the kind angle; the kind must be linear"):
         errors_of(stream, [*map(Truths, [source(turned)])])
     nameless = gather([estimates([1], [[0, 0, 0]], np.eye(3), kinds="linear,linear,quaternions")])
-    with pytest.raises(BadInput, match="must name components and, for each, a kind"):
+    with pytest.raises(BadInput, match="must name components and, for each, one of"):
         errors_of(nameless, [*map(Truths, [source(truth([1], [[0, 0, 0]]))])])
 
 

@@ -258,9 +258,9 @@ def test_what_cannot_be_compared_is_told() -> None:
     few = truth.take(np.arange(2))
     bare = replace(truth, time_ns=None)
     for estimate, true, how, words in (
-        (line, line, {"align": "se3"}, ("line", "50 poses", "three that are not in one line")),
-        (few, truth, {"align": "sim3"}, ("2 poses", "three that are not in one line")),
-        (few.take(np.arange(1)), truth, {"align": "yaw"}, ("1 poses", "two apart in the plane")),
+        (line, line, {"align": "se3"}, ("line", "50 poses", "three not on one line")),
+        (few, truth, {"align": "sim3"}, ("2 poses", "three not on one line")),
+        (few.take(np.arange(1)), truth, {"align": "yaw"}, ("1 poses", "two different horizontal")),
         (
             replace(truth, time_ns=truth.time_ns + 10 * SECOND),
             truth,
@@ -270,7 +270,7 @@ def test_what_cannot_be_compared_is_told() -> None:
         (bare.take(np.arange(9)), truth, {}, ("no stamps", "9", "50", "give both with stamps")),
         (truth, truth, {"delta": 0}, ("delta is 0", "positive")),
         (truth, truth, {"delta": 1.5}, ("delta is 1.5 frames", "whole number")),
-        (truth, truth, {"delta": 1e6, "delta_unit": "m"}, ("m long", "smaller delta than 1e+06")),
+        (truth, truth, {"delta": 1e6, "delta_unit": "m"}, ("m long", "delta smaller than 1e+06")),
         (bare, bare, {"delta_unit": "s"}, ("has no stamps",)),
         (bare, bare, {"time_offset_s": "estimate"}, ("has no stamps",)),
         (truth, bare, {"time_offset_s": 1.0}, ("has no stamps",)),
@@ -337,7 +337,7 @@ def test_a_planar_state_stays_in_its_plane() -> None:
     )
     assert_allclose(moved["covariance"][0], np.diag([4.0, 1.0, 9.0]).ravel(), atol=1e-12)
     flipped = Alignment(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix())
-    with pytest.raises(BadInput, match="topic /pose: is planar, and the alignment would turn it out"):
+    with pytest.raises(BadInput, match="topic /pose: is planar, and the alignment would rotate it out"):
         aligned_estimates(stream, Alignment(Rotation.from_rotvec([1.0, 0, 0]).as_matrix()))
     with pytest.raises(BadInput, match="out of its plane"):
         aligned_estimates(stream, flipped)

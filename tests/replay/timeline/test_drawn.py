@@ -87,7 +87,7 @@ def test_robots_have_paths_arrows_ellipses_and_what_they_see(tmp_path: Path) -> 
         wanted[f"/{plot}/one"] = Wanted("curve", time_ns, squared[rows])
         wanted[f"/{plot}/bounds"] = consistent(degrees, time_ns)
         titles.add((f"NIS of {degrees} component{'s' * (degrees > 1)} (-)", plot))
-    told = f"one: gated range_bearing of target {seen['target_id'][3]}: NIS 0.0"
+    told = f"one: rejected range_bearing of target {seen['target_id'][3]}: NIS 0.0"
     wanted["/events/robot2/one"] = Wanted("told", seen.publish_time_ns[[3]], [told])
     compare(run.picture.moving, wanted)
     check_views(run.picture, {*titles, ("Events", "events/robot2")})

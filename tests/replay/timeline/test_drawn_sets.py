@@ -195,7 +195,7 @@ def test_two_stand_side_by_side_above_how_much_farther_off_the_second_is(tmp_pat
     )
     titles = {view.name: view.roots for view in picture.views}
     assert [title for title in titles if "Legend" in title] == ["Legend"]
-    assert titles["robot1 difference of the errors' size (m)"] == [plot[1:]]
+    assert titles["robot1 difference in the size of errors (m)"] == [plot[1:]]
     for name, other in (ESTIMATORS, ESTIMATORS[::-1]):
         [roots] = [roots for title, roots in titles.items() if title.startswith(f"{name}: Map, grid")]
         assert roots[0] == "map/robot1"

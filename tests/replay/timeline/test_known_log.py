@@ -187,14 +187,14 @@ def test_all_that_happens_is_told_at_its_stamp_with_its_level(moving: dict[str, 
         (STAMPS[1], "WARN", "one: because of diagnosed"),
         (STAMPS[2], "WARN", "one: not used: because of skipped"),
         (STAMPS[3], "ERROR", "one: failed: because of failure"),
-        (STAMPS[4], "ERROR", "one: empty set: the pair 3, 8 is to blame"),
+        (STAMPS[4], "ERROR", "one: empty set, caused by the pair 3, 8"),
     ]
     quality = moving["/events/receiver"]
     assert quality["utc"] == STAMPS[[0, 2]].tolist()
     assert told(quality) == ["receiver: solution single", "receiver: solution fixed"]
     silent = moving["/events/wheels"]
     assert silent["utc"] == [BEGIN_NS + 3 * SECOND]
-    assert told(silent) == ["wheels: silent for 27.0 s"]
+    assert told(silent) == ["wheels: no messages for 27.0 s"]
 
 
 def test_pauses_between_bursts_are_no_silence() -> None:

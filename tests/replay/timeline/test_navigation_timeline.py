@@ -127,7 +127,7 @@ def test_the_map_has_the_estimates_and_events_the_solutions_and_stops(drawn: Pic
     assert_allclose(way[-1], [48.0 + 118.0 / 111_194.0, 9.0], atol=1e-5)
     said = {sensor: told(drawn.moving[f"/events/{sensor}"]) for sensor in ("quality", "standing")}
     assert said["quality"] == ["quality: solution fixed", "quality: solution float"]
-    assert said["standing"] == ["standing: moves", "standing: stands: no velocity"]
+    assert said["standing"] == ["standing: moves", "standing: stationary: zero velocity"]
 
 
 def test_every_panel_is_called_by_what_it_shows(drawn: Picture):

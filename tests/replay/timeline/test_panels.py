@@ -122,7 +122,7 @@ def test_what_an_own_model_estimates_comes_first_below_its_legend(tmp_path: Path
 def test_events_name_the_topic_of_what_was_gated(tmp_path: Path) -> None:
     """That with a message of its stamp; a sensor has no target 0."""
     said = told(read(a_room(tmp_path / "room.rrd", inside=48))["/events/ekf"])
-    assert said == ["ekf: gated window: NIS 5062.0"] * 2
+    assert said == ["ekf: rejected window: NIS 5062.0"] * 2
 
 
 def test_many_components_are_in_tabs_by_quantity() -> None:

@@ -106,7 +106,7 @@ def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
         faults = outputs[f"/estimates/{name}/robot1/fault"].stream
         assert faults.schema.full_name == schemas.RELATIVE_BEARING.full_name
         assert told(found[f"/events/robot1/{name.replace(':', chr(92) + ':')}"]) == [
-            f"{name}: empty set: the pair {first}, {second} is to blame"
+            f"{name}: empty set, caused by the pair {first}, {second}"
             for first, second in zip(faults["first_id"], faults["second_id"], strict=True)
         ]
 

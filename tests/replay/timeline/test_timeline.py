@@ -265,8 +265,8 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
     events = read(tmp_path / "late.rrd")["/events/robot1/ekf"]
     assert dict(zip(events["utc"], told(events), strict=True)) == {
         begin_ns + 10**9: "ekf: not used: too late",
-        begin_ns + 2 * 10**9: "ekf: came 0.250 s late: went back and used 3 after it again",
-        begin_ns + 3 * 10**9: "ekf: came late, 0.125 s behind newer ones, which waited for it",
+        begin_ns + 2 * 10**9: "ekf: came 0.250 s late: 3 messages after it were reprocessed",
+        begin_ns + 3 * 10**9: "ekf: came late, 0.125 s behind newer messages, which waited for it",
     }
 
 
@@ -300,11 +300,11 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
     gated = innovations.take(innovations["accepted"] == 0)
     texts = told(found["/events/robot1/ekf"])
     assert len(texts) == len(gated)
-    assert texts[0].startswith(f"ekf: gated range_bearing of target {gated['target_id'][0]}: NIS ")
+    assert texts[0].startswith(f"ekf: rejected range_bearing of target {gated['target_id'][0]}: NIS ")
     outages = ensemble.sources[RUN].streams["/robot1/range_bearing/outages"]
     dropouts = found["/events/robot1/range_bearing"]
     assert dropouts["utc"] == outages.publish_time_ns.tolist()
-    assert set(told(dropouts)) == {"range_bearing: dead for 2.0 s"}
+    assert set(told(dropouts)) == {"range_bearing: outage of 2.0 s"}
 
     source = ensemble.sources[0]
     without = {topic: each for topic, each in source.streams.items() if not topic.endswith("outages")}
@@ -322,7 +322,7 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
     assert told(found["/events/robot1/ekf\\:2"]) == ["ekf:2: failed: another"]
     silent = told(found["/events/robot1/range_bearing"])
     pauses_s = np.diff(np.unique(source.streams["/robot1/range_bearing"].publish_time_ns)) * 1e-9
-    assert silent == [f"range_bearing: silent for {pause:.1f} s" for pause in pauses_s if pause > 1]
+    assert silent == [f"range_bearing: no messages for {pause:.1f} s" for pause in pauses_s if pause > 1]
     assert silent
 
 
@@ -483,7 +483,7 @@ def test_what_sensors_see_is_drawn_about_them_and_on_the_map(tmp_path: Path) -> 
     assert "Events" not in views(tmp_path / "bare.rrd")  # nothing happened
     scans = make_stream("/scan", schemas.SCAN, time_ns, scan_id=range(10), detections=[2] * 10)
     found = drawn_bare([*streams, scans], tmp_path / "bare.rrd")
-    why = "none of its fields is a quantity over time"
+    why = "it has no field that can be plotted over time"
     assert told(found["/events/log"]) == [f"log: /scan is not drawn: {why}"]
     assert "Events" in views(tmp_path / "bare.rrd")
 
@@ -654,7 +654,7 @@ def test_what_cannot_be_shown_is_refused(ensemble: Replayed, tmp_path: Path) -> 
     with pytest.raises(BadInput, match="no run 2 to show; the runs are 0 to 1"):
         show(source, outputs, errors, run=2, save=tmp_path / "a.rrd")
     with pytest.raises(
-        BadInput, match="--focus robot9: nothing in this log has that name; did you mean 'robot1'"
+        BadInput, match="--focus robot9: no case in this log has this name; did you mean 'robot1'"
     ):
         show(source, outputs, errors, focus="robot9", save=tmp_path / "a.rrd")
     with pytest.raises(BadInput, match="cannot be written"):
@@ -759,7 +759,7 @@ def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
         screenshot(rrd, tmp_path / "a.png", at_s=99.0)
     if "Vulkan driver" in str(refused.value):
         pytest.skip(str(refused.value))
-    refused.match("--at 99: the run goes from 0 to 20 s")
+    refused.match("--at 99: give a time within the run, from 0 to 20 s")
 
 
 @pytest.mark.paper
