@@ -180,7 +180,7 @@ class _Geometry(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """k measurements of every sensor, NaN where missing, with derivatives in a last axis.
+    """Blocks of k measurements per sensor, NaN where missing, with derivatives in the last axis.
 
     residual (runs, sensors, k), jacobian (..., k, d), covariance (..., k, k), and its derivative slope
     (..., k, k, d): by azimuth, range and trajectory (d = 3) at first, by all parameters in the end.
